@@ -70,6 +70,11 @@ def connected(one: Ints, other: Ints, many: int) -> Ints:
     return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
 
 
+def dots(one: NDArray[np.floating], other: NDArray[np.floating]) -> Floats:
+    """Return the products (n,) of vectors (n, 2), row by row: summed along rows of two it takes several times as long."""
+    return np.asarray(one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1])
+
+
 def rms_length(vectors: Floats) -> float:
     """Return the root mean square length of vectors (n, d)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

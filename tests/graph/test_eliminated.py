@@ -6,7 +6,7 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import Blocks, WithBlocks, blocks_of, rows_of, side_by_side, step, summed
+from uwblite.graph.eliminated import Blocks, WithBlocks, entries, factor, rows_of, side_by_side
 from uwblite.graph.graph import edge_weights
 from uwblite.graph.marginals import Marginals
 from uwblite.graph.normal_equations import filled
@@ -24,12 +24,14 @@ def planted(n=12):
     by_block[np.arange(m)[:, None], block[:, None] * k + np.arange(k)] = rng.standard_normal((m, k))
     residual, prior = rng.standard_normal(m), np.tile(np.diag([1.0, 2.0, 3.0, 4.0]), (count, 1, 1))
     slope = rng.standard_normal((count, k))
-    none = sparse.csr_matrix((size, size)), sparse.csr_matrix((count * k, size))
-    parts = [Blocks(*none, prior, np.zeros(size), slope)]
-    for rows in (slice(0, 25), slice(25, m)):
-        some = sparse.csr_matrix(by_graph[rows]), sparse.csr_matrix(by_block[rows])
-        parts.append(blocks_of(*some, residual[rows], k))
-    blocks = summed(parts)
+    own = by_block.T @ by_block
+    blocks = Blocks(
+        sparse.csr_matrix(by_graph.T @ by_graph),
+        sparse.csr_matrix(by_block.T @ by_graph),
+        prior + np.stack([own[b * k : (b + 1) * k, b * k : (b + 1) * k] for b in range(count)]),
+        by_graph.T @ residual,
+        slope + (by_block.T @ residual).reshape(count, k),
+    )
     whole, jacobian = np.zeros((size + count * k,) * 2), np.hstack([by_graph, by_block])
     whole[:size, :size] = normal.matrix.toarray()
     for b in range(count):
@@ -45,7 +47,8 @@ def test_the_step_is_that_of_the_whole_system():
     n, order = normal.unknowns.size, None
     expected = -np.linalg.solve(whole, gradient)
     for _ in range(2):
-        x, s, order = step(normal, blocks, order)
+        found = factor(normal, blocks, order)
+        (x, s), order = found.step(normal, blocks), found.order
         np.testing.assert_allclose(x, expected[:n], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(s.ravel(), expected[n:], rtol=1e-9, atol=1e-12)
 
@@ -68,11 +71,11 @@ def test_covariances_are_those_of_the_whole_system():
 def test_the_factor_is_in_an_order_with_contiguous_subtrees():
     """Else the selected inverse hands on the rows of unrelated columns, which takes far more memory and time."""
     _, normal, blocks, whole, _ = planted(60)
-    factor = WithBlocks(normal.matrix, blocks)
-    lower, n = factor.L.toarray(), len(whole)
-    np.testing.assert_array_equal(factor.perm_r, factor.perm_c)
-    order = np.argsort(factor.perm_c)
-    np.testing.assert_allclose(lower @ factor.U.toarray(), whole[np.ix_(order, order)], rtol=1e-9, atol=1e-9)
+    found = WithBlocks(normal.matrix, blocks)
+    lower, n = found.L.toarray(), len(whole)
+    np.testing.assert_array_equal(found.perm_r, found.perm_c)
+    order = np.argsort(found.perm_c)
+    np.testing.assert_allclose(lower @ found.U.toarray(), whole[np.ix_(order, order)], rtol=1e-9, atol=1e-9)
     assert not np.triu(lower, 1).any()
     size, deepest = np.ones(n, dtype=int), np.arange(n)
     for column in range(n):
@@ -94,7 +97,7 @@ def test_what_nothing_measures_stays():
     nothing = Blocks(
         sparse.csr_matrix((size, size)), sparse.csr_matrix((4, size)), np.eye(4)[None], np.zeros(size), np.zeros((1, 4))
     )
-    x, _, _ = step(normal, nothing)
+    x, _ = factor(normal, nothing).step(normal, nothing)
     assert np.all(np.isfinite(x))
     np.testing.assert_array_equal(x[normal.unknowns.number["anchors"][-1]], 0.0)
 
@@ -103,10 +106,21 @@ def test_blocks_side_by_side_are_those_of_one_system():
     _, normal, blocks, whole, gradient = planted()
     n = normal.unknowns.size
     alone = Blocks(sparse.csr_matrix((n, n)), sparse.csr_matrix((4, n)), np.eye(4)[None], np.zeros(n), np.ones((1, 4)))
-    x, s, _ = step(normal, side_by_side(blocks, alone))
+    both = side_by_side(blocks, alone)
+    x, s = factor(normal, both).step(normal, both)
     expected = -np.linalg.solve(whole, gradient)
     np.testing.assert_allclose(x, expected[:n], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(s, [*expected[n:].reshape(-1, 4), -np.ones(4)], rtol=1e-9, atol=1e-12)
+
+
+def test_blocks_add_up_and_what_is_fixed_is_left_out():
+    rows, columns = np.array([[0, 2], [2, 0], [1, -1]]), np.array([[0, 1, -1], [1, -1, 0], [-1, 0, 1]])
+    values = np.random.default_rng(0).standard_normal((3, 2, 3))
+    expected = np.zeros((4, 4))
+    for row, column, value in zip(rows, columns, values, strict=True):
+        # The last row and column take what is fixed.
+        expected[row[:, None], column] += value
+    np.testing.assert_allclose(entries(rows, columns, values, (3, 3)).toarray(), expected[:3, :3], rtol=1e-12)
 
 
 def test_rows_of_edges_make_the_normal_equations():

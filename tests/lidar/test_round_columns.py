@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.round_columns import find_columns, fitted_circles, refined_columns
+from uwblite.lidar.round_columns import find_columns, fitted_circles, refined_columns, surroundings
 from uwblite.odometry.attached import ScanPoints
 
 POSES = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a), a + 2.0] for a in np.arange(0.0, 6.2, 0.5)])
@@ -70,3 +70,20 @@ def test_a_box_is_no_column(seed):
 def test_rays_that_do_not_bend_are_no_circle():
     rays = seen(POSES, lambda origin, way: np.full(len(way), 30.0))
     assert len(fitted_circles(rays).radius) == 0
+
+
+@pytest.mark.parametrize("size", [10.0, 3000.0])
+def test_points_near_columns_are_found_by_the_squares_they_lie_in(size):
+    """All that are near, and of each the nearest column, as if every point were compared with every column."""
+    rng = np.random.default_rng(2)
+    columns = np.column_stack([rng.uniform(0.0, size, (7, 2)), rng.uniform(0.1, 0.8, 7)])
+    anywhere, close = rng.uniform(-5.0, size + 5.0, (4000, 2)), rng.standard_normal((999, 2))
+    at = np.concatenate([anywhere, columns[rng.integers(7, size=999), :2] + close])
+    rows, which, away = surroundings(columns, 0.3).nearest(at)
+    apart = np.hypot(*(at[:, None] - columns[None, :, :2]).transpose(2, 0, 1))
+    np.testing.assert_array_equal(which, apart.argmin(axis=1)[rows])
+    np.testing.assert_allclose(away, apart.min(axis=1)[rows], rtol=1e-12)
+    near = np.flatnonzero((apart < columns[:, 2] + 0.3).any(axis=1))
+    assert len(near) > 100
+    assert np.isin(near, rows).all()
+    assert len(surroundings(columns[:0], 0.3).nearest(at)[0]) == 0

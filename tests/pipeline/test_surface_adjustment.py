@@ -13,8 +13,7 @@ from uwblite import mapping, se2
 from uwblite.graph.calibration import LASER, with_free
 from uwblite.graph.marginals import marginals
 from uwblite.graph.normal_equations import filled
-from uwblite.lidar import surface_rays
-from uwblite.lidar.surface_rays import linearized
+from uwblite.lidar.ray_equations import linearized
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
@@ -98,7 +97,7 @@ def test_rays_move_with_the_mounting_and_the_clock_of_the_lidar(around, kind, st
     lidar = _lidar(graph, after.joint, task)
     one, other = (linearized(rays, surfaces, each.sensors, graph.poses) for each in (lidar, moved_lidar))
     numeric = (other.residual - one.residual) / step
-    analytic = lidar.slopes(one.by_pose, rays.keyframe, graph.poses)[:, column]
+    analytic = np.einsum("mb,mb->m", one.by_pose, lidar.by_lidar(graph.poses)[rays.keyframe, column])
     assert np.abs(numeric).max() > 1.0
     near = np.abs(one.residual) < 1.0
     assert near.mean() > 0.5
@@ -116,22 +115,6 @@ def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(arou
     moves[unknowns.number["poses"]] = -np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
     moves[unknowns.number["calibration"][graph.calibration.index("laser_x")]] = 1.0
     assert np.abs(found.among @ moves[:-1]).max() < 1e-9 * np.abs(found.among).max()
-
-
-def test_rays_some_at_a_time_say_what_they_say_at_once(around, monkeypatch):
-    after, task = around["after"], around["task"]
-    graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint))
-    _, rays = for_covariances(after.surfaces, graph, task)
-    unknowns = filled(graph, subtrees=True).unknowns
-    whole = rays(unknowns)
-    monkeypatch.setattr(surface_rays, "_AT_ONCE", len(after.surfaces.rays.keyframe) // 3)
-    parts = rays(unknowns)
-    for name in ("among", "across"):
-        one, other = getattr(parts, name), getattr(whole, name)
-        assert abs(one - other).max() < 1e-12 * abs(other).max()
-    for name in ("own", "slope", "own_slope"):
-        scale = np.abs(getattr(whole, name)).max()
-        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-10, atol=1e-12 * scale)
 
 
 def test_without_pairs_of_clouds_nothing_is_adjusted(around):

@@ -9,8 +9,7 @@ Without the blocks, the matrix of the poses alone would tie all that touch one b
 leaves for late what is touched by many.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -39,33 +38,11 @@ class Blocks:
     """(b, k) g_s."""
 
 
-def blocks_of(by_graph: sparse.csr_matrix, by_block: sparse.csr_matrix, residual: Floats, k: int) -> Blocks:
-    """Return the normal equations of whitened residuals (m,) with Jacobians (m, n) and (m, b k)."""
-    among, across = sparse.csr_matrix(by_graph.T @ by_graph), sparse.csr_matrix(by_block.T @ by_graph)
-    entries, count = (by_block.T @ by_block).tocoo(), by_block.shape[1] // k
-    own = np.zeros((count, k, k))
-    np.add.at(own, (entries.row // k, entries.row % k, entries.col % k), entries.data)
-    return Blocks(among, across, own, by_graph.T @ residual, (by_block.T @ residual).reshape(count, k))
-
-
-def summed(parts: Iterable[Blocks]) -> Blocks:
-    """Return the normal equations of the measurements of all parts, one or more."""
-    parts = iter(parts)
-    total = next(parts)
-    among, across = [total.among], [total.across]
-    for part in parts:
-        among.append(part.among)
-        across.append(part.across)
-        slope, own_slope = total.slope + part.slope, total.own_slope + part.own_slope
-        total = replace(total, own=total.own + part.own, slope=slope, own_slope=own_slope)
-    return replace(total, among=_sum_of(among), across=_sum_of(across))
-
-
-def _sum_of(matrices: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
-    """Return the sum of sparse matrices, all at once: one after the other, each sum would copy those before."""
-    entries = [matrix.tocoo() for matrix in matrices]
-    data, row, column = (np.concatenate([getattr(e, name) for e in entries]) for name in ("data", "row", "col"))
-    return sparse.csr_matrix((data, (row, column)), shape=matrices[0].shape)
+def entries(rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int]) -> sparse.csr_matrix:
+    """Return the sum of blocks (m, a, b) in rows (m, a) and columns (m, b) of a matrix; a number below 0 is fixed."""
+    row, column = np.broadcast_to(rows[:, :, None], values.shape), np.broadcast_to(columns[:, None], values.shape)
+    free = (row >= 0) & (column >= 0)
+    return sparse.csr_matrix((values[free], (row[free], column[free])), shape=shape)
 
 
 def side_by_side(one: Blocks, other: Blocks) -> Blocks:
@@ -93,13 +70,13 @@ _TRACE = 1e-12
 """Damping, as a share of the diagonal: directions that nothing measures stay where they are."""
 
 
-def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> tuple[Floats, Floats, Ints]:
-    """Return the Gauss-Newton step of the graph's unknowns (n,) and of the blocks (b, k), and the order of elimination.
+def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> "WithBlocks":
+    """Return the factor of the normal equations of a graph and of blocks.
 
     Parameters
     ----------
     normal : of the graph, in the sparse layout (NormalEquations with subtrees).
-    order : of an earlier step whose measurements touch the same.
+    order : of an earlier factor of measurements that touch the same.
 
     Raises
     ------
@@ -107,10 +84,7 @@ def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> 
     """
     diagonal = normal.diagonal + blocks.among.diagonal()
     damping = sparse.diags(np.where(diagonal > 0.0, _TRACE * diagonal, 1.0))
-    factor = WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
-    found = -factor.solve_all(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
-    n = normal.unknowns.size
-    return found[:n], found[n:].reshape(blocks.own_slope.shape), factor.order
+    return WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
 
 
 class WithBlocks:
@@ -133,7 +107,8 @@ class WithBlocks:
         SolverError : the matrix is singular.
         """
         count = len(blocks.own)
-        own = sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1)))
+        own = sparse.csr_matrix(sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1))))
+        own.eliminate_zeros()
         whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
         self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
         self.order = with_subtrees_contiguous(pairs_of(whole), whole.shape[0]) if order is None else order
@@ -150,6 +125,11 @@ class WithBlocks:
     def U(self) -> sparse.csc_matrix:
         """Upper triangle."""
         return self._lu.U
+
+    def step(self, normal: NormalEquations, blocks: Blocks) -> tuple[Floats, Floats]:
+        """Return the step of the graph's unknowns (n,) and of the blocks (b, k) by these slopes."""
+        found = -self.solve_all(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
+        return found[: self._size], found[self._size :].reshape(blocks.own_slope.shape)
 
     def solve(self, right: Floats) -> Floats:
         """Solve for the graph's unknowns by right-hand sides (n,) or (n, m)."""

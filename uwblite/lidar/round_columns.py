@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, connected
+from ..arrays import Bools, Floats, Ints, Table, connected, dots
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
 
@@ -47,8 +47,7 @@ def fitted_circles(rays: ScanPoints) -> Circles:
 
     Least squares of the algebraic distance (I. Kasa 1976): a little too small where little of the circle is seen.
     """
-    reach = np.hypot(*(rays.points - rays.origins).T)
-    number = _runs(rays, reach)
+    rays, number, reach = _short_runs(rays)
     many = int(number.max(initial=-1)) + 1
     count = np.maximum(np.bincount(number, minlength=many), 1)
 
@@ -66,17 +65,28 @@ def fitted_circles(rays: ScanPoints) -> Circles:
     sigma = mean(range_sigma(reach))
     origin = np.stack([mean(rays.origins[:, 0]), mean(rays.origins[:, 1])], axis=1) - middle
     good = (count >= _FEWEST) & (radius > _RADII[0]) & (radius < _RADII[1]) & (off < _SCATTER * sigma)
-    good &= (count * (flat - off**2) > _CURVED * sigma**2) & ((centre * origin).sum(axis=1) < 0.0)
+    good &= (count * (flat - off**2) > _CURVED * sigma**2) & (dots(centre, origin) < 0.0)
     chosen = np.flatnonzero(good)
     keyframe = rays.keyframe[np.searchsorted(number, chosen)]
     return Circles(keyframe, (middle + centre)[chosen], radius[chosen], count[chosen].astype(np.float64))
 
 
-def _runs(rays: ScanPoints, reach: Floats) -> Ints:
-    """Return the number (p,) of the run to which each ray belongs."""
-    ends = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > _MISSING)
-    ends |= np.abs(np.diff(reach)) > _JUMP + _JUMP_SHARE * reach[1:]
-    return np.concatenate([[0], np.cumsum(ends)])[: len(reach)].astype(np.int64)
+def _short_runs(rays: ScanPoints) -> tuple[ScanPoints, Ints, Floats]:
+    """Return the rays (m,) of runs no longer than a column is wide, the number of each ray's run, and the rays' lengths, m."""
+    reach = np.hypot(*(rays.points - rays.origins).T)
+    begins = np.ones(len(reach), dtype=bool)
+    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > _MISSING)
+    begins[1:] |= np.abs(np.diff(reach)) > _JUMP + _JUMP_SHARE * reach[1:]
+    first = np.flatnonzero(begins)
+    count = np.diff(np.append(first, len(reach)))
+    wide = np.hypot(*(rays.points[first + count - 1] - rays.points[first]).T)
+    good = (count >= _FEWEST) & (wide < _WIDEST * _RADII[1])
+    rows, kept = np.flatnonzero(np.repeat(good, count)), count[good]
+    return rays.rows(rows), np.repeat(np.arange(len(kept)), kept), reach[rows]
+
+
+_WIDEST = 2.5
+"""Distance between the ends of a run by the radius of a column, beyond which noise does not make the one of the other."""
 
 
 def _solved(a: Floats, b: Floats, c: Floats, right_x: Floats, right_y: Floats) -> Floats:
@@ -115,11 +125,54 @@ def _apart(columns: Floats, weight: Floats) -> Floats:
 def to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Floats, Floats, Floats]:
     """Return how far (m,) points (m, 2) are from a circle about 0 along their rays, the normals (m, 2) there, and the cosine
     of incidence, 0 where a ray misses."""
-    along = (points * direction).sum(axis=1)
-    inside = radius**2 - (points**2).sum(axis=1) + along**2
+    along = dots(points, direction)
+    inside = radius**2 - dots(points, points) + along**2
     shift = -along - np.sqrt(np.maximum(inside, 0.0))
     normal = (points + shift[:, None] * direction) / radius[:, None]
-    return shift, normal, np.where(inside > 0.0, (normal * direction).sum(axis=1), 0.0)
+    return shift, normal, np.where(inside > 0.0, dots(normal, direction), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """Columns and the squares of the map near them: few points of a map lie there, and only these are looked at."""
+
+    columns: Floats
+    """(c, 3) x, y, radius."""
+    corner: Floats
+    """(2,) m, of the first square."""
+    size: float
+    """m, of a square."""
+    near: Bools
+    """(x, y) whether a square is near a column; the outermost ones are not."""
+
+    def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
+        """Return the rows (n,) of points (p, 2) on such squares, the column nearest to each, and how far its centre is, m."""
+        x, y = (
+            np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.int64)
+            for k in range(2)
+        )
+        rows = np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
+        if not len(rows):
+            return rows, rows, np.zeros(0)
+        away, which = cKDTree(self.columns[:, :2]).query(at[rows])
+        return rows, which, away
+
+
+_SQUARE, _MOST_SQUARES = 0.2, 1e6
+"""Size of a square, m, and as many of them as are taken before they get larger."""
+
+
+def surroundings(columns: Floats, margin: float) -> Surroundings:
+    """Return the squares within a margin, m, of columns (c, 3)."""
+    if not len(columns):
+        return Surroundings(columns, np.zeros(2), _SQUARE, np.zeros((1, 1), dtype=bool))
+    reach, wide = columns[:, 2].max() + margin, np.ptp(columns[:, :2], axis=0)
+    size = max(_SQUARE, float(np.sqrt(np.prod(wide + 2.0 * reach) / _MOST_SQUARES)))
+    corner = columns[:, :2].min(axis=0) - reach - 2.0 * size
+    x, y = np.ceil((wide + 2.0 * reach) / size).astype(np.int64) + 4
+    middle = corner + (np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1) + 0.5) * size
+    near = cKDTree(columns[:, :2]).query(middle)[0] < reach + size
+    return Surroundings(columns, corner, size, near)
 
 
 _WIDE, _WIDE_ROUNDS, _ROUNDS = 0.15, 3, 8
@@ -152,10 +205,9 @@ def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Float
         gate = _WIDE if turn < _WIDE_ROUNDS else _GATE * sigma + _SLACK
         near = (incidence < _FACING) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
-        rows = np.column_stack([normal, np.ones(len(normal))])
-        whole = _summed(own, robust[:, None, None] * rows[:, :, None] * rows[:, None, :], len(columns)) + np.eye(3)
-        right = _summed(own, (robust * -shift * incidence)[:, None] * rows, len(columns))
-        columns = columns + np.linalg.solve(whole, right[:, :, None])[:, :, 0]
+        rows = np.flatnonzero(robust)
+        whole, right = _summed(own[rows], robust[rows], normal[rows], (-shift * incidence)[rows], len(columns))
+        columns = columns + np.linalg.solve(whole + np.eye(3), right[:, :, None])[:, :, 0]
         columns[:, 2] = np.clip(columns[:, 2], *_RADII)
     ended = (incidence < _FACING) & (np.abs(shift) < _AROUND)
     count, around, probable = (
@@ -164,8 +216,12 @@ def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Float
     return np.asarray(columns[(count >= _FEW) & (count > _OWN * around) & (probable > 0.5 * count)])
 
 
-def _summed(number: Ints, values: Floats, many: int) -> Floats:
-    """Return the sums (m, ...) of values (p, ...) by number (p,)."""
-    flat = values.reshape(len(values), -1)
-    sums = [np.bincount(number, v, many).astype(np.float64) for v in flat.T]
-    return np.stack(sums, axis=1).reshape(many, *values.shape[1:])
+def _summed(own: Ints, weight: Floats, normal: Floats, residual: Floats, many: int) -> tuple[Floats, Floats]:
+    """Return the normal equations (m, 3, 3) and (m, 3) of as many circles by their rays (p,)."""
+    parts, whole, right = (*normal.T, np.ones(len(normal))), np.zeros((many, 3, 3)), np.zeros((many, 3))
+    for a in range(3):
+        weighted = weight * parts[a]
+        right[:, a] = np.bincount(own, weighted * residual, many)
+        for b in range(a, 3):
+            whole[:, a, b] = whole[:, b, a] = np.bincount(own, weighted * parts[b], many)
+    return whole, right

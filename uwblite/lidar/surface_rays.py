@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import Bools, Floats, Ints, Table, dots
 from ..odometry.attached import ScanPoints
 from .cloud_rasters import CloudRasters, look_up
 from .clouds import Clouds
-from .ray_noise import RayNoise, learnt_noise, range_sigma
-from .round_columns import refined_columns, to_circle
+from .ray_noise import RayNoise, range_sigma
+from .round_columns import Surroundings, refined_columns, surroundings, to_circle
 from .walls import Stretches, Walls
 
 _GATE = 4.0
@@ -30,8 +30,6 @@ ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
 _INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
 """Least cosine of incidence on walls, and on columns, whose edges return anything."""
-_NEAR = 0.3
-"""Distance from a column's rim up to which rays are kept until it is fitted, m."""
 _SLACK = 0.03
 """What a column's place and radius are off at first, m."""
 
@@ -88,10 +86,17 @@ class SurfaceRays(Table):
     sigma: NDArray[np.floating]
     """(m,) m, along the ray, by data sheets."""
 
-    def in_parts(self) -> Iterator["SurfaceRays"]:
-        """Yield the rays some at a time, which bounds the memory of what is made of them."""
-        for first in range(0, len(self.keyframe), _AT_ONCE):
-            yield self.rows(slice(first, first + _AT_ONCE))
+    def by_keyframe(self, surfaces: Surfaces) -> "SurfaceRays":
+        """Return the rays in order: those on walls before those on columns, by keyframe, and by surface."""
+        key = surfaces.round[self.surface] * np.int64(self.keyframe.max(initial=0) + 1) + self.keyframe
+        return self.rows(np.argsort(key * len(surfaces.round) + self.surface, kind="stable"))
+
+    def in_parts(self, surfaces: Surfaces) -> Iterator["SurfaceRays"]:
+        """Yield rays in this order some at a time, all on walls or all on columns: what is made of them stays in the cache."""
+        walls, last = int(np.count_nonzero(~surfaces.round[self.surface])), len(self.keyframe)
+        for first, end in ((0, walls), (walls, last)):
+            for begin in range(first, end, _RAYS_AT_ONCE):
+                yield self.rows(slice(begin, min(begin + _RAYS_AT_ONCE, end)))
 
     def renumbered(self, number: Ints) -> "SurfaceRays":
         """Return the rays with surface k as number[k]; without those where that is -1."""
@@ -104,8 +109,8 @@ class SurfaceRays(Table):
         return SurfaceRays(self.keyframe.astype(np.int32), self.surface.astype(np.int32), points, directions, sigma)
 
 
-_AT_ONCE = 1 << 16
-"""Rays, or points of clouds, that are looked at together."""
+_RAYS_AT_ONCE, _POINTS_AT_ONCE = 1 << 14, 1 << 16
+"""Rays, and points of clouds, that are looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,15 +130,16 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach))
 
 
-def stretch_of(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: Stretches) -> Ints:
+def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: Stretches) -> Ints:
     """Return on which straight stretch (p,) of its own cloud each ray ends, away from the stretch's ends; -1 = on none."""
     stretch = np.full(len(rays.keyframe), -1)
     if not len(clouds.points) or not len(stretch):
         return stretch
-    nearest = look_up(raster, rays.keyframe, rays.points[:, :1], rays.points[:, 1:])[:, 0].astype(np.int64)
+    x, y = (rays.points[:, k : k + 1].astype(np.float64) for k in range(2))
+    nearest = look_up(raster, rays.keyframe, x, y)[:, 0].astype(np.int64)
     of = found.of_point[np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)]
     near = np.flatnonzero((nearest >= 0) & found.straight[of])
-    near = near[_ends_on(as_rays(rays).rows(near), found, of[near])]
+    near = near[_ends_on(rays.rows(near), found, of[near])]
     stretch[near] = of[near]
     return stretch
 
@@ -141,9 +147,9 @@ def stretch_of(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: St
 def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     """Return which rays (m,) end on these stretches (m,), where their noise is taken away along the ray."""
     normal, off = found.normal[stretch], rays.points - found.centre[stretch]
-    residual, incidence = (off * normal).sum(axis=1), -(rays.directions * normal).sum(axis=1)
+    residual, incidence = dots(off, normal), -dots(rays.directions, normal)
     oblique = np.maximum(incidence, _INCIDENCE)
-    along = ((off + (residual / oblique)[:, None] * rays.directions) * found.tangent[stretch]).sum(axis=1)
+    along = dots(off + (residual / oblique)[:, None] * rays.directions, found.tangent[stretch])
     gate = _GATE * np.hypot(rays.sigma * incidence, ROUGHNESS)
     return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
 
@@ -181,22 +187,24 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     return replace(rays, surface=nearest + first).rows(good)
 
 
-def around_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Bools:
-    """Return which rays (m,) from poses (k, 3) end near columns (c, 3)."""
-    if not len(columns):
-        return np.zeros(len(rays.keyframe), dtype=bool)
-    near, which = cKDTree(columns[:, :2]).query(in_map(rays, poses)[0])
-    return np.asarray(near < columns[which, 2] + _NEAR)
+NEAR = 0.3
+"""Distance from a column's rim up to which rays are kept until it is fitted, m."""
+
+
+def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> Ints:
+    """Return the numbers (n,) of the rays (m,) from poses (k, 3) that end near columns."""
+    rows, which, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
+    return rows[away < columns.columns[which, 2] + NEAR]
 
 
 def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:
     """Return of what each of the clouds' points (p,) is: 0 a wall, 1 one of the columns (c, 3), -1 neither."""
     kind = np.where(walls.of_stretch >= 0, 0, -1).astype(np.int8)[found.of_point]
-    for first in range(0, len(kind) if len(columns) else 0, _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        at = se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64))
-        away, which = cKDTree(columns[:, :2]).query(at)
-        kind[part][np.abs(away - columns[which, 2]) < _ROUND] = 1
+    near = surroundings(columns, _ROUND)
+    for first in range(0, len(kind) if len(columns) else 0, _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        rows, which, away = near.nearest(se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64)))
+        kind[first + rows[np.abs(away - columns[which, 2]) < _ROUND]] = 1
     return kind
 
 
@@ -215,70 +223,3 @@ def in_map(rays: SurfaceRays, poses: Floats) -> tuple[Floats, Floats]:
         se2.transform_each(poses, rays.keyframe, rays.points),
         se2.rotate_each(poses[:, 2], rays.keyframe, rays.directions),
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RayEquations:
-    """Whitened residuals of rays and their derivatives."""
-
-    residual: Floats
-    """(m,)."""
-    by_pose: Floats
-    """(m, 3) by x, y, theta of the keyframe."""
-    by_surface: Floats
-    """(m, 4) by the step of Surfaces.moved."""
-
-
-def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayEquations:
-    """Linearise rays at their surfaces.
-
-    Parameters
-    ----------
-    sensors : (k, 3) frames of the clouds in the map, where the laser's mounting and clock put them. poses : (k, 3) of the
-        base, about which these turn.
-    """
-    at, direction = in_map(rays, sensors)
-    at -= surfaces.offset[rays.surface, None] * direction
-    away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]
-    normal, shift = np.stack(se2.cos_sin(surfaces.facing), axis=1)[rays.surface], np.zeros(len(away))
-    round_ones = np.flatnonzero(curved)
-    if len(round_ones):
-        radius = surfaces.radius[rays.surface[round_ones]]
-        shift[round_ones], normal[round_ones], _ = to_circle(away[round_ones], direction[round_ones], radius)
-    incidence = (normal * direction).sum(axis=1)
-    incidence = np.where(np.abs(incidence) > _LEAST, incidence, -_LEAST)
-    residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
-    ahead = -(residual / incidence)[:, None] * direction
-    arm, away = at + ahead - poses[rays.keyframe, :2], away + ahead
-    root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
-    by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-    turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
-    by_surface = np.column_stack([
-        np.where(curved, -normal[:, 0], turn), np.where(curved, -normal[:, 1], -1.0), -incidence, np.where(curved, -1.0, 0.0),
-    ])  # fmt: skip
-    return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
-
-
-def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayNoise:
-    """Learn the noise of rays from their residuals; for the parameters see linearized."""
-    shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts()]
-    residual, reach, place = (np.concatenate(part) for part in zip(*shown, strict=True))
-    return learnt_noise(residual, reach, place, rays.surface, surfaces.round)
-
-
-def _shown(
-    rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Return the residuals (m,) of rays in standard deviations, their lengths (m,), m, and where on its surface each ends."""
-    away = in_map(rays, sensors)[0] - surfaces.place[rays.surface]
-    facing, curved = surfaces.facing[rays.surface], surfaces.round[rays.surface]
-    along = np.cos(facing) * away[:, 1] - np.sin(facing) * away[:, 0]
-    place = np.floor(np.where(curved, se2.bearing(away) / _SECTOR, along / _PIECE)).astype(np.int32)
-    residual, reach = linearized(rays, surfaces, sensors, poses).residual, np.hypot(*rays.points.T)
-    return residual.astype(np.float32), reach.astype(np.float32), place
-
-
-_PIECE, _SECTOR = 1.0, np.pi / 4.0
-"""Length of a place on a wall, m, and angle of one on a column, rad, within which residuals may be alike."""
-_LEAST = 0.05
-"""Least cosine of incidence that is reckoned with."""

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, connected, unique_rows
+from ..arrays import Bools, Floats, Ints, connected, dots, unique_rows
 from .clouds import Clouds
 
 _GAP = 0.35
@@ -75,20 +75,30 @@ def stretches(clouds: Clouds) -> Stretches:
     lined, step = np.any(normals != 0.0, axis=1), np.diff(points, axis=0)
     ends = (np.diff(clouds.owner) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
     for side in (normals[1:], normals[:-1]):
-        ends |= np.abs((side * step).sum(axis=1)) > _STEP
+        ends |= np.abs(dots(side, step)) > _STEP
     noise = _SIGMAS**2 * (variance[1:] + variance[:-1])
     turn = np.minimum(np.sqrt(_TURN**2 + noise), _MOST_TURN)
-    ends |= (normals[1:] * normals[:-1]).sum(axis=1) < np.cos(turn)
+    ends |= dots(normals[1:], normals[:-1]) < np.cos(turn)
+    begins = np.concatenate([np.ones(min(len(points), 1), dtype=bool), ends])
+    _split(begins, points)
+    return _fitted(_numbered(begins), points, normals, variance)
+
+
+def _numbered(begins: Bools) -> Ints:
+    return np.cumsum(begins, dtype=np.int64) - 1
+
+
+def _split(begins: Bools, points: Floats) -> None:
+    """Split bent stretches where they bend most, and their parts again; begins (p,), of the first points, gets more."""
+    rows = np.arange(len(points))
     for _ in range(_SPLITS):
-        corners = _corners(_numbered(ends, points), points)
+        number, some = _numbered(begins[rows]), points[rows]
+        corners = _corners(number, some)
         if not len(corners):
             break
-        ends[corners] = ends[corners - 1] = True
-    return _fitted(_numbered(ends, points), points, normals, variance)
-
-
-def _numbered(ends: Bools, points: Floats) -> Ints:
-    return np.concatenate([[0], np.cumsum(ends)])[: len(points)].astype(np.int64)
+        begins[rows[corners]] = begins[rows[corners] + 1] = True
+        # What was straight, or could not be split, stays so.
+        rows = rows[np.isin(number, number[corners])]
 
 
 def _corners(number: Ints, points: Floats) -> Ints:
@@ -96,13 +106,18 @@ def _corners(number: Ints, points: Floats) -> Ints:
     IEEE Transactions on Computers 23, 1974)."""
     first = np.flatnonzero(np.diff(number, prepend=-1))
     last = np.flatnonzero(np.diff(number, append=-1))
-    chord = points[last] - points[first]
+    bent = np.flatnonzero(principal_axes(number, points, len(first))[2] > _STRAIGHT)
+    if not len(bent):
+        return bent
+    count = (last - first + 1)[bent]
+    own, starts = np.repeat(np.arange(len(bent)), count), np.cumsum(count) - count
+    rows = np.arange(len(own)) + (first[bent] - starts)[own]
+    chord, away = points[last[bent]] - points[first[bent]], points[rows] - points[first[bent]][own]
     across = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
-    off = np.abs(((points - points[first[number]]) * across[number]).sum(axis=1))
-    bent = principal_axes(number, points, len(first))[2] > _STRAIGHT
-    at = np.flatnonzero(off == np.maximum.reduceat(off, first)[number]) if len(first) else first
-    farthest = at[np.searchsorted(number[at], number[last], "right") - 1]
-    return farthest[bent & (farthest > first) & (farthest < last)]
+    off = np.abs(dots(away, across[own]))
+    at = np.flatnonzero(off == np.maximum.reduceat(off, starts)[own])
+    farthest = rows[at[np.searchsorted(own[at], np.arange(len(bent)), "right") - 1]]
+    return np.asarray(farthest[(farthest > first[bent]) & (farthest < last[bent])])
 
 
 def _fitted(number: Ints, points: Floats, normals: Floats, variance: Floats) -> Stretches:
@@ -110,12 +125,12 @@ def _fitted(number: Ints, points: Floats, normals: Floats, variance: Floats) -> 
     count = np.bincount(number, minlength=many)
     centre, direction, across = principal_axes(number, points, many)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    facing = np.bincount(number, (normals * normal[number]).sum(axis=1), many)
+    facing = np.bincount(number, dots(normals, normal[number]), many)
     normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
-    along = ((points - centre[number]) * tangent[number]).sum(axis=1)
+    along = dots(points - centre[number], tangent[number])
     first, last = extent(number, along, many)
-    unlike = 1.0 - (normals * normal[number]).sum(axis=1) ** 2 - variance
+    unlike = 1.0 - dots(normals, normal[number]) ** 2 - variance
     straight = (count >= _FEWEST) & (last - first >= _SHORTEST) & (across < _STRAIGHT)
     found = Stretches(number, along, centre, normal, first, last, straight)
     inner = found.inside(number, along)
@@ -224,15 +239,24 @@ _AT_ONCE = 1 << 13
 def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
     """Return pairs of places (m, 2) with normals (m, 2) that lie on one line and face the same way."""
     pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray")
-    one, other = pairs[_on_one_line(pairs[:, 0], pairs[:, 1], at, normal)].T
+    columns = [np.ascontiguousarray(column) for column in (*at.T, *normal.T)]
+    parts = (pairs[first : first + _PAIRS_AT_ONCE].T for first in range(0, len(pairs), _PAIRS_AT_ONCE))
+    good = [_on_one_line(one, other, *columns) for one, other in parts]
+    one, other = pairs[np.concatenate([np.zeros(0, dtype=bool), *good])].T
     return one, other
 
 
-def _on_one_line(one: Ints, other: Ints, at: Floats, normal: Floats) -> Bools:
-    step = at[other] - at[one]
-    good = (normal[one] * normal[other]).sum(axis=1) > _LEAN
-    for side in (one, other):
-        good &= np.abs((normal[side] * step).sum(axis=1)) < _OFF
+_PAIRS_AT_ONCE = 1 << 15
+"""Pairs looked at together: what fits into a processor's cache."""
+
+
+def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, left: Floats) -> Bools:
+    """Return which pairs (e,) of places do, with coordinates and normals (m,)."""
+    across, along = x.take(other) - x.take(one), y.take(other) - y.take(one)
+    (ax, ay), (bx, by) = ((ahead.take(side), left.take(side)) for side in (one, other))
+    good = ax * bx + ay * by > _LEAN
+    for nx, ny in ((ax, ay), (bx, by)):
+        good &= np.abs(nx * across + ny * along) < _OFF
     return np.asarray(good)
 
 
@@ -241,8 +265,8 @@ def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stre
     many, own = int(number.max(initial=-1)) + 1, number[stretch]
     centre, direction, _ = principal_axes(own, at, many)
     across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    across *= np.where(np.bincount(own, (normal * across[own]).sum(axis=1), many) < 0.0, -1.0, 1.0)[:, None]
-    off = np.abs(((at - centre[own]) * across[own]).sum(axis=1))
+    across *= np.where(np.bincount(own, dots(normal, across[own]), many) < 0.0, -1.0, 1.0)[:, None]
+    off = np.abs(dots(at - centre[own], across[own]))
     stretches_of = np.bincount(number[np.unique(stretch)], minlength=many)
     good = (stretches_of >= _STRETCHES) & (extent(own, off, many)[1] < _BENT)
     new = np.where(good, np.cumsum(good) - 1, -1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Table
 from ..sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 from .keyframes import KeyframeConfig, Keyframes, velocity_at
 
@@ -45,7 +45,7 @@ OUTSIDE = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanPoints:
+class ScanPoints(Table):
     """Rays of chosen scans as points in the frame of their keyframes, deskewed ray by ray."""
 
     keyframe: Ints
@@ -135,8 +135,7 @@ def beam_origins(first: Floats, sweep: Floats, scan: Ints, fraction: Floats, mou
     Within one sweep (0.1 s) the motion is taken as linear in x, y and theta; the error is below
     v omega t^2 / 8, 0.1 mm for a robot turning at 0.5 rad/s at 0.2 m/s.
     """
-    theta = first[scan, 2]
     moved = sweep[scan] * fraction[:, None]
     shift = moved[:, :2] + se2.rotate(moved[:, 2], mounting.T_base_laser[:2])
-    xy = first[scan, :2] + se2.rotate(theta, shift)
-    return np.concatenate([xy, (theta + moved[:, 2] + mounting.T_base_laser[2])[:, None]], axis=1)
+    xy = se2.transform_each(first, scan, shift)
+    return np.concatenate([xy, (first[scan, 2] + moved[:, 2] + mounting.T_base_laser[2])[:, None]], axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from ..arrays import Floats, spread
-from ..graph.eliminated import Blocks, blocks_of, rows_of
+from ..graph.eliminated import Blocks, rows_of
 from ..graph.graph import Graph, kernel_weights
 from ..graph.pose_edges import OdometryEdges
 from ..graph.unknowns import Unknowns
@@ -107,18 +107,20 @@ def _shown(residual: Floats, added: Floats) -> float | None:
 def equations(wheels: OdometryEdges, floor: Floor, graph: Graph, unknowns: Unknowns) -> Blocks:
     """Return what the floor adds to the normal equations of a graph that has the wheels among its edges, as blocks of four
     unknowns, of which two count."""
-    linearized, edges = wheels.linearize(graph), np.arange(len(wheels))
-    patch, root = edges // PATCH, np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
+    linearized = wheels.linearize(graph)
+    weight = kernel_weights(wheels, linearized.residuals)
+    patch, root = np.arange(len(wheels)) // PATCH, np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
     by_floor = wheels.length[:, None] * root[:, [0, 2]]
-    rows, columns = (3 * edges[:, None] + [0, 2]).ravel(), (4 * patch[:, None] + [0, 1]).ravel()
-    by_block = sparse.csr_matrix((by_floor.ravel(), (rows, columns)), shape=(3 * len(wheels), 4 * len(floor.value)))
-    scaled = sparse.diags(np.repeat(np.sqrt(kernel_weights(wheels, linearized.residuals)), 3))
-    added = np.zeros((len(wheels), 3))
-    added[:, [0, 2]] = by_floor * floor.value[patch]
-    by_graph, by_block = scaled @ rows_of(linearized, unknowns), scaled @ by_block
-    found = blocks_of(by_graph, by_block, scaled @ (linearized.residuals + added).ravel(), 4)
+    added, weighted = by_floor * floor.value[patch], weight[:, None] * by_floor
+    many, rows = len(floor.value), 3 * np.arange(len(wheels))[:, None] + [0, 2]
+    by_graph = rows_of(linearized, unknowns)[rows.ravel()]
+    places = (4 * patch[:, None] + [0, 1]).ravel(), np.arange(rows.size)
+    across = sparse.csr_matrix((weighted.ravel(), places), shape=(4 * many, rows.size)) @ by_graph
     prior = np.array([*np.maximum(floor.sigma, _SMALL), 1.0, 1.0]) ** -2.0
-    own_slope = found.own_slope.copy()
-    own_slope[:, :2] += floor.value * prior[:2]
-    none, slope = sparse.csr_matrix(found.among.shape), by_graph.T @ (scaled @ added.ravel())
-    return Blocks(none, found.across, found.own + np.diag(prior), slope, own_slope)
+    own, own_slope = np.tile(np.diag(prior), (many, 1, 1)), np.zeros((many, 4))
+    for k in range(2):
+        own[:, k, k] += np.bincount(patch, weighted[:, k] * by_floor[:, k], many)
+        slopes = weighted[:, k] * (linearized.residuals[:, 2 * k] + added[:, k])
+        own_slope[:, k] = np.bincount(patch, slopes, many) + floor.value[:, k] * prior[k]
+    slope = by_graph.T @ (weight[:, None] * added).ravel()
+    return Blocks(sparse.csr_matrix((unknowns.size, unknowns.size)), across, own, slope, own_slope)

@@ -14,23 +14,22 @@ real offices, rays of one place weigh as few, and pairs keep their weight.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from .. import se2
 from ..arrays import Floats, Ints
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, blocks_of, side_by_side, sparse_rows, step, summed
+from ..graph.eliminated import Blocks, entries, factor, side_by_side
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
+from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.ray_noise import RayNoise
-from ..lidar.surface_rays import MeasuredSurfaces, RayEquations, SurfaceRays, Surfaces, linearized, noise_of
+from ..lidar.surface_rays import MeasuredSurfaces, Surfaces
 from ..odometry import floor as floors
 from .estimate import Estimate, ScanClouds, Task
 from .surface_search import find_surfaces
@@ -86,7 +85,8 @@ def for_covariances(
     ]
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
-    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, lidar, unknowns)
+    sums = weighted_sums(found, lidar.sensors, graph.poses, _KERNEL)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _blocks(sums, found.surfaces, graph, lidar, unknowns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,14 +100,16 @@ class _Lidar:
     calibration: Ints
     """(4,) indices of the mounting's x, y, theta and of the delay in the calibration block; -1 = not an unknown."""
 
-    def slopes(self, by_pose: Floats, keyframe: Ints, poses: Floats) -> Floats:
-        """Return the derivatives (m, 4) of residuals by mounting and delay, from those (m, 3) by the keyframe's pose."""
-        cos, sin = se2.cos_sin(poses[keyframe, 2])
-        x, y, turn = by_pose.T
-        arm, twist = self.sensors[keyframe, :2] - poses[keyframe, :2], self.twist[keyframe]
-        ahead, left = x * cos + y * sin, y * cos - x * sin
-        own_turn = turn - y * arm[:, 0] + x * arm[:, 1]
-        return np.column_stack([ahead, left, own_turn, ahead * twist[:, 0] + left * twist[:, 1] + turn * twist[:, 2]])
+    def by_lidar(self, poses: Floats) -> Floats:
+        """Return what turns derivatives by the pose of each keyframe into those by mounting and delay, (k, 4, 3)."""
+        c, s = se2.cos_sin(poses[:, 2])
+        arm, found = self.sensors[:, :2] - poses[:, :2], np.zeros((len(poses), 4, 3))
+        found[:, 0, 0] = found[:, 1, 1] = c
+        found[:, 0, 1], found[:, 1, 0] = s, -s
+        found[:, 2] = np.column_stack([arm[:, 1], -arm[:, 0], np.ones(len(arm))])
+        found[:, 3] = np.einsum("ka,kab->kb", self.twist[:, :2], found[:, :2])
+        found[:, 3, 2] += self.twist[:, 2]
+        return found
 
 
 def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
@@ -140,25 +142,17 @@ def _adjusted(
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, subtrees=True, like=normal)
         kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
-        rays = _of_rays(found, graph, lidar, normal.unknowns, kernel=kernel)
-        certainty = _of_poses(rays, normal.unknowns)
+        sums = weighted_sums(found, lidar.sensors, poses, kernel)
+        certainty, rays = sums.poses, _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)
         both = side_by_side(rays, floors.equations(wheels, floor, graph, normal.unknowns))
-        change, by_block, order = step(normal, both, order)
+        known = factor(normal, both, order)
+        (change, by_block), order = known.step(normal, both), known.order
+        del known
         graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
         found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
-        if turn >= _SETTLING and np.abs(graph.poses - poses).max() < _STILL:
+        if turn >= _SETTLING and np.abs(se2.between(poses, graph.poses)).max() < _STILL:
             break
     return graph, found
-
-
-def _of_poses(rays: Blocks, unknowns: Unknowns) -> Floats:
-    """Return the information (n, 3, 3) that rays on surfaces that stand still have of each pose."""
-    number = unknowns.number["poses"]
-    found, free = np.zeros((len(number), 3, 3)), np.all(number >= 0, axis=1)
-    for a in range(3):
-        for b in range(3):
-            found[free, a, b] = np.asarray(rays.among[number[free, a], number[free, b]]).ravel()
-    return found
 
 
 def _measured_again(
@@ -169,41 +163,20 @@ def _measured_again(
     return measured_again(joint, graph, scans.clouds, scans.raster, task.config.refinement, weight)
 
 
-def _of_rays(
-    found: MeasuredSurfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns, kernel: float = _KERNEL
-) -> Blocks:
-    """Return the normal equations of rays and of what is known of surfaces, some rays at a time."""
-
-    def of_some(rays: SurfaceRays) -> Blocks:
-        lines = _weighted(linearized(rays, found.surfaces, lidar.sensors, graph.poses), rays, found, kernel)
-        return _of_some(rays, lines, lidar, graph, len(found.surfaces.facing), unknowns)
-
-    return summed(chain([_priors(found.surfaces, unknowns)], map(of_some, found.rays.in_parts())))
-
-
-def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
-    """Return the normal equations of what is known of surfaces beforehand."""
-    count, size = len(surfaces.facing), unknowns.size
-    own, slope = np.tile(np.diag(_PRIOR**-2.0), (count, 1, 1)), np.zeros((count, 4))
-    slope[:, 2] = surfaces.offset * _PRIOR[2] ** -2.0
-    return Blocks(sparse.csr_matrix((size, size)), sparse.csr_matrix((4 * count, size)), own, np.zeros(size), slope)
-
-
-def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, kernel: float) -> RayEquations:
-    """Return equations of rays robustly weighted, in standard deviations of the noise that was learnt."""
-    noise = found.noise.relative(np.hypot(*rays.points.T))
-    alike = found.noise.alike[found.surfaces.round[rays.surface].astype(np.int64)]
-    root = 1.0 / ((1.0 + (lines.residual / (kernel * noise)) ** 2) * noise * np.sqrt(alike))
-    return RayEquations(lines.residual * root, lines.by_pose * root[:, None], lines.by_surface * root[:, None])
-
-
-def _of_some(
-    rays: SurfaceRays, lines: RayEquations, lidar: _Lidar, graph: Graph, count: int, unknowns: Unknowns
-) -> Blocks:
-    """Return the normal equations of rays on as many surfaces."""
+def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> Blocks:
+    """Return the normal equations of rays and of what is known of surfaces beforehand."""
     # Of an index -1 the number is -1: fixed.
     of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
-    number = np.column_stack([unknowns.number["poses"][rays.keyframe], np.tile(of_lidar, (len(rays.keyframe), 1))])
-    slopes = np.column_stack([lines.by_pose, lidar.slopes(lines.by_pose, rays.keyframe, graph.poses)])
-    by_surface = sparse_rows(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
-    return blocks_of(sparse_rows(number, slopes, unknowns.size), by_surface, lines.residual, 4)
+    number = np.column_stack([unknowns.number["poses"], np.tile(of_lidar, (len(graph.poses), 1))])
+    by = np.concatenate([np.tile(np.eye(3), (len(graph.poses), 1, 1)), lidar.by_lidar(graph.poses)], axis=1)
+    among = entries(number, number, by @ sums.poses @ by.transpose(0, 2, 1), (unknowns.size, unknowns.size))
+    slope = np.zeros(unknowns.size)
+    np.add.at(slope, number[number >= 0], np.einsum("kab,kb->ka", by, sums.pose_slope)[number >= 0])
+    rows = 4 * sums.surface[:, None] + np.arange(4)
+    across = sums.across @ by[sums.keyframe].transpose(0, 2, 1)
+    across = entries(rows, number[sums.keyframe], across, (4 * len(surfaces.facing), unknowns.size))
+    # Walls have no radius.
+    across.eliminate_zeros()
+    own, own_slope = sums.surfaces + np.diag(_PRIOR**-2.0), sums.surface_slope.copy()
+    own_slope[:, 2] += surfaces.offset * _PRIOR[2] ** -2.0
+    return Blocks(among, across, own, slope, own_slope)

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, concatenated
 from ..lidar.ray_noise import UNLEARNT
-from ..lidar.round_columns import Circles, find_columns, fitted_circles
+from ..lidar.round_columns import Circles, find_columns, fitted_circles, surroundings
 from ..lidar.short_walls import Pieces, pieces_of, walls_of
 from ..lidar.surface_rays import (
+    NEAR,
     MeasuredSurfaces,
     SurfaceRays,
     around_columns,
@@ -48,14 +49,17 @@ def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Measure
         short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + many, -1)),
         on_columns(around, poses, columns, len(both.centre)),
     ]
-    return MeasuredSurfaces(surfaces_of(both, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
+    surfaces = surfaces_of(both, columns)
+    found = concatenated([part.packed() for part in rays]).by_keyframe(surfaces)
+    return MeasuredSurfaces(surfaces, found, UNLEARNT), kind
 
 
 def _on_stretches(rays: ScanPoints, scans: ScanClouds, parts: Stretches) -> tuple[SurfaceRays, Circles, Bools]:
     """Return the rays on straight stretches of their clouds, with these as surfaces; circles; and which are free (p,)."""
-    stretch = stretch_of(rays, scans.clouds, scans.raster, parts)
+    every = as_rays(rays)
+    stretch = stretch_of(every, scans.clouds, scans.raster, parts)
     on = np.flatnonzero(stretch >= 0)
-    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
+    found = bundled(every.rows(on), stretch[on], rays.scan[on], rays.ray[on])
     return found.packed(), fitted_circles(rays), stretch < 0
 
 
@@ -63,12 +67,13 @@ def _off_stretches(
     free: tuple[Bools, ...], poses: Floats, columns: Floats, scans: ScanClouds, task: Task
 ) -> tuple[SurfaceRays, Pieces, SurfaceRays]:
     """Return the rays around columns (c, 3), and of the free ones of all others the short pieces and the rays on these."""
-    around, pieces, on, first = [], [], [], 0
+    around, pieces, on, first, near_columns = [], [], [], 0, surroundings(columns, NEAR)
     for rays, unseen in zip(_rays(scans, task), free, strict=True):
         every = as_rays(rays)
-        near = around_columns(every, poses, columns)
-        around.append(every.rows(near))
-        found, some = pieces_of(rays, unseen & ~near)
+        near = around_columns(every, poses, near_columns)
+        around.append(every.rows(near).packed())
+        unseen[near] = False
+        found, some = pieces_of(rays, unseen)
         pieces.append(found)
         on.append(replace(some, surface=some.surface + first).packed())
         first += len(found.keyframe)
