@@ -81,12 +81,12 @@ def test_steps_between_keyframes_that_stay_neighbours_are_not_measured_again(mon
 
 
 @pytest.mark.parametrize(("moved", "done"), [
-    ((0.0005, 0.0005), "noise quick pattern solve"), ((0.039, 0.039), "noise quick noise pattern solve"),
-    ((0.041, 0.0005), "noise quick match noise quick pattern solve"),
-    ((0.041, 0.002), "noise quick match noise quick noise pattern solve"),
+    ((0.0005, 0.0005), "noise quick pattern quick"), ((0.039, 0.039), "noise quick noise pattern quick"),
+    ((0.041, 0.0005), "noise quick match noise quick pattern quick"),
+    ((0.041, 0.002), "noise quick match noise quick noise pattern quick"),
 ])  # fmt: skip
 def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetres(monkeypatch, moved, done):
-    """Once; ranges show another noise where poses moved by a millimetre; what another solution follows is solved roughly.
+    """Once; ranges show another noise where poses moved by a millimetre; all is solved roughly, since surfaces follow.
 
     What ranges err alike by direction is taken off before the last solution.
     """
@@ -95,7 +95,8 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     estimate = SimpleNamespace(graph=SimpleNamespace(poses=None), moved_since=lambda before: next(shifts))
 
     def solved(estimate, solver, optimizer=None):
-        made.append("solve" if solver == task.config.solver else "quick")
+        assert solver.relative_decrease > task.config.solver.relative_decrease
+        made.append("quick")
         return estimate
 
     def matched(*given):

@@ -13,8 +13,10 @@ from uwblite import mapping, se2
 from uwblite.graph.calibration import LASER, with_free
 from uwblite.graph.marginals import marginals
 from uwblite.graph.normal_equations import filled
+from uwblite.graph.solver import optimize
 from uwblite.lidar.ray_equations import linearized
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
 
@@ -120,3 +122,13 @@ def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(arou
 def test_without_pairs_of_clouds_nothing_is_adjusted(around):
     none = replace(around["before"], joint=None)
     assert adjust_surfaces(none, around["task"]) is none
+
+
+def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, monkeypatch):
+    """What stands before is a rough one."""
+    before = around["before"]
+    nothing = replace(around["after"].surfaces, rays=around["after"].surfaces.rays.rows(slice(0)))
+    monkeypatch.setattr(surface_adjustment, "find_surfaces", lambda *_: (nothing, None))
+    found = adjust_surfaces(before, around["task"])
+    assert found.surfaces is None
+    assert before.problem.chi2() > found.problem.chi2() >= optimize(found.problem)[0].chi2() * (1.0 - 1e-6)

@@ -231,7 +231,7 @@ def solved_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
-    constrains these, and it is matched again.
+    constrains these, and it is matched again. The last optimum is a rough one: the adjustment to surfaces goes on from there.
     """
     before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
     estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
@@ -245,7 +245,7 @@ def solved_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         estimate = with_range_noise(estimate, task.config)
     del optimizer  # What it analysed is as large as the covariances.
     task.stages.report("joint refinement", 1, 1)
-    return solved(_without_pattern(estimate, task), task.config.solver)
+    return solved(_without_pattern(estimate, task), quick)
 
 
 def _without_pattern(estimate: Estimate, task: Task) -> Estimate:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, rms_length
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, entries, factor, side_by_side
 from ..graph.graph import Graph
@@ -32,10 +32,11 @@ from ..lidar.ray_noise import RayNoise
 from ..lidar.surface_rays import MeasuredSurfaces, Surfaces
 from ..odometry import floor as floors
 from .estimate import Estimate, ScanClouds, Task
+from .lidar_stages import solved
 from .surface_search import find_surfaces
 
-_ROUNDS, _STILL = 6, 1e-3
-"""Most Gauss-Newton steps; the largest change of a pose, m and rad, that ends them once noise and pairs have settled."""
+_ROUNDS, _STILL = 6, 5e-4
+"""Most Gauss-Newton steps; the change of the poses, rms, m, that ends them once noise and pairs have settled."""
 _SETTLING = 2
 """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
 _KERNEL, _WIDER = 3.0, 4.0
@@ -60,7 +61,7 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     report(0, _ROUNDS + 1)
     found, kind = find_surfaces(_lidar(graph, joint, task).sensors, scans, task)
     if not len(found.rays.keyframe):
-        return estimate
+        return solved(estimate, task.config.solver)
     report(1, _ROUNDS + 1)
     graph, found = _adjusted(graph, estimate, found, kind, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
@@ -150,7 +151,7 @@ def _adjusted(
         del known
         graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
         found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
-        if turn >= _SETTLING and np.abs(se2.between(poses, graph.poses)).max() < _STILL:
+        if turn >= _SETTLING and rms_length((graph.poses - poses)[:, :2]) < _STILL:
             break
     return graph, found
 

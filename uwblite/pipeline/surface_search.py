@@ -36,21 +36,19 @@ def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Measure
     """Return the surfaces of the map with clouds at poses (k, 3) and their rays, and the kinds (p,) of the clouds' points."""
     parts = stretches(scans.clouds)
     some, circles, free = zip(*(_on_stretches(rays, scans, parts) for rays in _rays(scans, task)), strict=True)
-    long = concatenated(some)
-    columns = find_columns(concatenated(circles), poses)
+    long, columns = concatenated(some), find_columns(concatenated(circles), poses)
+    del some
     around, pieces, short = _off_stretches(free, poses, columns, scans, task)
     columns, walls = fitted_columns(around, poses, columns), find_walls(scans.clouds, parts, poses)
     kind = points_on(scans.clouds, poses, walls, parts, columns)
     small = walls_of(pieces, poses)
-    many = len(walls.centre)
     both = concatenated([walls, small])
-    rays = [
-        long.renumbered(walls.of_stretch),
-        short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + many, -1)),
-        on_columns(around, poses, columns, len(both.centre)),
-    ]
-    surfaces = surfaces_of(both, columns)
-    found = concatenated([part.packed() for part in rays]).by_keyframe(surfaces)
+    long = long.renumbered(walls.of_stretch)
+    short = short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + len(walls.centre), -1))
+    around, surfaces = on_columns(around, poses, columns, len(both.centre)), surfaces_of(both, columns)
+    found = concatenated([long, short, around])
+    del long, short, around
+    found = found.by_keyframe(surfaces)
     return MeasuredSurfaces(surfaces, found, UNLEARNT), kind
 
 
