@@ -139,7 +139,10 @@ def _sums_on_columns(
     lines = linearized(rays, surfaces, sensors, poses)
     rows = np.column_stack([lines.by_pose, lines.by_surface, lines.residual])
     rows *= (np.sqrt(share) / (1.0 + lines.residual**2 * narrow))[:, None]
-    return np.asarray(np.add.reduceat(rows[:, :, None] * rows[:, None, :], first, axis=0))
+    found = np.empty((len(first), 8, 8))
+    for a in range(8):
+        found[:, a, a:] = found[:, a:, a] = np.add.reduceat(rows[:, a:] * rows[:, a, None], first, axis=0)
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -149,7 +149,8 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     normal, off = found.normal[stretch], rays.points - found.centre[stretch]
     residual, incidence = dots(off, normal), -dots(rays.directions, normal)
     oblique = np.maximum(incidence, _INCIDENCE)
-    along = dots(off + (residual / oblique)[:, None] * rays.directions, found.tangent[stretch])
+    end = off + (residual / oblique)[:, None] * rays.directions
+    along = end[:, 0] * normal[:, 1] - end[:, 1] * normal[:, 0]
     gate = _GATE * np.hypot(rays.sigma * incidence, ROUGHNESS)
     return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
 

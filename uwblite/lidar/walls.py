@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, connected, dots, unique_rows
+from ..arrays import Bools, Floats, Ints, concatenated, connected, dots, unique_rows
 from .clouds import Clouds
 
 _GAP = 0.35
@@ -46,7 +46,7 @@ class Stretches:
     of_point: Ints
     """(p,) stretch of each of the clouds' points."""
     along: Floats
-    """(p,) m, where on its line each point stands, from the centre."""
+    """(p,) m, where on its line each point stands, from the centre; the direction is that of the normal turned right."""
     centre: Floats
     """(s, 2) m, frame of the cloud."""
     normal: Floats
@@ -58,11 +58,6 @@ class Stretches:
     straight: Bools
     """(s,) whether it is long and straight enough to be part of a wall."""
 
-    @property
-    def tangent(self) -> Floats:
-        """(s, 2) unit, in the direction of `along`."""
-        return np.stack([self.normal[:, 1], -self.normal[:, 0]], axis=1)
-
     def inside(self, stretch: Ints, along: Floats) -> Bools:
         """Return which places (m,) on stretches (m,) are not near their ends."""
         return (along > self.first[stretch] + TRIM) & (along < self.last[stretch] - TRIM)
@@ -70,10 +65,24 @@ class Stretches:
 
 def stretches(clouds: Clouds) -> Stretches:
     """Cut each cloud where neighbouring points, by bearing, are not on one line, and fit lines to the parts."""
-    points, normals = clouds.points.astype(np.float64), clouds.normals.astype(np.float64)
-    variance = clouds.normal_variance.astype(np.float64)
+    parts, many = [], 0
+    for first in range(0, max(len(clouds), 1), _CLOUDS_AT_ONCE):
+        part = _stretches_of(clouds, slice(clouds.offsets[first], clouds.offsets[min(first + _CLOUDS_AT_ONCE, len(clouds))]))
+        parts.append(replace(part, of_point=part.of_point + many))
+        many += len(part.first)
+    return concatenated(parts)
+
+
+_CLOUDS_AT_ONCE = 128
+"""Clouds that are cut together: their arrays stay in the cache."""
+
+
+def _stretches_of(clouds: Clouds, rows: slice) -> Stretches:
+    """Return the stretches of whole clouds, whose points are these rows."""
+    points, normals = clouds.points[rows].astype(np.float64), clouds.normals[rows].astype(np.float64)
+    variance = clouds.normal_variance[rows].astype(np.float64)
     lined, step = np.any(normals != 0.0, axis=1), np.diff(points, axis=0)
-    ends = (np.diff(clouds.owner) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
+    ends = (np.diff(clouds.owner[rows]) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
     for side in (normals[1:], normals[:-1]):
         ends |= np.abs(dots(side, step)) > _STEP
     noise = _SIGMAS**2 * (variance[1:] + variance[:-1])
