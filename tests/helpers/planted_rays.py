@@ -28,4 +28,4 @@ def rays_that_end(extra=0.0):
     curved = middle - np.sqrt(np.maximum(0.16 - (to**2).sum(axis=1) + middle**2, 0.0))
     reach = np.where(surface == 0, flat, curved) + SURFACES.offset[surface] + extra
     local = se2.rotate(-POSES[keyframe, 2], way)
-    return SurfaceRays(keyframe, surface, reach[:, None] * local, local, np.full(40, 0.01))
+    return SurfaceRays(keyframe, surface, reach[:, None] * local, local, np.full(40, 0.01), np.arange(40))

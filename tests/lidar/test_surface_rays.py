@@ -10,7 +10,7 @@ from helpers.planted_rays import POSES, rays_that_end
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.round_columns import surroundings
-from uwblite.lidar.surface_rays import NEAR, around_columns, as_rays, bundled, on_columns, points_on, stretch_of
+from uwblite.lidar.surface_rays import NEAR, around_columns, as_rays, on_columns, points_on, stretch_of
 from uwblite.lidar.walls import find_walls, stretches
 from uwblite.odometry.attached import ScanPoints
 
@@ -26,7 +26,7 @@ def test_rays_of_a_wall_are_bundled_and_lie_on_it(noise):
     rays = ScanPoints(nothing, reach[:, None] * way, np.zeros((300, 2)), np.arange(300), nothing)
     stretch = stretch_of(as_rays(rays), clouds, rasterize(clouds, 0.1, 0.3), stretches(clouds))
     on = np.flatnonzero(stretch >= 0)
-    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
+    found = replace(as_rays(rays), surface=stretch).rows(on).bundled()
     assert 60 <= len(found.keyframe) <= 76
     off = found.points[:, 1] - 1.0
     assert np.abs(off).max() < max(4.0 * 0.5 * noise, 2e-3)

@@ -19,6 +19,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
+from uwblite.pipeline.surface_search import FoundSurfaces
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +128,9 @@ def test_without_pairs_of_clouds_nothing_is_adjusted(around):
 def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, monkeypatch):
     """What stands before is a rough one."""
     before = around["before"]
-    nothing = replace(around["after"].surfaces, rays=around["after"].surfaces.rays.rows(slice(0)))
-    monkeypatch.setattr(surface_adjustment, "find_surfaces", lambda *_: (nothing, None))
+    measured = around["after"].surfaces
+    nothing = FoundSurfaces(replace(measured, rays=measured.rays.rows(slice(0))), None, None, measured.rays.rows(slice(0)))
+    monkeypatch.setattr(surface_adjustment, "find_surfaces", lambda *_: nothing)
     found = adjust_surfaces(before, around["task"])
     assert found.surfaces is None
     assert before.problem.chi2() > found.problem.chi2() >= optimize(found.problem)[0].chi2() * (1.0 - 1e-6)

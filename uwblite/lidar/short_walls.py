@@ -6,7 +6,7 @@ one, until each piece is as straight as the noise of its rays lets it look. Piec
 facing the same way, are one wall.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import MAD_TO_SIGMA, Bools, Floats, Ints, Table, connected
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
-from .surface_rays import ROUGHNESS, SurfaceRays, as_rays, bundled
+from .surface_rays import ROUGHNESS, SurfaceRays, as_rays
 from .walls import Walls
 
 _GAP, _SIGMAS, _MISSED = 0.35, 5.0, 2
@@ -103,7 +103,7 @@ def pieces_of(rays: ScanPoints, free: Bools) -> tuple[Pieces, SurfaceRays]:
     inner = last - first - 2
     piece = np.repeat(np.arange(len(first)), inner)
     on = rows[np.arange(len(piece)) + (first + 1 - np.cumsum(inner) + inner)[piece]]
-    return found, bundled(as_rays(rays).rows(on), piece, rays.scan[on], rays.ray[on])
+    return found, replace(as_rays(rays).rows(on), surface=piece).bundled()
 
 
 def _apart(scan: Ints, ray: Ints, points: Floats, reach: Floats, sigma: Floats) -> Bools:

@@ -28,7 +28,7 @@ _GATE = 4.0
 """Standard deviations within which a ray ends on the surface."""
 ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
-_INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
+INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
 """Least cosine of incidence on walls, and on columns, whose edges return anything."""
 _SLACK = 0.03
 """What a column's place and radius are off at first, m."""
@@ -85,6 +85,8 @@ class SurfaceRays(Table):
     """(m, 2) unit, same frame."""
     sigma: NDArray[np.floating]
     """(m,) m, along the ray, by data sheets."""
+    bundle: NDArray[np.signedinteger]
+    """(m,) number of the few neighbouring rays of one scan that count as one where they end on one surface."""
 
     def by_keyframe(self, surfaces: Surfaces) -> "SurfaceRays":
         """Return the rays in order: those on walls before those on columns, by keyframe, and by surface."""
@@ -106,9 +108,26 @@ class SurfaceRays(Table):
     def packed(self) -> "SurfaceRays":
         """Return the rays in half the memory: single precision is a few micrometres at the reach of a lidar, as in clouds."""
         points, directions, sigma = (v.astype(np.float32) for v in (self.points, self.directions, self.sigma))
-        return SurfaceRays(self.keyframe.astype(np.int32), self.surface.astype(np.int32), points, directions, sigma)
+        keyframe, surface = self.keyframe.astype(np.int32), self.surface.astype(np.int32)
+        return SurfaceRays(keyframe, surface, points, directions, sigma, self.bundle)
+
+    def bundled(self) -> "SurfaceRays":
+        """Return neighbouring rays of one scan on one surface as their mean, which weighs as they together do; the rays of a
+        scan are in order."""
+        first = np.flatnonzero(np.diff(np.stack([self.bundle, self.surface]), axis=1, prepend=-1).any(axis=0))
+        if not len(first):
+            return self
+        count = np.diff(np.append(first, len(self.bundle)))[:, None]
+        points, ways = (np.add.reduceat(v.astype(np.float64), first, axis=0) / count for v in (self.points, self.directions))
+        sigma = np.add.reduceat(self.sigma, first) / count[:, 0] / np.sqrt(count[:, 0])
+        directions = ways / np.hypot(*ways.T)[:, None]
+        return replace(self.rows(first), points=points, directions=directions, sigma=sigma)
 
 
+_BUNDLE = 4
+"""Neighbouring rays that count as one."""
+_MOST_RAYS = 1 << 14
+"""Rays of a scan."""
 _RAYS_AT_ONCE, _POINTS_AT_ONCE = 1 << 14, 1 << 16
 """Rays, and points of clouds, that are looked at together."""
 
@@ -127,7 +146,8 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     way = rays.points - rays.origins
     reach = np.maximum(np.hypot(*way.T), 1e-9)
     none = np.full(len(reach), -1)
-    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach))
+    bundle = (rays.scan * _MOST_RAYS + rays.ray) // _BUNDLE
+    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
 def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: Stretches) -> Ints:
@@ -148,33 +168,11 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     """Return which rays (m,) end on these stretches (m,), where their noise is taken away along the ray."""
     normal, off = found.normal[stretch], rays.points - found.centre[stretch]
     residual, incidence = dots(off, normal), -dots(rays.directions, normal)
-    oblique = np.maximum(incidence, _INCIDENCE)
+    oblique = np.maximum(incidence, INCIDENCE)
     end = off + (residual / oblique)[:, None] * rays.directions
     along = end[:, 0] * normal[:, 1] - end[:, 1] * normal[:, 0]
     gate = _GATE * np.hypot(rays.sigma * incidence, ROUGHNESS)
-    return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
-
-
-def bundled(rays: SurfaceRays, surface: Ints, scan: Ints, ray: Ints) -> SurfaceRays:
-    """Return neighbouring rays of one scan on one surface (m,) as their mean, which weighs as they together do.
-
-    Parameters
-    ----------
-    scan, ray : (m,) numbers of the rays, ascending.
-    """
-    key = np.stack([scan, surface, ray // _BUNDLE])
-    first = np.flatnonzero(np.diff(key, axis=1, prepend=-1).any(axis=0))
-    if not len(first):
-        return replace(rays, surface=surface)
-    count = np.diff(np.append(first, len(scan)))[:, None]
-    points, ways = (np.add.reduceat(v, first, axis=0) / count for v in (rays.points, rays.directions))
-    sigma = np.add.reduceat(rays.sigma, first) / count[:, 0] / np.sqrt(count[:, 0])
-    directions = ways / np.hypot(*ways.T)[:, None]
-    return SurfaceRays(rays.keyframe[first], surface[first], points, directions, sigma)
-
-
-_BUNDLE = 4
-"""Rays on a wall that are taken as one."""
+    return np.asarray(found.inside(stretch, along) & (incidence > INCIDENCE) & (np.abs(residual) < gate))
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
@@ -185,7 +183,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[nearest, :2], direction, columns[nearest, 2])
     good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE * rays.sigma + _SLACK)
-    return replace(rays, surface=nearest + first).rows(good)
+    return replace(rays, surface=nearest + first).rows(good).bundled()
 
 
 NEAR = 0.3
@@ -201,12 +199,25 @@ def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> I
 def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:
     """Return of what each of the clouds' points (p,) is: 0 a wall, 1 one of the columns (c, 3), -1 neither."""
     kind = np.where(walls.of_stretch >= 0, 0, -1).astype(np.int8)[found.of_point]
-    near = surroundings(columns, _ROUND)
-    for first in range(0, len(kind) if len(columns) else 0, _POINTS_AT_ONCE):
+    kind[_around(clouds, poses, columns)] = 1
+    return kind
+
+
+def without_columns(kind: NDArray[np.int8], clouds: Clouds, poses: Floats, columns: Floats) -> NDArray[np.int8]:
+    """Return the kinds (p,) of the clouds' points, see points_on, where columns (c, 3) have turned out to be none."""
+    kind = kind.copy()
+    kind[_around(clouds, poses, columns)] = -1
+    return kind
+
+
+def _around(clouds: Clouds, poses: Floats, columns: Floats) -> Ints:
+    """Return the numbers (n,) of the clouds' points on columns (c, 3)."""
+    near, found = surroundings(columns, _ROUND), [np.zeros(0, dtype=np.int64)]
+    for first in range(0, len(clouds.points) if len(columns) else 0, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         rows, which, away = near.nearest(se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64)))
-        kind[first + rows[np.abs(away - columns[which, 2]) < _ROUND]] = 1
-    return kind
+        found.append(first + rows[np.abs(away - columns[which, 2]) < _ROUND])
+    return np.concatenate(found)
 
 
 _ROUND = 0.06

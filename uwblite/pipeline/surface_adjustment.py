@@ -33,7 +33,7 @@ from ..lidar.surface_rays import MeasuredSurfaces, Surfaces
 from ..odometry import floor as floors
 from .estimate import Estimate, ScanClouds, Task
 from .lidar_stages import solved
-from .surface_search import find_surfaces
+from .surface_search import FoundSurfaces, find_surfaces
 
 _ROUNDS, _STILL = 6, 5e-4
 """Most Gauss-Newton steps; the change of the poses, rms, m, that ends them once noise and pairs have settled."""
@@ -59,11 +59,11 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     graph = replace(estimate.graph, fixed_calibration=fixed)
     report = task.stages.reporter("surfaces")
     report(0, _ROUNDS + 1)
-    found, kind = find_surfaces(_lidar(graph, joint, task).sensors, scans, task)
-    if not len(found.rays.keyframe):
+    first = find_surfaces(_lidar(graph, joint, task).sensors, scans, task)
+    if not len(first.measured.rays.keyframe):
         return solved(estimate, task.config.solver)
     report(1, _ROUNDS + 1)
-    graph, found = _adjusted(graph, estimate, found, kind, task)
+    graph, found = _adjusted(graph, estimate, first, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
@@ -120,24 +120,23 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
 
 
 def _adjusted(
-    graph: Graph, estimate: Estimate, found: MeasuredSurfaces, kind: NDArray[np.int8], task: Task
+    graph: Graph, estimate: Estimate, first: FoundSurfaces, task: Task
 ) -> tuple[Graph, MeasuredSurfaces]:
-    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these.
-
-    Parameters
-    ----------
-    kind : (p,) of the clouds' points, see points_on.
-    """
+    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these."""
+    found, kind = first.measured, first.kind
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
     floor, certainty = floors.even(wheels), np.zeros((0, 3, 3))
     assert joint is not None
     others = () if estimate.ranges is None else (estimate.ranges,)
     for turn in range(_ROUNDS):
-        poses, lidar, many = graph.poses, _lidar(graph, joint, task), len(found.surfaces.facing)
+        poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
         if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
+            own = weighted_sums(found, lidar.sensors, poses, _KERNEL).surfaces + np.diag(_PRIOR**-2.0)
+            revised = first.revised(found, estimate.lidar.clouds, lidar.sensors, poses, own)
+            found, kind, order = revised.measured, revised.kind, None
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
@@ -149,6 +148,7 @@ def _adjusted(
         known = factor(normal, both, order)
         (change, by_block), order = known.step(normal, both), known.order
         del known
+        many = len(found.surfaces.facing)
         graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
         found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
         if turn >= _SETTLING and rms_length((graph.poses - poses)[:, :2]) < _STILL:

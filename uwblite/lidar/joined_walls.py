@@ -1,0 +1,129 @@
+"""Pieces of wall that are one wall: on one line, with one range offset, and nothing was seen through the gap between them.
+
+Clouds show a wall in pieces, since what stands in front of it hides parts. One wall of many metres holds headings better than
+its pieces do; but the wall on the other side of a door is painted, and built, on its own. So pieces are joined where their
+places, directions and range offsets agree, where the gap is short, and where no ray has passed through it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, Table, concatenated, connected, dots
+from .surface_rays import MeasuredSurfaces, SurfaceRays, Surfaces
+from .walls import extent
+
+_LEAN, _OFF = 0.15, 0.05
+"""Largest difference of directions, rad, and of places across, m, with which pieces are compared at all."""
+_GAP, _CLOSE = 2.0, 0.1
+"""Longest gap, m, and one that is too short to be seen through."""
+_CHI2 = 11.3
+"""Largest chi2 of three between pieces: its 99 % quantile."""
+_BENT = np.array([0.002, 0.003, 0.0])
+"""What pieces of one wall differ by in direction, rad, place, m, and offset, m, beside the noise of their rays."""
+_FRONT, _BEHIND = 0.05, 0.12
+"""A ray has passed through a gap that begins in front of the wall and ends behind it by so much, m."""
+_THROUGH = 3
+"""Rays that show that a gap is open."""
+_SAMPLE = 1 << 17
+"""Rays that are asked whether they passed, at most."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gaps(Table):
+    """Pairs (e) of pieces that may be one wall."""
+
+    one: Ints
+    other: Ints
+    first: Floats
+    """(e,) m, where the gap begins, along the line of the one piece from its own place; overlaps begin after they end."""
+    last: Floats
+    """(e,) m, where it ends."""
+
+
+def with_joined_walls(found: MeasuredSurfaces, information: Floats, sensors: Floats) -> tuple[MeasuredSurfaces, Ints]:
+    """Return the surfaces with pieces of one wall as one, and the number (s,) of each surface among them.
+
+    Parameters
+    ----------
+    information : (s, 4, 4) of each surface from its rays, by the step of Surfaces.moved. sensors : (k, 3) frames of the
+        keyframes' rays in the map.
+    """
+    surfaces, rays = found.surfaces, found.rays
+    gaps = _agreeing(surfaces, _gaps(surfaces, rays, sensors), information)
+    closed = (gaps.last - gaps.first < _CLOSE) | ~_seen_through(surfaces, rays, sensors, gaps)
+    number = connected(gaps.one[closed], gaps.other[closed], len(surfaces.facing))
+    # Each goes on as the piece of most rays.
+    largest = np.lexsort((np.bincount(rays.surface, minlength=len(number)), number))
+    kept = largest[np.flatnonzero(np.diff(number[largest], append=-1))]
+    order = np.sort(kept)
+    new = np.empty(len(kept), dtype=np.int64)
+    new[number[order]] = np.arange(len(order))
+    of = new[number]
+    joined = surfaces.rows(order)
+    return replace(found, surfaces=joined, rays=replace(rays, surface=of[rays.surface]).by_keyframe(joined)), of
+
+
+def _along(surfaces: Surfaces) -> tuple[Floats, Floats]:
+    """Return the normals (s, 2) of walls and their directions (s, 2)."""
+    normal = np.stack(se2.cos_sin(surfaces.facing), axis=1)
+    return normal, np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+
+
+def _gaps(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats) -> _Gaps:
+    """Return the pairs of walls that lie and face about alike and are not far apart."""
+    normal, way = _along(surfaces)
+    ended = se2.transform_each(sensors, rays.keyframe, rays.points)
+    first, last = extent(rays.surface, dots(ended - surfaces.place[rays.surface], way[rays.surface]), len(normal))
+    walls = np.flatnonzero(~surfaces.round & (last > first))
+    found = [_Gaps(walls[:0], walls[:0], np.zeros(0), np.zeros(0))]
+    for k, one in enumerate(walls.tolist()):
+        other = walls[k + 1 :]
+        step = surfaces.place[other] - surfaces.place[one]
+        at, lean = step @ way[one], np.abs(se2.wrap_angle(surfaces.facing[other] - surfaces.facing[one]))
+        begin, end = at + first[other], at + last[other]
+        after = begin > first[one] + 0.5 * (last[one] - first[one]) - 0.5 * (end - begin)
+        gap_first, gap_last = np.where(after, last[one], end), np.where(after, begin, first[one])
+        middle = surfaces.place[one] + 0.5 * (gap_first + gap_last)[:, None] * way[one]
+        off = np.abs(dots(middle - surfaces.place[other], normal[other]))
+        near = np.flatnonzero((lean < _LEAN) & (gap_last - gap_first < _GAP) & (off < _OFF))
+        found.append(_Gaps(np.full(len(near), one), other[near], gap_first[near], gap_last[near]))
+    return concatenated(found)
+
+
+def _agreeing(surfaces: Surfaces, gaps: _Gaps, information: Floats) -> _Gaps:
+    """Return the pairs whose lines agree at the gap, and their offsets."""
+    covariance = np.linalg.inv(information[:, :3, :3])
+    normal, way = _along(surfaces)
+    middle = surfaces.place[gaps.one] + (0.5 * (gaps.first + gaps.last))[:, None] * way[gaps.one]
+    total, lines = np.tile(np.diag(_BENT**2), (len(gaps.one), 1, 1)), []
+    for side in (gaps.one, gaps.other):
+        away = middle - surfaces.place[side]
+        turn = np.tile(np.eye(3), (len(side), 1, 1))
+        turn[:, 1, 0] = -dots(away, way[side])
+        total += turn @ covariance[side] @ turn.transpose(0, 2, 1)
+        lines.append(dots(away, normal[side]))
+    turned = se2.wrap_angle(surfaces.facing[gaps.one] - surfaces.facing[gaps.other])
+    apart = np.column_stack([turned, lines[1] - lines[0], surfaces.offset[gaps.one] - surfaces.offset[gaps.other]])
+    chi2 = np.einsum("ea,ea->e", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
+    return gaps.rows(np.flatnonzero(chi2 < _CHI2))
+
+
+def _seen_through(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats, gaps: _Gaps) -> Bools:
+    """Return through which gaps (e,) that are long enough rays have passed."""
+    some, open_ = rays.rows(slice(None, None, 1 + len(rays.keyframe) // _SAMPLE)), np.zeros(len(gaps.one), dtype=bool)
+    ended = se2.transform_each(sensors, some.keyframe, some.points)
+    normal, way = _along(surfaces)
+    for gap in np.flatnonzero(gaps.last - gaps.first > _CLOSE).tolist():
+        wall = gaps.one[gap]
+        ahead = (sensors[:, :2] - surfaces.place[wall]) @ normal[wall]
+        rows = np.flatnonzero((ahead > _FRONT)[some.keyframe])
+        behind = (ended[rows] - surfaces.place[wall]) @ normal[wall]
+        rows, behind = rows[behind < -_BEHIND], behind[behind < -_BEHIND]
+        begin = sensors[some.keyframe[rows], :2]
+        share = ahead[some.keyframe[rows]] / (ahead[some.keyframe[rows]] - behind)
+        at = (begin + share[:, None] * (ended[rows] - begin) - surfaces.place[wall]) @ way[wall]
+        inner = (at > gaps.first[gap] + 0.5 * _CLOSE) & (at < gaps.last[gap] - 0.5 * _CLOSE)
+        open_[gap] = np.count_nonzero(inner) >= _THROUGH
+    return open_
