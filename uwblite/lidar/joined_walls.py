@@ -52,7 +52,10 @@ def with_joined_walls(found: MeasuredSurfaces, information: Floats, sensors: Flo
     """
     surfaces, rays = found.surfaces, found.rays
     gaps = _agreeing(surfaces, _gaps(surfaces, rays, sensors), information)
-    closed = (gaps.last - gaps.first < _CLOSE) | ~_seen_through(surfaces, rays, sensors, gaps)
+    closed = gaps.last - gaps.first < _CLOSE
+    number = connected(gaps.one[closed], gaps.other[closed], len(surfaces.facing))
+    asked = np.flatnonzero(number[gaps.one] != number[gaps.other])
+    closed[asked] = ~_seen_through(surfaces, rays, sensors, gaps.rows(asked))
     number = connected(gaps.one[closed], gaps.other[closed], len(surfaces.facing))
     # Each goes on as the piece of most rays.
     largest = np.lexsort((np.bincount(rays.surface, minlength=len(number)), number))
@@ -111,12 +114,11 @@ def _agreeing(surfaces: Surfaces, gaps: _Gaps, information: Floats) -> _Gaps:
 
 
 def _seen_through(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats, gaps: _Gaps) -> Bools:
-    """Return through which gaps (e,) that are long enough rays have passed."""
+    """Return through which gaps (e,) rays have passed."""
     some, open_ = rays.rows(slice(None, None, 1 + len(rays.keyframe) // _SAMPLE)), np.zeros(len(gaps.one), dtype=bool)
     ended = se2.transform_each(sensors, some.keyframe, some.points)
     normal, way = _along(surfaces)
-    for gap in np.flatnonzero(gaps.last - gaps.first > _CLOSE).tolist():
-        wall = gaps.one[gap]
+    for gap, wall in enumerate(gaps.one.tolist()):
         ahead = (sensors[:, :2] - surfaces.place[wall]) @ normal[wall]
         rows = np.flatnonzero((ahead > _FRONT)[some.keyframe])
         behind = (ended[rows] - surfaces.place[wall]) @ normal[wall]

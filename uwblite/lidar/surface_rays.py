@@ -140,6 +140,12 @@ class MeasuredSurfaces:
     rays: SurfaceRays
     noise: RayNoise
 
+    def shown(self) -> "MeasuredSurfaces":
+        """Return the surfaces that rays show."""
+        used = np.unique(self.rays.surface)
+        rays = replace(self.rays, surface=np.searchsorted(used, self.rays.surface).astype(np.int32))
+        return replace(self, surfaces=self.surfaces.rows(used), rays=rays)
+
 
 def as_rays(rays: ScanPoints) -> SurfaceRays:
     """Return rays of which it is not known yet on which surface they end."""

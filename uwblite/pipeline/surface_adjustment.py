@@ -135,8 +135,8 @@ def _adjusted(
         if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
             own = weighted_sums(found, lidar.sensors, poses, _KERNEL).surfaces + np.diag(_PRIOR**-2.0)
-            revised = first.revised(found, estimate.lidar.clouds, lidar.sensors, poses, own)
-            found, kind, order = revised.measured, revised.kind, None
+            found, kind = first.revised(found, estimate.lidar.clouds, lidar.sensors, poses, own)
+            order = None
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))

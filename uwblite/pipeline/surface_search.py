@@ -50,8 +50,9 @@ class FoundSurfaces:
 
     def revised(
         self, measured: MeasuredSurfaces, clouds: Clouds, sensors: Floats, poses: Floats, information: Floats
-    ) -> "FoundSurfaces":
-        """Return the surfaces without columns that are none, with pieces of one wall joined, and more rays on short walls.
+    ) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
+        """Return the surfaces without columns that are none, with pieces of one wall joined, and more rays on short walls;
+        and the kinds (p,) of the clouds' points.
 
         Parameters
         ----------
@@ -65,8 +66,8 @@ class FoundSurfaces:
         measured, number = with_joined_walls(measured, information, sensors)
         short = np.ones(len(measured.surfaces.facing), dtype=bool)
         short[number[~self.short]] = False
-        measured = with_free_rays(measured, short, self.free, sensors)
-        return FoundSurfaces(measured, without_columns(self.kind, clouds, sensors, columns), short, self.free)
+        measured = with_free_rays(measured, short, self.free, sensors).shown()
+        return measured, without_columns(self.kind, clouds, sensors, columns)
 
 
 _MISFIT = 1.3
