@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.submaps import SubmapConfig, build, cut
+from uwblite.lidar.submaps import SubmapConfig, build, cut, of_pieces
 
 KEEP = SubmapConfig(epsilon=2.0, voxel=0.08, std_ratio=1e6, min_neighbours=0)
 """No filter but the voxels."""
@@ -102,3 +102,16 @@ def test_sub_maps_of_a_recording_without_returns_are_empty():
     made = build(empty, np.zeros((3, 3)), np.array([0.0, 3.0, 6.0]), np.zeros(3, dtype=np.int64), KEEP)
     assert len(made) == 3
     assert made.clouds.counts.tolist() == [0, 0, 0]
+
+
+def test_what_moves_as_a_whole_is_not_bent():
+    """Two sub-maps moved apart, and one of them bent by 3 cm at one of its five keyframes."""
+    poses = np.column_stack([np.arange(10.0), np.zeros(10), np.linspace(0.0, 3.0, 10)])
+    first, last = np.array([0, 5]), np.array([5, 10])
+    made = of_pieces(scanned(poses, ROOM), poses, first, last, np.array([2, 7]), KEEP)
+    after = poses.copy()
+    for rows, motion in ((slice(0, 5), [0.3, -0.2, 0.5]), (slice(5, 10), [-1.0, 2.0, -2.0])):
+        after[rows] = se2.compose(np.array(motion), poses[rows])
+    assert made.bent(poses, after) < 1e-12
+    after[9, :2] += [0.018, 0.024]
+    assert made.bent(poses, after) == pytest.approx(0.03 / np.sqrt(10.0), rel=1e-6)

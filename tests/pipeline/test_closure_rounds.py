@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, returned
 
+from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.lidar.submaps import SubmapConfig, of_pieces
 from uwblite.loop_closure.closures import LoopClosureConfig, no_closures
 from uwblite.loop_closure.long_stretches import cut
 from uwblite.pipeline import closure_rounds
 from uwblite.pipeline.closure_rounds import _check_open_loops
+from uwblite.pipeline.estimate import Estimate, ScanClouds
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 
@@ -57,3 +59,29 @@ def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_w
         [("long stretches", len(set().union(*asked)), 0)] if tried else []
     )
     assert sum(map(len, asked)) == len(set().union(*asked))
+
+
+@pytest.mark.parametrize(("by", "built"), [(0.003, 1), (0.1, 4)])
+def test_sub_maps_are_made_again_where_closures_bent_them(monkeypatch, by, built):
+    """Each of four rounds moves every other keyframe aside."""
+    truth, graph, path, clouds = returned(CORRIDOR, 1.0, [0.0, 0.0, 0.0])
+    made, build = [], closure_rounds.submaps.build
+    monkeypatch.setattr(closure_rounds.submaps, "build", lambda *given: made.append(given) or build(*given))
+    again = SimpleNamespace(edges=np.zeros(3), candidates=())
+
+    def reconciled(graph, *_):
+        poses = graph.poses.copy()
+        poses[::2, 1] += by
+        return graph.updated(poses, graph.anchors, graph.calibration.values), no_closures()
+
+    monkeypatch.setattr(closure_rounds, "_verified", lambda *_: again)
+    monkeypatch.setattr(closure_rounds.closure_candidates, "missed", lambda *_: set())
+    monkeypatch.setattr(closure_rounds.closures, "merged", lambda found, new: found)
+    monkeypatch.setattr(closure_rounds.verification, "reconcile", reconciled)
+    recordings = SimpleNamespace(stamps=np.arange(len(truth)), of_keyframe=np.zeros(len(truth), dtype=np.int64), path=path)
+    task = SimpleNamespace(recordings=recordings, config=MappingConfig(), stages=Stages(None, None), executor=None)
+    odometry = next(e for e in graph.edges if isinstance(e, OdometryEdges))
+    estimate = Estimate(graph, odometry, None, (), scans=ScanClouds(clouds, None, 0.0))
+    closure_rounds.close_loops(estimate, task)
+    assert len(task.stages.done) == 4
+    assert len(made) == built

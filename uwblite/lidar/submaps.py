@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, rms_length
 from ..config import setting
 from .clouds import Clouds, cell_number, joined, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
@@ -56,6 +56,12 @@ class Submaps:
 
     def __len__(self) -> int:
         return len(self.first)
+
+    def bent(self, before: Floats, after: Floats) -> float:
+        """Return how far keyframes are, in the frames of their sub-maps, from where they were, rms, m; by all poses (k, 3)."""
+        of = np.repeat(self.reference, self.last - self.first)
+        one, other = (se2.between(poses[of], poses[self.first[0] : self.last[-1]]) for poses in (before, after))
+        return rms_length((one - other)[:, :2])
 
 
 def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:

@@ -29,9 +29,11 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     with_ranges = estimate.ranges is not None
+    pieces, built = None, base.poses
     for lap in range(config.loop_closure.rounds):
-        pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
-        pieces, free = _static(pieces, base, estimate)
+        if pieces is None or pieces.bent(built, base.poses) > _BENT:
+            pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
+            (pieces, free), built = _static(pieces, base, estimate), base.poses
         # No name holds the covariance: among a thousand sub-maps it is a hundred megabytes.
         candidates = closure_candidates.propose(
             base, JointCovariance(base.with_edges(found.edges), pieces.reference), pieces, recordings.of_keyframe,
@@ -56,6 +58,10 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     if stretches is not None:
         _check_open_loops(base, found, stretches, with_ranges, task)
     return replace(estimate, closures=found).with_estimates_of(base)
+
+
+_BENT = 0.01
+"""How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
 
 
 def _with_long_stretches_tied(
