@@ -26,6 +26,7 @@ from .pipeline import (
     map_frame,
     mirror_images,
     moved_anchors,
+    odometry_units,
     place_agreement,
     radio_stages,
     scan_selection,
@@ -69,7 +70,7 @@ def build_map(
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [scan_selection.prepared(log, config) for log in logs]
-    config = radio_stages.with_units_checked(config, logs)
+    config = odometry_units.with_units_checked(config, logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task, logs = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)
@@ -84,7 +85,7 @@ def build_map(
 def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, list[SensorLog]]:
     """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
     estimate, config = radio_stages.first_optimisation(task), task.config
-    factors = radio_stages.odometry_unit_factors(estimate, task)
+    factors = odometry_units.odometry_unit_factors(estimate, task)
     if np.all(factors == 1.0):
         return estimate, task, logs
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, spread
+from ..arrays import Bools, spread
 from ..graph import calibration
 from ..graph.calibration import (
     BIAS,
@@ -32,8 +32,6 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from ..screening.units import likely_unit
-from ..sensor_log import SensorLog
 from . import anchor_heights, joining, map_frame, other_minima
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -143,67 +141,6 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
 
 _NOISE_ROUNDS = 3
 """Times that noise is estimated and the graph optimised; in the last one the radio's calibration is free too."""
-
-
-def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
-    """Return the settings without the hypothesis that a unit of the wheels is wrong, where a lidar has measured their ways.
-
-    Ranges through walls to an anchor or two may fit wheels several times too short better than a path that is right. Lidar and
-    wheels that agree would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
-    """
-    ways = np.array([float("nan") if log.screening is None else log.screening.lidar_by_wheels for log in logs])
-    if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
-        return config
-    priors = config.calibration
-    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
-
-
-def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
-    """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres; warn of it.
-
-    It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
-    """
-    calibration, recordings = estimate.graph.calibration, task.recordings
-    places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
-    factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
-    factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
-    other = estimate.other_heights
-    for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
-        if factor != 1.0:
-            double = abs(abs(np.log2(abs(factor))) - 1.0) < _DOUBLE
-            unit = likely_unit(factor)
-            either = double or "yards" in unit
-            unclear = either and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
-            reason = _TWICE if unclear and double else "the odometry has a wrong unit and was multiplied by that"
-            whose = f"{recording.name}: " if len(recordings) > 1 else ""
-            text = (
-                f"{whose}by the ranges (times of flight) the robot drove {factor:.3f} times the distance that its "
-                f"odometry counts: {reason}{unit}"
-            )
-            high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
-            if other is not None and high:
-                text += f"; or the odometry is right and the anchors are {other.high:.1f} m above the tag: give their heights"
-            add = task.stages.doubt if unclear or high else task.stages.warn
-            add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
-    return factors
-
-
-def _lidar_agrees(recording: Recording, factor: float) -> bool:
-    """Return whether the lidar measures ways that are longer than the wheels' by a factor, more likely than as long."""
-    screening = recording.log.screening
-    ratio = float("nan") if screening is None else screening.lidar_by_wheels
-    return abs(ratio - factor) < abs(ratio - 1.0)
-
-
-_OTHER_UNIT = 0.12
-"""Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
-_DOUBLE = 0.1
-"""A factor is 2 or 1/2 up to this, by its logarithm to the base 2."""
-_TWICE = (
-    "either the wheels' radius and diameter were mistaken for each other, or the radio reports twice or half "
-    "the distance, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
-    "between two anchors"
-)
 
 
 def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
