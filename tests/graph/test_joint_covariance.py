@@ -1,14 +1,16 @@
 """Covariances among chosen poses against those of all."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import calibrated_loop, loop
+from helpers.planted_graphs import calibrated_loop, dense_system, loop
 
+from uwblite.errors import SolverError
 from uwblite.graph import joint_covariance
 from uwblite.graph.graph import Graph
-from uwblite.graph.joint_covariance import JointCovariance
+from uwblite.graph.joint_covariance import JointCovariance, calibration_covariance
 from uwblite.graph.marginals import marginals
 
 
@@ -39,6 +41,24 @@ def test_pieces_of_the_work_change_no_bit(monkeypatch):
     monkeypatch.setattr(joint_covariance, "_COLUMNS_AT_ONCE", 7)
     assert JointCovariance(graph, chosen).relative(i, j).tobytes() == whole.tobytes()
     assert JointCovariance(graph, chosen).relative(i[:0], j[:0]).shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("fixed", [[False, False], [False, True], [True, False], [True, True]])
+def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
+    graph = replace(calibrated_loop()[0], fixed_calibration=np.array(fixed))
+    H, _, number = dense_system(graph)
+    padded = np.zeros((len(H) + 1, len(H) + 1))
+    padded[:-1, :-1] = np.linalg.inv(H)
+    expected = padded[np.ix_(number["calibration"][:, 0], number["calibration"][:, 0])]
+    np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
+
+
+def test_a_calibration_with_a_direction_that_nothing_measures_has_no_covariance(monkeypatch):
+    graph, _ = calibrated_loop()
+    ends = joint_covariance._end(graph, None)
+    monkeypatch.setattr(joint_covariance, "_end", lambda *given: (*ends[:3], 0.0 * ends[3], ends[4]))
+    with pytest.raises(SolverError, match="singular"):
+        calibration_covariance(graph)
 
 
 def test_of_many_pairs_little_more_is_in_memory_than_their_covariances():

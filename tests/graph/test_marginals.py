@@ -6,11 +6,7 @@ from helpers.planted_graphs import calibrated_loop, dense_system, loop, relative
 
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
-from uwblite.graph.marginals import (
-    CommonErrors,
-    calibration_covariance,
-    marginals,
-)
+from uwblite.graph.marginals import CommonErrors, marginals
 from uwblite.graph.solver import optimize
 from uwblite.graph.unknowns import Unknowns, moved
 from uwblite.graph.variance_components import variances_of_kinds
@@ -34,16 +30,6 @@ def test_marginals_are_blocks_of_the_dense_inverse(n):
         np.testing.assert_allclose(found.covariances.anchors[a], covariance("anchors", a, "anchors", a), rtol=1e-6)
     sigmas = [np.sqrt(covariance("calibration", c, "calibration", c)[0, 0]) for c in range(2)]
     np.testing.assert_allclose(found.covariances.calibration, sigmas, rtol=1e-6)
-
-
-@pytest.mark.parametrize("fixed", [[False, False], [False, True], [True, False], [True, True]])
-def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(monkeypatch, fixed):
-    graph = replace(calibrated_loop()[0], fixed_calibration=np.array(fixed))
-    covariance = dense_covariance(graph)
-    expected = np.block([[covariance("calibration", a, "calibration", b) for b in (0, 1)] for a in (0, 1)])
-    for columns in (16, 1):
-        monkeypatch.setattr("uwblite.graph.marginals._COLUMNS_AT_ONCE", columns)
-        np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
 
 
 def test_fixed_unknowns_have_no_covariance():

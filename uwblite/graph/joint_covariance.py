@@ -1,11 +1,15 @@
-"""Covariances among chosen poses of an optimised graph: what is left once all others are eliminated."""
+"""Covariances among chosen unknowns of an optimised graph: what is left once all others are eliminated."""
+
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import lapack
+from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
+from ..errors import SINGULAR, SolverError
 from .graph import Graph
 from .marginals import factor_of, relative_covariances
 from .normal_equations import filled
@@ -20,17 +24,12 @@ class JointCovariance:
     """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
 
     def __init__(self, graph: Graph, poses: Ints) -> None:
-        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix.
-
-        With the chosen poses last, H = L D L^T ends in a dense block L2 D2 L2^T, their information once all others are
-        marginalised out, and its inverse is W^T W with W = D2^-1/2 L2^-1.
-        """
-        number, size, lower, pivots, place = _last_block(graph, poses)
-        whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
-        whitened /= np.sqrt(pivots)[:, None]
+        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix."""
+        numbers, first, lower, pivots, place = _end(graph, poses)
+        number = numbers["poses"]
         self._graph = graph
-        self._lower: Floats = lapack.dlauum(whitened, lower=1, overwrite_c=1)[0]
-        self._row = np.where(number >= size, place[np.maximum(number - size, 0)], -1)
+        self._lower = _inverse(lower, pivots)
+        self._row = np.where(number >= first, place[np.maximum(number - first, 0)], -1)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
@@ -50,19 +49,56 @@ class JointCovariance:
         return np.asarray(covariance * ((row >= 0) & (column >= 0)))
 
 
-def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
-    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = fixed, and what it
-    takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
-    normal = filled(graph, last=poses)
-    factor, number, size = factor_of(normal), normal.unknowns.number["poses"], normal.unknowns.size
-    # Behind the chosen poses stand only anchors and calibration.
-    first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
-    place = factor.perm_c[np.arange(first, size)].astype(np.int64)
+def calibration_covariance(graph: Graph) -> Floats:
+    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are fixed.
+
+    Raises
+    ------
+    SolverError : the measurements leave a direction open.
+    """
+    numbers, first, lower, pivots, place = _end(graph, None)
+    if not np.all(pivots > 0.0):
+        raise SolverError(SINGULAR)
+    number = numbers["calibration"][:, 0]
+    free, covariance = np.flatnonzero(number >= 0), np.zeros((len(number), len(number)))
+    if len(free):
+        inverse, row = _inverse(lower, pivots), place[number[free] - first]
+        covariance[np.ix_(free, free)] = inverse[np.maximum(row[:, None], row), np.minimum(row[:, None], row)]
+    return covariance
+
+
+def _end(graph: Graph, poses: Ints | None) -> tuple[dict[str, Ints], int, Floats, Floats, Ints]:
+    """Return the end of a graph's factor H = L D L^T: what is left once all else is eliminated.
+
+    Parameters
+    ----------
+    poses : to begin with, behind which only anchors and calibration stand; None: the calibration alone.
+
+    Returns
+    -------
+    Places of the unknowns, -1 = fixed; the first of the end; L2 (n, n), D2 (n,) and each unknown's row in them (n,).
+    """
+    normal = filled(graph, subtrees=poses is None, last=poses)
+    number, size = normal.unknowns.number, normal.unknowns.size
+    if poses is None:
+        first, undamped = size - int(np.sum(number["calibration"] >= 0)), np.where(normal.diagonal > 0, 0.0, 1.0)
+        factor = cast(SuperLU, normal.factor(undamped))
+    else:
+        first = int(np.sum(number["poses"] >= 0)) - int(np.sum(number["poses"][poses] >= 0))
+        factor = factor_of(normal)
+    place = factor.perm_c[first:].astype(np.int64)
     inside = np.sort(place)
     lower, pivots = factor.L, factor.U.diagonal()[inside]
     # They hold the factor twice more, and what it was made of.
     del normal, factor
     return number, first, _dense(lower, inside), pivots, np.searchsorted(inside, place)
+
+
+def _inverse(lower: Floats, pivots: Floats) -> Floats:
+    """Return the lower triangle of (L2 D2 L2^T)^-1 = W^T W, W = D2^-1/2 L2^-1; L2 is used up."""
+    whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
+    whitened /= np.sqrt(pivots)[:, None]
+    return np.asarray(lapack.dlauum(whitened, lower=1, overwrite_c=1)[0])
 
 
 def _dense(matrix: sparse.csc_matrix, rows: Ints) -> Floats:

@@ -261,24 +261,5 @@ def marginals(
     return Marginals(graph, normal, common, among, None if further is None else further(normal.unknowns))
 
 
-def calibration_covariance(graph: Graph) -> Floats:
-    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are fixed.
-
-    Raises
-    ------
-    SolverError : the measurements leave a direction open.
-    """
-    normal = filled(graph)
-    number = normal.unknowns.number["calibration"][:, 0]
-    free = np.flatnonzero(number >= 0)
-    factor = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0))
-    covariance = np.zeros((len(number), len(number)))
-    for some in np.split(free, np.arange(_COLUMNS_AT_ONCE, len(free), _COLUMNS_AT_ONCE)):
-        right = np.zeros((normal.unknowns.size, len(some)))
-        right[number[some], np.arange(len(some))] = 1.0
-        covariance[np.ix_(free, some)] = factor.solve(right)[number[free]]
-    return covariance
-
-
 _COLUMNS_AT_ONCE = 16
 """Columns of an inverse solved for at once; a bound on the memory, for each is as long as there are unknowns."""

@@ -19,7 +19,7 @@ from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import HEIGHT
 from ..graph.graph import Graph, PriorEdges
-from ..graph.marginals import calibration_covariance
+from ..graph.joint_covariance import calibration_covariance
 from .prior_selection import prior_sigma
 
 _LEAST = 0.3

@@ -29,7 +29,7 @@ from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import HEIGHT, CalibrationConfig
 from ..graph.graph import Edges, Graph, PriorEdges
-from ..graph.marginals import calibration_covariance
+from ..graph.joint_covariance import calibration_covariance
 
 _STEPS = 4
 """Widths tried from sound to unsound, evenly spaced in their logarithm."""
