@@ -80,6 +80,8 @@ def test_what_is_not_positive_definite_is_said():
         (chain(500, 6), 500, 10, (True, True, False)),
         (chain(500, 40), 500, 10, (False, False, True)),
         (rooms(60, 12), 720, 10, (True, False, False)),
+        (rooms(30, 80), 2400, 10, (True, False, False)),
+        (rooms(4, 600), 2400, 10, (False, False, True)),
         (chain(499, 40), 499, 10, (True, False, False)),
         (anywhere(np.random.default_rng(1), 500, 2000), 500, 10, (True, False, False)),
         (anywhere(np.random.default_rng(1), 500, 2100), 500, 10, (False, False, True)),
@@ -89,7 +91,7 @@ def test_what_is_not_positive_definite_is_said():
     ],
 )
 def test_the_form_follows_the_structure(pairs, poses, others, form):
-    """Borders to 48 scalars, bands to 16 poses; iteration where a factor takes long, or much and there are many edges."""
+    """Borders to 48 scalars, bands to 16 poses; iteration where a factor takes long, or longer than it and edges are many."""
     ordering = chosen(pairs, poses, others)
     assert (ordering.bordered, ordering.banded, ordering.iterative) == form
     assert sorted(ordering.order) == list(range(poses))

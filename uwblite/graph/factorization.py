@@ -19,6 +19,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
 from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
+from .schwarz_cg import expected_work
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
@@ -27,13 +28,11 @@ _WIDEST_BORDER = 48
 _LONGEST_LINK = 16
 """Poses; edges that reach farther make no chain."""
 _MANY, _TIED = 500, 4
-"""From so many poses on, with so many neighbours each, iteration wins over factorisation,"""
-_LITTLE_WORK = 3e4
-"""but where that takes no more multiplications a pose: a robot that drives along the streets of a town meets itself often, yet
-never far from where it was."""
+"""From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
+meet, in the rooms of a site or the streets of a town only those nearby."""
 MOST_WORK = 4e9
-"""Multiplications of a factorisation, about a second; a hundred times the paper's graph takes 2.4e9. Edges between any
-poses and any others, however few, fill the whole matrix."""
+"""Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
+any poses and any others, however few, fill the whole matrix."""
 
 
 _LONG, _PANEL = 20_000, 8
@@ -91,7 +90,8 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     order = with_subtrees_contiguous(among, poses)
     every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
     multiplications = work(among if bordered else pairs, every, width)
-    if multiplications > (_LITTLE_WORK * poses if tied else MOST_WORK):
+    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=np.int64).sum())
+    if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
         return Ordering(np.arange(poses), False, False, iterative=True)
     return Ordering(order, bordered, False, work=multiplications)
 

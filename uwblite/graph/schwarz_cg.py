@@ -29,6 +29,8 @@ _MOST_COARSE = 1000
 """Unknowns that are no poses, up to which each is in the coarse level."""
 _PER_PRODUCT = 4
 """Multiplications of a factorisation that take as long as one of a product with a vector, which waits for memory."""
+_USUAL = 60
+"""Iterations, in halls, sites and warehouses of 1,000 to 15,000 poses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,12 +46,33 @@ class Pieces:
     def work(self) -> float:
         """Multiplications that prepare a solution: the inverses of the pieces and the factor of the coarse matrix."""
         (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
-        return float(pieces * wide**3 + coarse**3 / 3.0)
+        return _work(pieces, wide, coarse)
 
     def work_of_a_step(self, entries: int) -> float:
         """Return the work of an iteration with a matrix of so many entries, in multiplications of a factorisation."""
         (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
-        return float(_PER_PRODUCT * (entries + pieces * wide**2 + coarse**2))
+        return _work_of_a_step(pieces, wide, coarse, entries)
+
+
+def _work(pieces: int, wide: int, coarse: int) -> float:
+    return pieces * float(wide) ** 3 + float(coarse) ** 3 / 3.0
+
+
+def _work_of_a_step(pieces: int, wide: int, coarse: int, entries: int) -> float:
+    return _PER_PRODUCT * (entries + pieces * float(wide) ** 2 + float(coarse) ** 2)
+
+
+def expected_work(poses: int, others: int, entries: int) -> float:
+    """Return the work of a solution to be expected, in multiplications of a factorisation.
+
+    Parameters
+    ----------
+    poses : in one chain or a few. others : scalars that are no poses. entries : of the matrix.
+    """
+    pieces, wide = -(-poses // _PIECE), 3 * _PIECE
+    apart = others > _MOST_COARSE
+    pieces, coarse = pieces + (-(-others // wide) if apart else 0), 3 * pieces + (0 if apart else others)
+    return _work(pieces, wide, coarse) + _USUAL * _work_of_a_step(pieces, wide, coarse, entries)
 
 
 def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
