@@ -258,9 +258,10 @@ def test_pairs_measured_again_say_the_same_and_less_where_points_weigh_less():
     assert rms_length(se2.between(result.edges.T_i_j, again[0].T_i_j)) < 0.002
 
 
-@pytest.mark.parametrize(("convergence", "rounds"), [(1e9, 2), (0.0, 8)])
-def test_rounds_end_at_the_last_gate_where_nothing_moves(convergence, rounds):
+@pytest.mark.parametrize(("convergence", "better", "rounds"), [(1e9, -np.inf, 2), (0.0, 0.9, 3), (0.0, -np.inf, 8)])
+def test_rounds_end_at_the_last_gate_where_nothing_moves_or_fits_better(monkeypatch, convergence, better, rounds):
     """From the truth the first round moves no cloud by 0.04 m, so the second has the last gate; else as often as allowed."""
+    monkeypatch.setattr(joint_refinement, "_BETTER", better)
     truth, path, clouds = room(7, 0.01, 6.0)
     config = replace(CONFIG, rounds=8, convergence=convergence)
     result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path, config, selections=1)
@@ -281,6 +282,7 @@ def test_the_gate_shrinks_at_its_own_pace_where_a_step_failed(monkeypatch, bette
 
     summary = SimpleNamespace(chi2_initial=1.0, chi2_history=[] if better is None else [0.5 if better else 1.0])
     monkeypatch.setattr(joint_refinement, "match", recorded)
+    monkeypatch.setattr(joint_refinement, "_BETTER", -np.inf)
     monkeypatch.setattr(joint_refinement.Optimizer, "optimize", lambda self, problem, config: (problem, summary))
     graph, config = Graph(truth).with_edges(chained(truth, NOISE)), replace(CONFIG, rounds=4, convergence=0.0)
     assert refined(graph, clouds, path, config, selections=1).rounds == 4

@@ -201,7 +201,7 @@ def refine(
     i, j = np.where(turned, j, i), np.where(turned, i, j)
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
-    gate, sigma, rounds = config.first_gate, config.sigma, 0
+    gate, sigma, rounds, fit = config.first_gate, config.sigma, 0, np.inf
     none = np.zeros((0, 3)), np.zeros((0, 3, 3))
     probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     optimizer = Optimizer()
@@ -225,7 +225,9 @@ def refine(
         if on_round is not None:
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
-        if rounds >= config.rounds or (last and moved < config.convergence):
+        before_fit, fit = fit, float(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)) if last else np.inf
+        creeping = fit > (1.0 - _BETTER) * before_fit
+        if rounds >= config.rounds or (last and (moved < config.convergence or creeping)):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
         # After a step that failed or was braked, as much may be left as before.
         whole = used.any() and len(summary.chi2_history) > 0 and summary.chi2_history[0] < summary.chi2_initial
@@ -254,6 +256,10 @@ def measured_again(
     return replace(pairs, T_i_j=z, sqrt_information=sqrt_information)
 
 
+_BETTER = 0.002
+"""Share by which the mean squared distance of matches has to fall from round to round at the last gate. Where it does not,
+clouds creep along what they do not see: for many rounds where recordings overlap in corridors, and away from the truth
+(docs/performance.md)."""
 _GATE_PER_SHIFT = 3.0
 """Gate of a round by the farthest that the one before moved a cloud in the frame of its partner: less than that is left."""
 
