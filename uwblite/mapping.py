@@ -144,6 +144,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
                 yield lidar_stages.refine_jointly
             yield moved_anchors.separate_moved_anchors
             if config.refinement.rounds:
+                yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
         yield lidar_stages.check_map_consistency
     if given.landmark_distances:

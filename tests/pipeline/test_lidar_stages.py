@@ -92,7 +92,7 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     """
     made, shifts = [], iter(moved)
     task = SimpleNamespace(config=MappingConfig(), stages=SimpleNamespace(report=lambda *_: None))
-    estimate = SimpleNamespace(graph=SimpleNamespace(poses=None), moved_since=lambda before: next(shifts))
+    estimate = SimpleNamespace(graph=SimpleNamespace(poses=None), ranges=0, joint=0, moved_since=lambda before: next(shifts))
 
     def solved(estimate, solver, optimizer=None):
         assert solver.relative_decrease > task.config.solver.relative_decrease
@@ -108,5 +108,5 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     monkeypatch.setattr(lidar_stages, "_without_pattern", lambda estimate, task: made.append("pattern") or estimate)
     monkeypatch.setattr(lidar_stages, "solved", solved)
     monkeypatch.setattr(lidar_stages, "_matched_once_more", matched)
-    assert lidar_stages.solved_by_own_errors(estimate, task) is estimate
+    assert lidar_stages.solve_by_own_errors(estimate, task) is estimate
     assert " ".join(made) == done

@@ -40,8 +40,8 @@ _LARGE_GRID = 5_000_000
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """Put every measurement into the graph; where the lidar has refined the poses, give anchors the weights that suit them.
 
-    Poses are estimated with ranges that weigh by their own errors (lidar_stages.refine_jointly), anchors with those that all
-    ranges from one direction have in common as well, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
+    Poses are estimated with ranges that weigh by their own errors (lidar_stages.solve_by_own_errors), anchors with those that
+    all ranges from one direction have in common as well, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
     graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
     """
     if estimate.joint is not None and estimate.ranges is not None:

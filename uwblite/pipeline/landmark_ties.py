@@ -23,7 +23,7 @@ from ..lidar.clouds import Clouds
 from ..lidar.columns import Landmarks, find_columns, fit_circle
 from . import map_frame
 from .estimate import Estimate, Task
-from .lidar_stages import refine_jointly
+from .lidar_stages import refine_jointly, solve_by_own_errors
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
@@ -103,7 +103,7 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
     solved = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
     estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(solved)
     if estimate.joint is not None:
-        estimate = refine_jointly(estimate, task)
+        estimate = solve_by_own_errors(refine_jointly(estimate, task), task)
     figures = outcome(task, tied, estimate.graph)
     task.stages.end("landmark distances", distances=figures)
     return estimate

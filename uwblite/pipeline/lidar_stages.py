@@ -222,17 +222,18 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         "joint refinement", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
         sigma=round(refined.sigma, 4), shift=round(estimate.moved_since(before), 5), **solver_figures(refined.summary),
     )  # fmt: skip
-    del refined, i, j  # Matches of all pairs are large.
-    return estimate if estimate.ranges is None or estimate.joint is None else solved_by_own_errors(estimate, task)
+    return estimate
 
 
-def solved_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
+def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
     """Solve everything with ranges that weigh by their own errors alone.
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
     constrains these, and it is matched again. The last optimum is a rough one: the adjustment to surfaces goes on from there.
     """
+    if estimate.ranges is None or estimate.joint is None:
+        return estimate
     before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
     estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:

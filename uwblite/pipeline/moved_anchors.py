@@ -17,7 +17,7 @@ from ..radio.range_noise import RangeNoiseConfig
 from ..sensor_log.anchor_names import first_place, numbered, radio_name
 from .estimate import Estimate, Task
 from .joining import tolerance, warn_of_moved_anchor
-from .lidar_stages import solved, solved_by_own_errors
+from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
 _LEAST_MOVE = 0.25
@@ -32,8 +32,8 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
 
     With the poses fixed, every recording's ranges determine where each anchor stood then; places whose distance their
     uncertainty does not explain are not the same. Recordings that were joined may have had an anchor and its mirror image: such
-    an anchor was not moved, if its places are now as near as joining would have asked. Where anything changes, all is solved
-    again, and clouds are matched again where poses move by much.
+    an anchor was not moved, if its places are now as near as joining would have asked. Ranges weigh little so far beside the
+    lidar: a wrong anchor bends no trajectory yet, and all is solved once, with the names that result.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
         return estimate
@@ -83,7 +83,7 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _solved_again(estimate: Estimate, task: Task) -> Estimate:
-    """Return the optimum with ranges that belong to other anchors than before.
+    """Return the optimum, or from where to begin after a joint refinement, with ranges to other anchors than before.
 
     It begins where all ranges of an anchor put it: from the place that one recording shows those of others look like outliers.
     """
@@ -93,9 +93,8 @@ def _solved_again(estimate: Estimate, task: Task) -> Estimate:
     anchors = estimate.graph.anchors.copy()
     anchors[pairs[:, 0]] = place
     estimate = replace(estimate, graph=replace(estimate.graph, anchors=anchors))
-    if estimate.joint is None:
-        return solved(with_range_noise(estimate, task.config), task.config.solver)
-    return solved_by_own_errors(estimate, task)
+    # After a joint refinement all is solved in any case.
+    return solved(with_range_noise(estimate, task.config), task.config.solver) if estimate.joint is None else estimate
 
 
 def _first_of(ids: Sequence[str], task: Task) -> Callable[[str], str]:
