@@ -110,5 +110,13 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
     monkeypatch.setattr(radio_stages.other_minima, "at_best", lambda e, task: made.append("other") or replace(e))
     radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
     assert made[-7:-1] == [(name, 3, 3), "other", "noise", "priors", "free", "solve"]
+    # Recordings that were joined have been optimised alone; what a lidar refines is not done again.
+    joined = replace(estimate, alone=(estimate, estimate))
+    end = ((name,), {"placed": 2, "chi2": 1.0})
+    once_more = ["noise", "priors", "free", "solve", (name, 3, 3)]
+    for seen.have_scans, done in ((False, ["free", "solve", *once_more, end]), (True, ["free", "solve", end])):
+        made.clear()
+        radio_stages._optimised(joined, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
+        assert made == done
     without = replace(estimate, ranges=None)
     assert radio_stages._optimised(without, None) is without

@@ -13,6 +13,7 @@ from ..errors import SolverError
 from ..graph.calibration import HEIGHT, RADIO, optimize_with_heights, with_free
 from ..graph.graph import Graph
 from ..graph.optimizer import Optimizer
+from ..graph.solver import SolverConfig
 from ..radio import prior_selection
 from .estimate import Estimate, OtherHeights, Task
 from .mapping_config import MappingConfig
@@ -37,7 +38,7 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
     if estimate.ranges is None or not heights.any():
         return estimate
     start = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO)
-    optimizer, quick = Optimizer(), replace(config.solver, relative_decrease=max(config.solver.relative_decrease, _COMPARED))
+    optimizer, quick = Optimizer(), compared(config.solver)
     try:
         high, _ = optimize_with_heights(start.with_edges(*edges), quick, optimizer)
         # Heights that were put back to 0 count as known no better than the others.
@@ -53,6 +54,11 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
     if abs(gain) > _REFUTED or height < _NOTICEABLE:
         return estimate
     return replace(estimate, other_heights=OtherHeights(height, taken, _apart(low, high)))
+
+
+def compared(solver: SolverConfig) -> SolverConfig:
+    """Return the rules of an optimisation whose likelihood is compared with another one's."""
+    return replace(solver, relative_decrease=max(solver.relative_decrease, _COMPARED))
 
 
 def _apart(one: Graph, other: Graph) -> float:

@@ -58,7 +58,7 @@ def first_optimisation(task: Task, known: Sequence[Estimate | None] = ()) -> Est
     ]
     if len(estimates) == 1:
         return anchor_heights.with_likelier_heights(estimates[0], task.config)
-    joined = replace(_optimised(joining.join(estimates, task), task), alone=tuple(estimates))
+    joined = _optimised(replace(joining.join(estimates, task), alone=tuple(estimates)), task)
     return anchor_heights.with_likelier_heights(joined, task.config)
 
 
@@ -113,14 +113,22 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
 
 
 def _optimised(estimate: Estimate, task: Task) -> Estimate:
-    """Optimise odometry and ranges together, estimating the ranges' noise on the way."""
+    """Optimise odometry and ranges together, estimating the ranges' noise on the way.
+
+    Recordings that were joined have been through all laps alone: with the noise that each has shown they are solved together
+    once, and without a lidar in one more lap that shows noise and priors of all.
+    """
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    optimizer = Optimizer()
-    for lap in range(_NOISE_ROUNDS):
+    optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
+    if estimate.alone:
+        estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
+        estimate, result = _solved(estimate, anchor_heights.compared(task.config.solver), optimizer)
+        laps = range(0) if have_scans else laps[-1:]
+    for lap in laps:
         estimate, result = _lap(estimate, lap, task, optimizer)
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
-    found = estimate if task.recordings.have_scans or estimate.alone else other_minima.at_best(estimate, task)
+    found = estimate if have_scans or estimate.alone else other_minima.at_best(estimate, task)
     if found is not estimate:
         estimate, result = _lap(found, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
@@ -133,8 +141,13 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
     if lap == _NOISE_ROUNDS - 1:
         graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
         estimate = replace(estimate, graph=with_free(graph, *RADIO))
+    return _solved(estimate, config.solver if lap else rough(config.solver), optimizer)
+
+
+def _solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
+    """Return the optimum of odometry and ranges."""
     problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
-    solved, result = optimize_with_heights(problem, config.solver if lap else rough(config.solver), optimizer)
+    solved, result = optimize_with_heights(problem, solver, optimizer)
     graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
     return replace(estimate, graph=graph.with_estimates_of(solved)), result
 
