@@ -11,6 +11,7 @@ from helpers.planted_graphs import loop
 from uwblite import se2
 from uwblite.arrays import rms_length
 from uwblite.constraints import Constraints
+from uwblite.errors import SolverError
 from uwblite.graph.calibration import HEIGHT
 from uwblite.pipeline import anchor_heights, radio_stages
 from uwblite.pipeline.anchor_heights import check_heights
@@ -73,3 +74,25 @@ def test_without_heights_to_find_nothing_is_compared():
     graph = loop()[0]
     estimate = Estimate(graph, graph.edges[0], None, ())
     assert anchor_heights.with_likelier_heights(estimate, MappingConfig()) is estimate
+
+
+@pytest.mark.parametrize(("gains", "ids", "refuted", "asked"), [
+    ([-21.0, 50.0], ["AB", "A"], True, 1),
+    ([-21.0, 50.0], ["AB", "BC"], False, 2),
+    ([-12.0, -9.0], ["AB", "C"], True, 2),
+    ([-12.0, -7.0], ["AB", "C"], False, 2),
+    ([None, -21.0], ["AB", "AB"], True, 2),
+])  # fmt: skip
+def test_joined_recordings_are_asked_alone_each_that_has_other_anchors(monkeypatch, gains, ids, refuted, asked):
+    given = iter(gains)
+
+    def compared(estimate, config, optimizer):
+        if (gain := next(given)) is None:
+            raise SolverError("open")
+        return None, None, gain
+
+    monkeypatch.setattr(anchor_heights, "_with_high_anchors", compared)
+    graph = SimpleNamespace(calibration=SimpleNamespace(of_kinds=lambda *kinds: np.ones(1, dtype=bool)))
+    alone = [SimpleNamespace(ranges=0, graph=graph, anchor_ids=tuple(own)) for own in ids]
+    assert anchor_heights._refuted(alone, MappingConfig()) is refuted
+    assert len(gains) - len(list(given)) == asked

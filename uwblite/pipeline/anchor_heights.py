@@ -3,6 +3,8 @@
 Two hypotheses, low or as high as in a large hall, are solved and compared by marginal likelihood at their optima.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -31,21 +33,20 @@ _ELSEWHERE = 0.4
 
 
 def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
-    """Return the estimate under the likelier of the two hypotheses, and what the other one says where it is not refuted."""
-    edges = estimate.odometry_and_ranges
-    low = estimate.graph.with_edges(*edges)
+    """Return the estimate under the likelier of the two hypotheses, and what the other one says where it is not refuted.
+
+    Recordings that were joined are asked alone first: only where they do not refute high anchors, all are solved together.
+    """
+    low = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     heights = low.calibration.of_kinds(HEIGHT)
-    if estimate.ranges is None or not heights.any():
+    if estimate.ranges is None or not heights.any() or _refuted(estimate.alone, config):
         return estimate
-    start = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO)
-    optimizer, quick = Optimizer(), compared(config.solver)
+    optimizer = Optimizer()
     try:
-        high, _ = optimize_with_heights(start.with_edges(*edges), quick, optimizer)
-        # Heights that were put back to 0 count as known no better than the others.
-        likely = [prior_selection.laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in (low, high)]
+        start, high, gain = _with_high_anchors(estimate, config, optimizer)
     except SolverError:
         return estimate
-    gain, height = likely[1] - likely[0], float(np.sqrt(np.median(high.calibration.values[heights])))
+    height = float(np.sqrt(np.median(high.calibration.values[heights])))
     taken = gain > _LIKELIER
     if taken:
         high, _ = optimize_with_heights(high, config.solver, optimizer)
@@ -54,6 +55,37 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
     if abs(gain) > _REFUTED or height < _NOTICEABLE:
         return estimate
     return replace(estimate, other_heights=OtherHeights(height, taken, _apart(low, high)))
+
+
+def _with_high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimizer) -> tuple[Graph, Graph, float]:
+    """Return where the search under the hypothesis of high anchors begins, without measurements, where it ends, with them, and
+    by how much its logarithm of the marginal likelihood is greater than that of the estimate.
+
+    Raises
+    ------
+    SolverError : the measurements do not determine one of them.
+    """
+    edges = estimate.odometry_and_ranges
+    start = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO)
+    high, _ = optimize_with_heights(start.with_edges(*edges), compared(config.solver), optimizer)
+    # Heights that were put back to 0 count as known no better than the others.
+    graphs = estimate.graph.with_edges(*edges), high
+    likely = [prior_selection.laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in graphs]
+    return start, high, likely[1] - likely[0]
+
+
+def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
+    """Return whether recordings (r,), each on its own, refute together that anchors are high.
+
+    One that has ranges to the anchors of others alone is not asked; nor does one say anything that does not determine them.
+    """
+    gain, asked = 0.0, set[str]()
+    for own in alone:
+        if own.ranges is not None and own.graph.calibration.of_kinds(HEIGHT).any() and not asked.issuperset(own.anchor_ids):
+            with suppress(SolverError):
+                gain += _with_high_anchors(own, config, Optimizer())[2]
+                asked.update(own.anchor_ids)
+    return gain < -_REFUTED
 
 
 def compared(solver: SolverConfig) -> SolverConfig:
