@@ -11,6 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.pipeline.mirror_images import _costs, _images, find_mirror_images
 
@@ -95,6 +96,14 @@ def test_a_bend_seen_by_ranges_that_err_alike_decides_nothing():
     assert not find_mirror_images(before, TASK).bootstrap.ambiguous.any()
     alike = replace(before.ranges, weights=np.full(len(before.ranges), 2.0 / len(before.ranges)))
     assert find_mirror_images(replace(before, ranges=alike), TASK).bootstrap.ambiguous.all()
+
+
+def test_what_ranges_of_little_worth_say_together_decides():
+    """Beyond the bend each range counts a two hundredth, as through obstacles; the other place is metres off."""
+    before = estimate(3.0)
+    weights = np.where(before.graph.poses[:, 0] > 6.0, 0.005, 1.0)
+    ranges = replace(before.ranges, weights=weights, kernel=Kernel("cauchy", 2.5))
+    assert not find_mirror_images(replace(before, ranges=ranges), TASK).bootstrap.ambiguous.any()
 
 
 def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path():

@@ -100,9 +100,12 @@ def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Float
 
 
 def _costs(graph: Graph, ranges: RangeEdges, worth: Floats | Bools) -> Floats:
-    """Return the cost (a,) of each anchor's ranges times what each is worth (m,), and of the priors of its bias and height."""
+    """Return the cost (a,) of each anchor's ranges by what each is worth (m,), and of the priors of its bias and height.
+
+    A range that counts a hundredth is no outlier at ten standard deviations: many of them together may exclude a place.
+    """
     squared = ranges.residuals(graph)[:, 0] ** 2
-    each = ranges.kernel.rho(squared) * worth
+    each = ranges.kernel.rho(squared * worth)
     costs: Floats = np.bincount(ranges.anchor, each, len(graph.anchors)).astype(np.float64)
     of_unknown = np.zeros(len(graph.calibration.values))
     for priors in graph.calibration_priors:
