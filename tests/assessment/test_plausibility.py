@@ -257,14 +257,15 @@ def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
 
 @pytest.mark.parametrize("ranges_used", [False, True])
 def test_every_check_is_made_once(monkeypatch, ranges_used):
-    """Ranges that stayed outliers for long are looked for where there are ranges."""
+    """Stretches whose ranges disagree with the map are looked for where there are ranges."""
     made = []
     for name in [name for name in vars(plausibility) if name.startswith("check_")]:
         monkeypatch.setattr(plausibility, name, lambda *args, name=name: made.append(name))
     table = {"residual": np.ones(3)} if ranges_used else {}
     plausibility.judge(SimpleNamespace(anchor_ids=()), (), (), {}, table, None, None, None)
     expected = {name for name in vars(plausibility) if name.startswith("check_")}
-    assert sorted(made) == sorted(expected - ({"check_sustained_outliers"} if not ranges_used else set()))
+    of_ranges = {"check_sustained_outliers", "check_displaced_stretches"}
+    assert sorted(made) == sorted(expected - (of_ranges if not ranges_used else set()))
 
 
 @pytest.mark.parametrize(("statuses", "warnings", "doubts"), [

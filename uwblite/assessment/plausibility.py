@@ -17,6 +17,7 @@ from ..pipeline.other_minima import check_other_minimum
 from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
+from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
 from .range_agreement import check_sustained_outliers, check_unit, check_wheels_against_lidar
@@ -57,9 +58,8 @@ def judge(
     check_calibration(calibrated, usual, task)
     if table:
         check_sustained_outliers(table, estimate.anchor_ids, task)
-        check_residuals(estimate, table["residual"], grid, task)
-    else:
-        check_residuals(estimate, np.zeros(0), grid, task)
+        check_displaced_stretches(table, anchors, task)
+    check_residuals(estimate, table["residual"] if table else np.zeros(0), grid, task)
     check_unit(anchors, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)
