@@ -284,6 +284,18 @@ def test_the_factor_of_turns_is_of_turns_alone():
     assert disagreeing(found, 0.0) == []
 
 
+@pytest.mark.parametrize(("by_wheels", "said"), [(0.0004, False), (0.00047, False), (0.00049, True)])
+def test_a_motion_that_matches_hardly_better_than_that_of_the_wheels_is_none(monkeypatch, by_wheels, said):
+    """Along a bare wall, by mean square distances of matches, m^2; the lidar's own is 0.0004."""
+    found = pairs(100)
+    found.lidar[40:50, 0] = 0.5
+    scans = LaserScans(np.arange(150.0), np.ones((150, 20), dtype=np.float32), 0.0, 0.1, 0.0, 0.05, 8.0)
+    log = SensorLog(driven(np.full(150, 0.1), np.zeros(150), 1.0), None, scans)
+    by = iter([0.0004, by_wheels])
+    monkeypatch.setattr(wheel_motion, "misfits", lambda scans, mounting, first, second, motion: np.full(len(first), next(by)))
+    assert len(disagreeing(found, 0.0, log)) == said
+
+
 @pytest.mark.parametrize(("moved", "rest", "stands"), [(0.007, 0.016, True), (0.007, 0.021, False), (0.02, 0.027, True)])
 def test_a_robot_at_rest_whose_scans_differ_by_noise_stands(monkeypatch, moved, rest, stands):
     """Wheels stand for 4 s, and of few points some motion fits better than rest (rms distances of matches, m)."""

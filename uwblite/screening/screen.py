@@ -72,7 +72,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     remarks += [*more, *turned, *standing]
     cut, more = _cuts(log, jumps.stamps, OdometryBreaks.of_all([gaps, lost]).stamps)
     if pairs is not None:
-        more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
+        more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]), log)
     more += _hardly_moving(log.odometry)
     breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
     return replace(log, screening=Screening((*remarks, *more), breaks, _way_ratio(pairs)))

@@ -173,11 +173,15 @@ def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
 
     What a robot at rest measures twice differs by the noise of its lidar, and some motion fits that better.
     """
-    assert log.scans is not None
-    middle = log.scans.middles
-    first, second = (np.searchsorted(middle, t) for t in (pairs.start, pairs.end))
-    moving, rest = (misfits(log.scans, log.mounting, first, second, m) for m in (pairs.lidar, 0.0 * pairs.lidar))
+    moving, rest = (_misfits(log, pairs, motion) for motion in (pairs.lidar, 0.0 * pairs.lidar))
     return rest > np.maximum(_WORSE_AT_REST * moving, _NOISE_AT_REST**2)
+
+
+def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
+    """Return the mean square distances (e,), m^2, at which pairs of scans match at given motions (e, 3)."""
+    assert log.scans is not None
+    first, second = (np.searchsorted(log.scans.middles, t) for t in (pairs.start, pairs.end))
+    return misfits(log.scans, log.mounting, first, second, motion)
 
 
 _NOISE_AT_REST = 0.02
@@ -186,16 +190,23 @@ _WORSE_AT_REST = 2.0
 """Factor between the mean square distances of matches if the robot stood and as it moved, from which it did not stand."""
 
 
-def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
-    """Return a doubt where wheels and lidar measure different motions for long, one factor for all taken out."""
+def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Remark]:
+    """Return a doubt where wheels and lidar measure different motions for long, one factor for all taken out.
+
+    Along a bare wall any motion matches two scans of few rays, that of the wheels as well as that which the lidar seems to
+    measure; such pairs show nothing, where the log with their scans is given.
+    """
     own = pairs.rows(pairs.measured)
     if len(own.start) < 4 * _LEAST_PAIRS:
         return []
     way, turn = _factor(own.wheels[:, :2], own.lidar[:, :2], 0.03), _factor(own.wheels[:, 2:], own.lidar[:, 2:], 0.03)
-    off = own.lidar - own.wheels * np.array([way, way, turn])
-    larger = np.maximum(np.abs(own.lidar), np.abs(own.wheels * np.array([way, way, turn])))
+    wheels = own.wheels * np.array([way, way, turn])
+    off, larger = own.lidar - wheels, np.maximum(np.abs(own.lidar), np.abs(wheels))
     bad = np.hypot(off[:, 0], off[:, 1]) > _ABSOLUTE[0] + _RELATIVE * np.hypot(larger[:, 0], larger[:, 1])
     bad |= np.abs(off[:, 2]) > _ABSOLUTE[1] + _RELATIVE * larger[:, 2]
+    if log is not None and bad.any():
+        by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
+        bad[bad] = by_wheels > _WORSE_BY_WHEELS * by_lidar
     smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
     runs = [(own.start[a], own.end[b - 1]) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
     runs = runs or _other_scale(own, start)
@@ -208,6 +219,10 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
         "than elsewhere; cut that part off, or drive it again"
     )
     return [Remark("wheels-against-lidar", text, doubt=True, stretches=tuple((float(a), float(b)) for a, b in runs))]
+
+
+_WORSE_BY_WHEELS = 1.2
+"""Factor between the mean square distances of matches as wheels and lidar measure the motion from which the lidar shows it."""
 
 
 def unmatched(pairs: Pairs) -> list[Remark]:
