@@ -57,13 +57,9 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     fixed = estimate.graph.fixed_calibration | estimate.graph.calibration.of_kinds(*LASER)
     graph = replace(estimate.graph, fixed_calibration=fixed)
-    report = task.stages.reporter("surfaces")
-    report(0, _ROUNDS + 1)
-    first = find_surfaces(_lidar(graph, joint, task).sensors, scans, task)
-    if not len(first.measured.rays.keyframe):
+    graph, found = _adjusted(graph, estimate, task)
+    if not len(found.rays.keyframe):
         return solved(estimate, task.config.solver)
-    report(1, _ROUNDS + 1)
-    graph, found = _adjusted(graph, estimate, first, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
@@ -119,24 +115,29 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
     return _Lidar(joint.sensor_poses(graph, np.arange(len(graph.poses)), twist)[0], twist, joint.calibration)
 
 
-def _adjusted(
-    graph: Graph, estimate: Estimate, first: FoundSurfaces, task: Task
-) -> tuple[Graph, MeasuredSurfaces]:
-    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these."""
-    found, kind = first.measured, first.kind
+def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, MeasuredSurfaces]:
+    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; without rays, as it was."""
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
     floor, certainty = floors.even(wheels), np.zeros((0, 3, 3))
     assert joint is not None
+    report = task.stages.reporter("surfaces")
+    report(0, _ROUNDS + 1)
+    first: FoundSurfaces | None = find_surfaces(_lidar(graph, joint, task).sensors, estimate.lidar, task)
+    assert first is not None
+    found, kind = first.measured, first.kind
     others = () if estimate.ranges is None else (estimate.ranges,)
     for turn in range(_ROUNDS):
+        report(turn + 1, _ROUNDS + 1)
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
-        if turn == 1:
+        if first is not None and turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
             own = weighted_sums(found, lidar.sensors, poses, _KERNEL).surfaces + np.diag(_PRIOR**-2.0)
             found, kind = first.revised(found, estimate.lidar.clouds, lidar.sensors, poses, own)
-            order = None
+            first, order = None, None
+        if not len(found.rays.keyframe):
+            break
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
