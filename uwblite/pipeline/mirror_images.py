@@ -19,9 +19,10 @@ from .estimate import Estimate, Task
 _CLEAR = 30.0
 """Difference of chi2 between two places from which on the worse one is excluded. By chance alone 9 would do, but
 poses that are off by decimetres, which chi2 does not count, brought it to 11; the wrong side of a bent path, to hundreds."""
-_LIKELIER = 4.0
-"""The same where correlated ranges count once, two standard deviations: a hundred ranges that come along one aisle may
-prefer the wrong side of it by 34, and by 1.3 as what they are worth."""
+_LIKELIER = 10.0
+"""The same where correlated ranges count once, three standard deviations: a hundred ranges that come along one aisle may
+prefer the wrong side of it by 34, and by 1.3 as what they are worth. Where neither place was right it was 9, and the mirror
+images of right places had 10 to 125."""
 _APART = 0.5
 """Places nearer to each other than this are the same, m."""
 
