@@ -52,14 +52,15 @@ def off(graph, places):
     return float(np.sqrt(np.mean(np.sum((graph.anchors - places) ** 2, axis=1))))
 
 
-def test_anchors_as_high_as_each_other_come_nearer_to_their_places():
-    """High ones, of which independent priors say that they stand farther from the corridor."""
+@pytest.mark.parametrize("height", [2.0, 3.5])
+def test_anchors_as_high_as_each_other_come_nearer_to_their_places(height):
+    """High ones, of which independent priors say that they stand farther from the corridor; the more so the higher they are."""
     before, after = [], []
     for seed in range(4):
-        graph, places = solved(seed, np.full(8, 2.0))
+        graph, places = solved(seed, np.full(8, height))
         before.append(off(graph, places))
         after.append(off(optimize(with_alike_heights(graph))[0], places))
-    assert np.mean(after) < 0.7 * np.mean(before)
+    assert np.mean(after) < 0.25 * np.mean(before)
 
 
 def test_anchors_of_different_heights_keep_what_their_ranges_say():

@@ -4,7 +4,7 @@ From a straight path, as along a corridor, the ranges to an anchor show how far 
 of that is height and which is distance across. An assumed height of 0 then moves every anchor away from the path, always
 outwards. Anchors near corners show their height. So the squared heights q of one robot's tag get the prior
 
-    q_k = m + d_k,    m ~ N(0, sigma^2),    d_k ~ N(0, tau^2)
+    q_k = m + d_k,    m ~ N(0, (4 sigma)^2),    d_k ~ N(0, tau^2)
 
 in the place of independent ones, N(0, sigma^2). How alike they are, tau, has the mean of widths from hardly different to
 independent, weighted by their marginal likelihood (as in radio/prior_selection.py). Every height then has a prior of its own
@@ -26,6 +26,8 @@ _LEAST = 0.3
 """Least spread of squared heights, m^2: anchors 1.5 m above the tag, mounted within 10 cm."""
 _WIDTHS = 6
 """Spreads tried, evenly spaced in their logarithm."""
+_TOGETHER = 4.0
+"""Width of the prior of the mean, in those of single squares: all anchors of a hall may hang twice as high as usual ones."""
 _FEWEST = 3
 """Anchors from which on a mean stands for others."""
 
@@ -63,9 +65,9 @@ def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, f
     """
     posterior = np.linalg.inv(covariance)
     pulled, measured = posterior @ values, posterior - np.diag(sigma**-2.0)
-    wide = float(np.median(sigma))
-    found = []
-    for spread in np.geomspace(min(_LEAST, wide), wide, _WIDTHS).tolist():
+    usual = float(np.median(sigma))
+    wide, found = _TOGETHER * usual, []
+    for spread in np.geomspace(min(_LEAST, usual), usual, _WIDTHS).tolist():
         prior = wide**2 + spread**2 * np.eye(len(values))
         whole = measured + np.linalg.inv(prior)
         likely = 0.5 * (pulled @ np.linalg.solve(whole, pulled) - np.linalg.slogdet(whole)[1] - np.linalg.slogdet(prior)[1])
