@@ -127,7 +127,6 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
     found, kind = first.measured, first.kind
     others = () if estimate.ranges is None else (estimate.ranges,)
     for turn in range(_ROUNDS):
-        report(turn + 1, _ROUNDS + 1)
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
@@ -138,6 +137,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
             first, order = None, None
         if not len(found.rays.keyframe):
             break
+        report(turn + 1, _ROUNDS + 1)
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
