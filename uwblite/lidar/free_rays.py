@@ -54,8 +54,7 @@ def with_free_rays(found: MeasuredSurfaces, short: Bools, free: SurfaceRays, sen
 def _cells(found: MeasuredSurfaces, sensors: Floats) -> tuple[Floats, Ints]:
     """Return the middles (c, 2) of the cells of walls that enough rays have shown, and the wall (c,) of each."""
     surfaces, rays = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface])
-    way = np.stack(se2.cos_sin(surfaces.facing + 0.5 * np.pi), axis=1)
-    wall = rays.surface.astype(np.int64)
+    way, wall = surfaces.tangent, rays.surface.astype(np.int64)
     along = dots(se2.transform_each(sensors, rays.keyframe, rays.points) - surfaces.place[wall], way[wall])
     cells, number = unique_rows(np.column_stack([wall, np.floor(along / _CELL).astype(np.int64)]))
     wall, cell = cells[np.bincount(number, minlength=len(cells)) >= _SHOWN].T
@@ -70,7 +69,7 @@ def _ended_on(
     ray, column = np.nonzero(np.isfinite(away))
     cell = nearest[ray, column]
     of = wall[cell]
-    normal = np.stack(se2.cos_sin(surfaces.facing), axis=1)[of]
+    normal = surfaces.normal[of]
     incidence = -dots(direction[ray], normal)
     end = at[ray] - surfaces.offset[of, None] * direction[ray]
     residual = dots(end - surfaces.place[of], normal)

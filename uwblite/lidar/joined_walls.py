@@ -68,15 +68,9 @@ def with_joined_walls(found: MeasuredSurfaces, information: Floats, sensors: Flo
     return replace(found, surfaces=joined, rays=replace(rays, surface=of[rays.surface]).by_keyframe(joined)), of
 
 
-def _along(surfaces: Surfaces) -> tuple[Floats, Floats]:
-    """Return the normals (s, 2) of walls and their directions (s, 2)."""
-    normal = np.stack(se2.cos_sin(surfaces.facing), axis=1)
-    return normal, np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-
-
 def _gaps(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats) -> _Gaps:
     """Return the pairs of walls that lie and face about alike and are not far apart."""
-    normal, way = _along(surfaces)
+    normal, way = surfaces.normal, surfaces.tangent
     ended = se2.transform_each(sensors, rays.keyframe, rays.points)
     first, last = extent(rays.surface, dots(ended - surfaces.place[rays.surface], way[rays.surface]), len(normal))
     walls = np.flatnonzero(~surfaces.round & (last > first))
@@ -98,7 +92,7 @@ def _gaps(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats) -> _Gaps:
 def _agreeing(surfaces: Surfaces, gaps: _Gaps, information: Floats) -> _Gaps:
     """Return the pairs whose lines agree at the gap, and their offsets."""
     covariance = np.linalg.inv(information[:, :3, :3])
-    normal, way = _along(surfaces)
+    normal, way = surfaces.normal, surfaces.tangent
     middle = surfaces.place[gaps.one] + (0.5 * (gaps.first + gaps.last))[:, None] * way[gaps.one]
     total, lines = np.tile(np.diag(_BENT**2), (len(gaps.one), 1, 1)), []
     for side in (gaps.one, gaps.other):
@@ -117,7 +111,7 @@ def _seen_through(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats, gaps: 
     """Return through which gaps (e,) rays have passed."""
     some, open_ = rays.rows(slice(None, None, 1 + len(rays.keyframe) // _SAMPLE)), np.zeros(len(gaps.one), dtype=bool)
     ended = se2.transform_each(sensors, some.keyframe, some.points)
-    normal, way = _along(surfaces)
+    normal, way = surfaces.normal, surfaces.tangent
     for gap, wall in enumerate(gaps.one.tolist()):
         ahead = (sensors[:, :2] - surfaces.place[wall]) @ normal[wall]
         rows = np.flatnonzero((ahead > _FRONT)[some.keyframe])

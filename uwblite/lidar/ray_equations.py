@@ -45,7 +45,7 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     at, direction = in_map(rays, sensors)
     at -= surfaces.offset[rays.surface, None] * direction
     away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]
-    normal, shift = np.stack(se2.cos_sin(surfaces.facing), axis=1)[rays.surface], np.zeros(len(away))
+    normal, shift = surfaces.normal[rays.surface], np.zeros(len(away))
     round_ones = np.flatnonzero(curved)
     if len(round_ones):
         radius = surfaces.radius[rays.surface[round_ones]]
@@ -170,7 +170,7 @@ class _AtWalls:
 def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats) -> _AtWalls:
     """Return rays at their walls; a wall's direction is its normal turned left."""
     wall, sensor = rays.surface[first], sensors[rays.keyframe[first]]
-    normal, (c, s) = np.stack(se2.cos_sin(surfaces.facing[wall]), axis=1), se2.cos_sin(sensor[:, 2])
+    normal, (c, s) = surfaces.normal[wall], se2.cos_sin(sensor[:, 2])
     away = sensor[:, :2] - surfaces.place[wall]
     before = normal[:, 0] * away[:, 0] + normal[:, 1] * away[:, 1]
     beside = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]

@@ -49,11 +49,21 @@ class Surfaces(Table):
     radius: Floats
     """(s,) m, of a column; of a wall 1."""
 
+    @property
+    def normal(self) -> Floats:
+        """(s, 2) unit, of walls."""
+        return np.stack(se2.cos_sin(self.facing), axis=1)
+
+    @property
+    def tangent(self) -> Floats:
+        """(s, 2) unit, along walls: the normal turned left."""
+        normal = self.normal
+        return np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+
     def moved(self, step: Floats) -> "Surfaces":
         """Return the surfaces after a step (s, 4): a wall's turn and shift along its normal, or a column's shift; the
         offset; the radius."""
-        normal = np.stack(se2.cos_sin(self.facing), axis=1)
-        shift = np.where(self.round[:, None], step[:, :2], normal * step[:, 1:2])
+        shift = np.where(self.round[:, None], step[:, :2], self.normal * step[:, 1:2])
         facing = self.facing + np.where(self.round, 0.0, step[:, 0])
         return replace(
             self, place=self.place + shift, facing=facing, offset=self.offset + step[:, 2], radius=self.radius + step[:, 3]
