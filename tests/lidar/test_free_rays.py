@@ -81,3 +81,10 @@ def test_rays_near_short_walls_are_kept_and_no_others():
     kept = rays_near(free, known().rays.rows(known().rays.surface == 0), POSES)
     assert len(kept.keyframe) == 9
     np.testing.assert_array_equal(kept.bundle % 3, 0)
+
+
+def test_short_walls_that_few_rays_show_in_any_one_place_take_no_free_rays():
+    before, free = known(), rays_to(on_front(np.zeros(5)), -1)
+    few = before.rays.rows(np.r_[np.flatnonzero(before.rays.surface == 0)[:2], np.flatnonzero(before.rays.surface == 1)])
+    found = with_free_rays(MeasuredSurfaces(SURFACES, few, UNLEARNT), SHORT, free, POSES)
+    assert set(found.rays.surface.tolist()) == {1}

@@ -38,8 +38,8 @@ def with_free_rays(found: MeasuredSurfaces, short: Bools, free: SurfaceRays, sen
     ----------
     short : (s,) of which surfaces all rays are among the free ones. sensors : (k, 3) frames of the rays in the map.
     """
-    own = np.unique(found.rays.surface[short[found.rays.surface]])
-    if not len(own) or not len(free.keyframe):
+    known = short[found.rays.surface]
+    if not known.any() or not len(free.keyframe):
         return found
     cells, wall = _cells(found, sensors)
     at, direction = in_map(free, sensors)
@@ -47,7 +47,7 @@ def with_free_rays(found: MeasuredSurfaces, short: Bools, free: SurfaceRays, sen
     surface = _ended_on(at[near], direction[near], free.sigma[near].astype(np.float64), found.surfaces, cells, wall)
     surface = np.where(short[surface], surface, -1)
     more = replace(free.rows(near), surface=surface).rows(np.flatnonzero(surface >= 0)).bundled().packed()
-    rays = concatenated([found.rays.rows(~short[found.rays.surface]), more])
+    rays = concatenated([found.rays.rows(~known), more])
     return replace(found, rays=rays.by_keyframe(found.surfaces))
 
 

@@ -58,13 +58,10 @@ def with_joined_walls(found: MeasuredSurfaces, information: Floats, sensors: Flo
     closed[asked] = ~_seen_through(surfaces, rays, sensors, gaps.rows(asked))
     number = connected(gaps.one[closed], gaps.other[closed], len(surfaces.facing))
     # Each goes on as the piece of most rays.
-    largest = np.lexsort((np.bincount(rays.surface, minlength=len(number)), number))
-    kept = largest[np.flatnonzero(np.diff(number[largest], append=-1))]
-    order = np.sort(kept)
-    new = np.empty(len(kept), dtype=np.int64)
-    new[number[order]] = np.arange(len(order))
-    of = new[number]
-    joined = surfaces.rows(order)
+    by_rays = np.lexsort((np.bincount(rays.surface, minlength=len(number)), number))
+    largest = by_rays[np.flatnonzero(np.diff(number[by_rays], append=-1))]
+    kept, of = np.unique(largest[number], return_inverse=True)
+    joined = surfaces.rows(kept)
     return replace(found, surfaces=joined, rays=replace(rays, surface=of[rays.surface]).by_keyframe(joined)), of
 
 
