@@ -10,8 +10,9 @@ from helpers.planted_rays import POSES, rays_that_end
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.round_columns import surroundings
+from uwblite.lidar.stretches import stretches
 from uwblite.lidar.surface_rays import NEAR, around_columns, as_rays, on_columns, points_on, stretch_of
-from uwblite.lidar.walls import find_walls, stretches
+from uwblite.lidar.walls import find_walls
 from uwblite.odometry.attached import ScanPoints
 
 

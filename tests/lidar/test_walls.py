@@ -6,7 +6,8 @@ from helpers.laser_walks import scanned
 
 from uwblite import se2
 from uwblite.lidar import walls as walls_module
-from uwblite.lidar.walls import find_walls, stretches
+from uwblite.lidar.stretches import stretches
+from uwblite.lidar.walls import find_walls
 
 ALONG = np.column_stack([np.arange(0.0, 6.0, 0.4), np.zeros(15), np.zeros(15)])
 

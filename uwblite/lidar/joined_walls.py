@@ -11,8 +11,8 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated, connected, dots
+from .stretches import extent
 from .surface_rays import MeasuredSurfaces, SurfaceRays, Surfaces
-from .walls import extent
 
 _LEAN, _OFF = 0.15, 0.05
 """Largest difference of directions, rad, and of places across, m, with which pieces are compared at all."""

@@ -22,7 +22,8 @@ from .cloud_rasters import CloudRasters, look_up
 from .clouds import Clouds
 from .ray_noise import RayNoise, range_sigma
 from .round_columns import Surroundings, refined_columns, surroundings, to_circle
-from .walls import Stretches, Walls
+from .stretches import Stretches
+from .walls import Walls
 
 _GATE = 4.0
 """Standard deviations within which a ray ends on the surface."""

@@ -14,6 +14,7 @@ from ..lidar.ray_equations import misfit
 from ..lidar.ray_noise import UNLEARNT
 from ..lidar.round_columns import Circles, find_columns, fitted_circles, surroundings
 from ..lidar.short_walls import Pieces, pieces_of, walls_of
+from ..lidar.stretches import Stretches, stretches
 from ..lidar.surface_rays import (
     NEAR,
     MeasuredSurfaces,
@@ -27,7 +28,7 @@ from ..lidar.surface_rays import (
     surfaces_of,
     without_columns,
 )
-from ..lidar.walls import Stretches, find_walls, stretches
+from ..lidar.walls import find_walls
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import ScanClouds, Task
 from .recordings import Recording
