@@ -65,6 +65,22 @@ def test_a_bent_wall_is_none():
     assert len(found.centre) == 0
 
 
+def test_a_wall_that_poses_bend_is_found_in_straight_parts():
+    """A corridor of 30 m along which the heading drifts by 0.08 rad: 0.3 m from the line in its middle."""
+    x = np.arange(0.0, 30.0, 0.4)
+    walls = np.array([[-9.0, -1.0, 40.0, -1.0], [40.0, 1.0, -9.0, 1.0]])
+    clouds = scanned(np.column_stack([x, 0.0 * x, 0.0 * x]), walls, beams=720, reach=4.0)
+    drift = 0.08 / 30.0
+    parts, poses = stretches(clouds), np.column_stack([x, 0.5 * drift * x**2, drift * x])
+    found = find_walls(clouds, parts, poses)
+    assert 4 <= len(found.centre) <= 8
+    assert np.all(found.of_stretch[parts.straight] >= 0)
+    wall = found.of_stretch[parts.of_point]
+    at = se2.transform_each(poses, clouds.owner, clouds.points.astype(float))[wall >= 0]
+    off = np.sum((at - found.centre[wall[wall >= 0]]) * found.normal[wall[wall >= 0]], axis=1)
+    assert np.abs(off).max() < 0.2
+
+
 def test_walls_found_strip_by_strip_are_those_found_at_once(monkeypatch):
     """Strips of a few places each, of a hall with a column row between its long walls, seen from two aisles."""
     across = np.column_stack([np.arange(0.0, 6.0, 0.4), np.full(15, 2.5), np.full(15, 0.2)])

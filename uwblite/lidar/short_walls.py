@@ -1,9 +1,9 @@
 """Short walls: door jambs, piers and the fronts of cupboards, which clouds are too coarse to show as lines.
 
 A point of a cloud is the mean of ten rays, and lines through few of them say little. So the rays that end on no stretch of
-their own cloud (lidar/stretches.py) are cut scan by scan where neighbours are apart, and where two lines explain them better than
-one, until each piece is as straight as the noise of its rays lets it look. Pieces that several keyframes show in one place,
-facing the same way, are one wall.
+their own cloud (lidar/stretches.py) are cut scan by scan where neighbours are apart, and where two lines explain them better
+than one, until each piece is as straight as the noise of its rays lets it look. Pieces that several keyframes show in one
+place, facing the same way, are one wall.
 """
 
 from dataclasses import dataclass, replace

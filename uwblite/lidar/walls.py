@@ -17,7 +17,7 @@ _REACH, _OFF, _LEAN = 0.4, 0.06, np.cos(np.deg2rad(6.0))
 """Two stretches are of one wall where places on them are within a reach, m, of each other, lie on each other's line within
 some cm, and face the same way: what maps err by after the joint refinement, and less than what stands off a wall."""
 _BENT = 0.15
-"""Farthest that places of one wall lie off its line, m; a wall farther off is bent and left to pairs of clouds."""
+"""Farthest that places of one wall lie off its line, m; a wall farther off is bent: its halves may be walls."""
 _STRETCHES = 3
 """Stretches that make a wall."""
 
@@ -40,7 +40,7 @@ def find_walls(clouds: Clouds, found: Stretches, poses: Floats) -> Walls:
     stretch, owner = found.of_point[rows], clouds.owner[rows]
     at = se2.transform(poses[owner], clouds.points[rows].astype(np.float64))
     normal = se2.rotate(poses[owner, 2], found.normal[stretch])
-    number = _joined(stretch, at, normal, len(found.straight))
+    number = _halved(_joined(stretch, at, normal, len(found.straight)), stretch, at, owner)
     return _judged(number, stretch, at, normal, found)
 
 
@@ -121,16 +121,62 @@ def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, le
     return np.asarray(good)
 
 
+def _halved(number: Ints, stretch: Ints, at: Floats, owner: Ints) -> Ints:
+    """Return the number (s,) of the set of each stretch, -1 = without places, with bent sets halved along their length.
+
+    Poses that err by some mrad over a long way bend a long wall, which looks straight from each of them. Its parts are straight,
+    and are found to be one once poses have been adjusted to them (joined_walls.py). What single clouds see bent stays whole.
+
+    Parameters
+    ----------
+    number : (s,) set of each stretch.
+    stretch, at, owner : (m,), (m, 2), (m,) of places on stretches: of which, where in the map, m, and seen in which cloud.
+    """
+    own, which = (np.unique(k, return_inverse=True)[1] for k in (number[stretch], stretch))
+    middle = principal_axes(which, at, int(which.max(initial=-1)) + 1)[0][which]
+    bent = _bent(own, at) & ~_curved(own, at, owner)
+    for _ in range(_HALVINGS):
+        if not bent.any():
+            break
+        centre, direction, _ = principal_axes(own, at, len(bent))
+        beyond = bent[own] & (dots(middle - centre[own], direction[own]) > 0.0)
+        halves, own = np.unique(2 * own + beyond, return_inverse=True)
+        bent = bent[halves // 2] & _bent(own, at)
+    halved = np.full(len(number), -1)
+    halved[stretch] = own
+    return halved
+
+
+_HALVINGS = 6
+"""Most times that a bent set of stretches is halved."""
+
+
+def _bent(own: Ints, at: Floats) -> Bools:
+    """Return which sets of places (m, 2), numbered (m,), reach too far off their line."""
+    many = int(own.max(initial=-1)) + 1
+    centre, direction, _ = principal_axes(own, at, many)
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    return np.asarray(extent(own, np.abs(dots(at - centre[own], across[own])), many)[1] >= _BENT)
+
+
+def _curved(own: Ints, at: Floats, owner: Ints) -> Bools:
+    """Return which sets of places (m, 2), numbered (m,), are off a line for most of the clouds (m,) that see them."""
+    seen, number = unique_rows(np.stack([own, owner], axis=1))
+    off = principal_axes(number, at, len(seen))[2] > _ROUND
+    return np.asarray(np.bincount(seen[:, 0], np.where(off, 1.0, -1.0)) > 0.0)
+
+
+_ROUND = 0.02
+"""Root mean square distance from their line of places that one cloud sees on a curve, m."""
+
+
 def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
-    """Fit a line to each set (s,) of stretches by their places (m,), and keep those that are walls."""
+    """Fit a line to each set (s,) of stretches, see _halved, by their places (m,), and keep those that are walls."""
     many, own = int(number.max(initial=-1)) + 1, number[stretch]
     centre, direction, _ = principal_axes(own, at, many)
     across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
     across *= np.where(np.bincount(own, dots(normal, across[own]), many) < 0.0, -1.0, 1.0)[:, None]
-    off = np.abs(dots(at - centre[own], across[own]))
     stretches_of = np.bincount(number[np.unique(stretch)], minlength=many)
-    good = (stretches_of >= _STRETCHES) & (extent(own, off, many)[1] < _BENT)
+    good = (stretches_of >= _STRETCHES) & ~_bent(own, at)
     new = np.where(good, np.cumsum(good) - 1, -1)
-    with_places = np.zeros(len(number), dtype=bool)
-    with_places[stretch] = True
-    return Walls(np.where(found.straight & with_places, new[number], -1), centre[good], across[good])
+    return Walls(np.where(found.straight & (number >= 0), new[number], -1), centre[good], across[good])
