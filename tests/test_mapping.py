@@ -23,7 +23,7 @@ from uwblite.io.tum import read_tum
 from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, _stages, build_map
-from uwblite.odometry.wheels import with_noise_shown
+from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline import anchor_moves, final_stages
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.final_stages import at_given_poses

@@ -26,7 +26,7 @@ from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
 from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.wheels import with_noise_shown
+from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import preset
 from uwblite.radio.bootstrap_attempt import BootstrapResult

@@ -45,8 +45,16 @@ def test_exact_ranges_have_no_residual_and_a_delay_is_seen_by_the_tag_s_velocity
     frames = select(wheels, CONFIG)
     attached = attach_ranges(radio, wheels, frames, SensorMounting(tag_position=np.array([*tag, 0.0])))
     edges = RangeEdges(
-        attached.keyframe, attached.anchor, attached.ranges, np.ones(len(attached.ranges)), attached.lever_arm,
-        attached.turn, attached.velocity, tag, np.zeros(len(attached.ranges)), np.full((len(attached.ranges), 6), -1),
+        attached.keyframe,
+        attached.anchor,
+        attached.ranges,
+        np.ones(len(attached.ranges)),
+        attached.lever_arm,
+        attached.turn,
+        attached.velocity,
+        tag,
+        np.zeros(len(attached.ranges)),
+        np.full((len(attached.ranges), 6), -1),
     )
 
     def wrong(delay):

@@ -1,6 +1,5 @@
 """Keyframes: spacing along the odometry, velocity, the dense trajectory."""
 
-
 import numpy as np
 import pytest
 from helpers.planted import chain, drive, odometry, wander

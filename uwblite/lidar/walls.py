@@ -124,8 +124,8 @@ def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, le
 def _halved(number: Ints, stretch: Ints, at: Floats, owner: Ints) -> Ints:
     """Return the number (s,) of the set of each stretch, -1 = without places, with bent sets halved along their length.
 
-    Poses that err by some mrad over a long way bend a long wall, which looks straight from each of them. Its parts are straight,
-    and are found to be one once poses have been adjusted to them (joined_walls.py). What single clouds see bent stays whole.
+    Poses that err by some mrad over a long way bend a long wall, which looks straight from each of them. Its parts are
+    straight, and are found to be one once poses have been adjusted to them (joined_walls.py). What clouds see bent stays whole.
 
     Parameters
     ----------

@@ -5,21 +5,26 @@ with the square root of the way. So the residuals of single steps show the noise
 stays. Poses that rays on surfaces determine err themselves, and follow the wheels as far as these are trusted: of an error with
 the variance w, assumed s, a measurement with the variance v leaves a residual with (s / (s + v))^2 (w + v).
 
+The same residuals show how far the stated covariances must be larger than single steps let them be (`with_noise_shown`).
+
 A step sideways, in the frame in its middle, is slip: that of wheels that roll is far below what is assumed.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Floats, spread
+from ..arrays import Bools, Floats, spread
 from ..graph.eliminated import Blocks, rows_of
-from ..graph.graph import Graph, kernel_weights
-from ..graph.pose_edges import OdometryEdges
+from ..graph.graph import Graph, edge_weights, kernel_weights
+from ..graph.marginals import marginals
+from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.unknowns import Unknowns
-from .wheels import PATCH
 
+PATCH = 10
+"""Steps over which errors of the floor are correlated: 3 m."""
 _ENOUGH = 60
 """Residuals, measured better than assumed, that show a noise."""
 _LEAST, _MOST = 0.25, 3.0
@@ -59,12 +64,10 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
     """
     noise, patch = np.ones(3), np.zeros(2)
     if len(wheels) > PATCH:
+        shown = _steps_and_sums(wheels, graph, certainty, np.ones(len(wheels), dtype=bool))
         root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
-        variance, residuals = _pose_variance(graph, certainty), wheels.residuals(graph)
-        for k in range(3):
-            one = _shown(residuals[:, k], (variance[wheels.i, k] + variance[wheels.j, k]) * root[:, k] ** 2)
-            ten = _shown(*_summed(wheels, residuals[:, k], variance[:, k], root[:, k]))
-            if one is None or ten is None:
+        for k, ((one, of_one), (ten, of_ten)) in enumerate(shown):
+            if min(of_one, of_ten) < _ENOUGH:
                 continue
             if k == 1:
                 one = max(one, ten)
@@ -73,6 +76,83 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
                 patch[k // 2] = np.sqrt(max(ten - one, 0.0) * _STRADDLED / PATCH) / max(reach, _SMALL)
             noise[k] = np.sqrt(one)
     return replace(wheels, sqrt_information=wheels.sqrt_information / noise[:, None]), replace(even(wheels), sigma=patch)
+
+
+def with_noise_shown(graph: Graph, certainty: Floats | None = None) -> Graph:
+    """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
+
+    Errors that stay with the floor add up faster than with the square root of the way, which single steps do not show. Two
+    kinds of residuals do: sums over ten consecutive steps whose ends the lidar determines better than the wheels, and steps
+    that no scan measured, as far as ranges check them, for ranges check ways of many metres. The assumed noise counts as two.
+
+    Parameters
+    ----------
+    certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by what is not among the graph's edges; None = none.
+    """
+    scans, seen = [e for e in graph.edges if isinstance(e, ScanEdges)], np.zeros((len(graph.poses), 3, 3))
+    measured = np.zeros(max(len(graph.poses) - 1, 0), dtype=bool)
+    for e in scans:
+        measured[np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1]] = True
+        weight = edge_weights(e, graph)
+        for name, index, by_pose in e.linearize(graph).blocks:
+            if name == "poses":
+                np.add.at(seen, index, np.einsum("e,eda,edb->eab", weight, by_pose, by_pose))
+    if certainty is not None:
+        seen += certainty
+    return replace(
+        graph, edges=tuple(_as_shown(e, graph, seen, measured) if isinstance(e, OdometryEdges) else e for e in graph.edges)
+    )
+
+
+def _as_shown(wheels: OdometryEdges, graph: Graph, certainty: Floats, measured: Bools) -> OdometryEdges:
+    """Scale the noise of the edges along, across and in heading to what errors add up to over many steps."""
+    own, variance, sums = measured[wheels.i], np.ones(3), np.zeros(3)
+    if len(wheels) > PATCH:
+        for k, ((one, of_one), (ten, of_ten)) in enumerate(_steps_and_sums(wheels, graph, certainty, own)):
+            if min(of_one, of_ten) > 0:
+                variance[k], sums[k] = max(one + _ADDS_UP * max(ten - one, 0.0), 1.0), of_ten / PATCH
+    squares, checked = _by_redundancy(wheels, graph, ~own)
+    factor = np.sqrt((_ASSUMED + sums * variance + squares) / (_ASSUMED + sums + checked))
+    return replace(wheels, sqrt_information=wheels.sqrt_information / np.clip(factor, 1.0 / _MOST_FLOOR, _MOST_FLOOR)[:, None])
+
+
+def _by_redundancy(wheels: OdometryEdges, graph: Graph, some: Bools) -> tuple[Floats, Floats]:
+    """Return the weighted squares (3,) of the residuals of some edges, and how many of them other measurements check:
+    Helmert's variance components, with Baarda's redundancy."""
+    if not some.any():
+        return np.zeros(3), np.zeros(3)
+    squares = edge_weights(wheels, graph)[some, None] * np.square(wheels.residuals(graph)[some])
+    return squares.sum(axis=0), marginals(graph).redundancy(wheels)[some].sum(axis=0)
+
+
+_ASSUMED = 2.0
+"""What the assumed noise counts, in residuals: it is right within a factor of two."""
+_ADDS_UP = 3.0
+"""How much more the correlated part of errors adds up to over many steps than over ten: the sum of exp(-|k| / 10) over all k
+but 0 is 19, and that of (1 - |k| / 10) exp(-|k| / 10) within ten steps 6.4."""
+_MOST_FLOOR = 3.0
+"""Largest factor: more is slip, not floor."""
+
+_Shown = tuple[float, int]
+"""Variance relative to that assumed, and how many residuals show it."""
+
+
+def _steps_and_sums(wheels: OdometryEdges, graph: Graph, certainty: Floats, some: Bools) -> Iterator[tuple[_Shown, _Shown]]:
+    """Yield ahead, sideways and in heading the variance of the errors of some steps (e,), and that per step of their sums over
+    ten consecutive ones, which lie on one or two patches of floor; see `learnt`."""
+    root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
+    pose, residuals = _pose_variance(graph, certainty), wheels.residuals(graph)
+    ends, roots = (np.concatenate([np.zeros((1, 3)), np.cumsum(v, axis=0)]) for v in (residuals, root))
+    count = np.concatenate([[0], np.cumsum(some)])
+    # Windows across the seam of two recordings are none.
+    ten = np.flatnonzero((wheels.j[PATCH - 1 :] - wheels.i[: 1 - PATCH] == PATCH) & (count[PATCH:] - count[:-PATCH] == PATCH))
+    one = np.flatnonzero(some)
+    of_one = (pose[wheels.i[one]] + pose[wheels.j[one]]) * root[one] ** 2
+    mean = (roots[ten + PATCH] - roots[ten]) / PATCH
+    of_ten = (pose[wheels.i[ten]] + pose[wheels.j[ten + PATCH - 1]]) * mean**2 / PATCH
+    summed = (ends[ten + PATCH] - ends[ten]) / np.sqrt(PATCH)
+    for k in range(3):
+        yield _shown(residuals[one, k], of_one[:, k]), _shown(summed[:, k], of_ten[:, k])
 
 
 def _pose_variance(graph: Graph, certainty: Floats) -> Floats:
@@ -84,24 +164,14 @@ def _pose_variance(graph: Graph, certainty: Floats) -> Floats:
     return np.column_stack([np.einsum("nai,nij,naj->na", axes, covariance, axes), covariance[:, 2, 2]])
 
 
-def _summed(wheels: OdometryEdges, residual: Floats, variance: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """Return sums over consecutive steps, divided by the root of their number, and the variance that poses add to these."""
-    ends = np.concatenate([[0.0], np.cumsum(residual)])
-    roots = np.concatenate([[0.0], np.cumsum(root)])
-    first, last = wheels.i[: 1 - PATCH], wheels.j[PATCH - 1 :]
-    whole = np.flatnonzero(last - first == PATCH)
-    mean = (roots[whole + PATCH] - roots[whole]) / PATCH
-    added = (variance[first[whole]] + variance[last[whole]]) * mean**2 / PATCH
-    return (ends[whole + PATCH] - ends[whole]) / np.sqrt(PATCH), added
-
-
-def _shown(residual: Floats, added: Floats) -> float | None:
-    """Return the variance of errors relative to that assumed, by residuals to which poses add a variance; None = not shown."""
+def _shown(residual: Floats, added: Floats) -> _Shown:
+    """Return the variance of errors by residuals to which poses add a variance; only those count that poses check well."""
     good = added < 1.0
-    if good.sum() < _ENOUGH:
-        return None
+    if not good.any():
+        return 1.0, 0
     residual, added = residual[good], added[good]
-    return float(np.clip(spread(residual * (1.0 + added)) ** 2 - np.median(added), _LEAST**2, _MOST**2))
+    variance = spread(residual * (1.0 + added)) ** 2 - np.median(added)
+    return float(np.clip(variance, _LEAST**2, _MOST**2)), int(good.sum())
 
 
 def equations(wheels: OdometryEdges, floor: Floor, graph: Graph, unknowns: Unknowns) -> Blocks:

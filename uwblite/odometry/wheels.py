@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, spread
+from ..arrays import Floats, spread
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
-from ..graph.graph import Calibration, Graph, edge_weights
-from ..graph.marginals import marginals
-from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from ..graph.graph import Calibration, Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..graph.robust import Kernel
 from ..sensor_log import Odometry
 from .keyframes import Keyframes
@@ -133,68 +132,3 @@ _CERTAIN = 5.0
 """Standard deviations of their difference from which a measured step contradicts the wheels for certain."""
 _MOVING = 0.05
 """m + rad; over shorter steps wheels count nothing, and do not show how noise grows with the way."""
-
-
-def with_noise_shown(graph: Graph) -> Graph:
-    """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
-
-    A carpet's nap, a cross slope or a smooth patch makes all steps on it wrong by the same, for three metres (ten steps). Their
-    errors then add up faster than with the square root of the way, which single steps do not show. Two kinds of residuals do:
-    sums over ten consecutive steps that the lidar measured, and steps that no scan measured, as far as ranges check them, for
-    ranges check ways of many metres. The assumed noise counts as two of them.
-    """
-    scans = [e for e in graph.edges if isinstance(e, ScanEdges)]
-    measured = np.zeros(max(len(graph.poses) - 1, 0), dtype=bool)
-    for e in scans:
-        measured[np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1]] = True
-    return replace(
-        graph, edges=tuple(_as_shown(e, graph, measured) if isinstance(e, OdometryEdges) else e for e in graph.edges)
-    )
-
-
-def _as_shown(wheels: OdometryEdges, graph: Graph, measured: Bools) -> OdometryEdges:
-    """Scale the noise of the edges along, across and in heading to what errors add up to over many steps."""
-    errors, own = wheels.residuals(graph), measured[wheels.i]
-    variance, sums = _long_term_variance(errors, own)
-    squares, checked = _by_redundancy(wheels, graph, errors, ~own)
-    factor = np.sqrt((_ASSUMED + sums * variance + squares) / (_ASSUMED + sums + checked))
-    return replace(wheels, sqrt_information=wheels.sqrt_information / np.clip(factor, 1.0 / _MOST_FLOOR, _MOST_FLOOR)[:, None])
-
-
-def _long_term_variance(errors: Floats, measured: Bools) -> tuple[Floats, float]:
-    """Return the variance (3,) per step of sums over many steps with errors (e, 3), and how many independent sums show it.
-
-    It is extrapolated from sums over ten measured steps: with a correlation of exp(-1 / 10) between neighbours, the correlated
-    part has there reached a third of what it adds up to. No noise becomes smaller by it.
-    """
-    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(errors, axis=0)])
-    count = np.concatenate([[0], np.cumsum(measured)])
-    # Windows across the seam of two recordings are few.
-    whole = np.flatnonzero(count[PATCH:] - count[:-PATCH] == PATCH)
-    if not len(whole):
-        return np.ones(3), 0.0
-    single, added = (
-        np.array([spread(column) ** 2 for column in values.T])
-        for values in (errors[measured], (summed[whole + PATCH] - summed[whole]) / np.sqrt(PATCH))
-    )
-    return np.maximum(single + _ADDS_UP * np.maximum(added - single, 0.0), 1.0), len(whole) / PATCH
-
-
-def _by_redundancy(wheels: OdometryEdges, graph: Graph, errors: Floats, some: Bools) -> tuple[Floats, Floats]:
-    """Return the weighted squares (3,) of the errors (e, 3) of some edges, and how many of them other measurements check:
-    Helmert's variance components, with Baarda's redundancy."""
-    if not some.any():
-        return np.zeros(3), np.zeros(3)
-    squares = edge_weights(wheels, graph)[some, None] * np.square(errors[some])
-    return squares.sum(axis=0), marginals(graph).redundancy(wheels)[some].sum(axis=0)
-
-
-_ASSUMED = 2.0
-"""What the assumed noise counts, in residuals: it is right within a factor of two."""
-PATCH = 10
-"""Steps over which errors of the floor are correlated: 3 m."""
-_ADDS_UP = 3.0
-"""How much more the correlated part of errors adds up to over many steps than over ten: the sum of exp(-|k| / 10) over all k
-but 0 is 19, and that of (1 - |k| / 10) exp(-|k| / 10) within ten steps 6.4."""
-_MOST_FLOOR = 3.0
-"""Largest factor: more is slip, not floor."""

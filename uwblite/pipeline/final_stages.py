@@ -20,8 +20,8 @@ from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.attached import choose_scans
+from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
-from ..odometry.wheels import with_noise_shown
 from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
@@ -59,10 +59,11 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
     """
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
-    stated = with_noise_shown(with_fewer_pairs(estimate.graph))
-    rays = None
+    graph, rays, certainty = with_fewer_pairs(estimate.graph), None, None
     if estimate.surfaces is not None:
-        stated, rays = for_covariances(estimate.surfaces, stated, task)
+        graph, on_surfaces = for_covariances(estimate.surfaces, graph, task)
+        rays, certainty = on_surfaces.equations, on_surfaces.sums.poses
+    stated = with_noise_shown(graph, certainty)
     found = marginals(stated, common := common_range_errors(stated), among=along, further=rays)
     if common:
         estimate = estimate.with_estimates_of(with_nonnegative_heights(found.corrected()))

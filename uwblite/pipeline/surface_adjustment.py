@@ -12,7 +12,6 @@ walls and columns, and their points there hardly count any more; where walls ben
 real offices, rays of one place weigh as few, and pairs keep their weight.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,10 +69,22 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
 
-def for_covariances(
-    found: MeasuredSurfaces, graph: Graph, task: Task
-) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
-    """Return a graph and what gives the normal equations of the rays by the numbers of its unknowns, for covariances.
+@dataclass(frozen=True, slots=True, eq=False)
+class RaysOfGraph:
+    """What rays say of a graph's unknowns, for covariances."""
+
+    sums: RaySums
+    surfaces: Surfaces
+    graph: Graph
+    lidar: "_Lidar"
+
+    def equations(self, unknowns: Unknowns) -> Blocks:
+        """Return the normal equations of the rays by the numbers of the graph's unknowns."""
+        return _blocks(self.sums, self.surfaces, self.graph, self.lidar, unknowns)
+
+
+def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, RaysOfGraph]:
+    """Return a graph, and what the rays say of it, for covariances.
 
     Rays count as in the adjustment. Pairs of clouds have seen the same points, and more: they count half.
     """
@@ -83,7 +94,7 @@ def for_covariances(
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
     sums = weighted_sums(found, lidar.sensors, graph.poses, _KERNEL)
-    return replace(graph, edges=tuple(edges)), lambda unknowns: _blocks(sums, found.surfaces, graph, lidar, unknowns)
+    return replace(graph, edges=tuple(edges)), RaysOfGraph(sums, found.surfaces, graph, lidar)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
