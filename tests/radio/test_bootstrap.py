@@ -175,6 +175,19 @@ def test_a_straight_path_reports_that_its_anchors_are_ambiguous():
         np.testing.assert_array_equal(bootstrapped.graph.anchors[k], found[0])
 
 
+def test_anchors_heard_late_and_from_one_line_alone_are_placed_and_ambiguous():
+    """No stretch shows the side of any anchor: then all of the path is searched, and not the first metres alone."""
+    rng = np.random.default_rng(42)
+    stamps = np.arange(3000) * 0.1
+    truth = np.column_stack([0.3 * stamps, 0.003 * np.sin(stamps), np.zeros(3000)])
+    places = np.array([[62.0, 3.0], [72.0, -4.0]])
+    wheels = odometry(stamps, truth, rng, noise=0.005, turn_noise=0.001)
+    heard = np.array([[180.0, 290.0], [190.0, 299.0]])
+    bootstrapped, _ = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, in_reach=heard))
+    assert bootstrapped.ambiguous.all()
+    assert bootstrapped.placed.all()
+
+
 def test_ranges_of_no_weight_and_none_at_all_leave_the_odometry():
     rng = np.random.default_rng(51)
     stamps, truth = wander(rng, 20.0)

@@ -176,8 +176,11 @@ class Attempt:
         return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
 
     def _seed(self) -> float:
-        """Choose the stretch whose anchors are clearest and place them; return its length, m."""
-        best, most = None, -1.0
+        """Choose the stretch whose anchors are clearest, all of the path where none is clear anywhere, and place them.
+
+        Returns its length, m.
+        """
+        best, most = None, 0.0
         total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), 3)
         for length in [d for d in self.config.seed_distances if d < total] + [total]:
             places = 1 + max(0, min(5, int(2 * total / max(length, 1e-9)) - 2))
@@ -187,7 +190,7 @@ class Attempt:
                 found = self._search(low, high, self.config.drift * length)
                 clear = [h[0] for h in found.values() if h and not self._unclear(h)]
                 worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
-                if worth > most + 1e-9:
+                if worth > most + 1e-9 or best is None and length == total:
                     best, most = (found, low, high), worth
             if most > self.config.clear_enough * count:
                 break
