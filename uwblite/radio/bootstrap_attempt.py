@@ -190,7 +190,7 @@ class Attempt:
                 found = self._search(low, high, self.config.drift * length)
                 clear = [h[0] for h in found.values() if h and not self._unclear(h)]
                 worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
-                if worth > most + 1e-9 or best is None and length == total:
+                if worth > most + 1e-9 or (best is None and length == total):
                     best, most = (found, low, high), worth
             if most > self.config.clear_enough * count:
                 break
