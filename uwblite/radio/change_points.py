@@ -36,7 +36,7 @@ _WORST_BIAS = 1.0
 """Constant error of ranges to a place, m, beyond that of the worst radios: no anchor stood there."""
 _STEP = 0.5
 """Change of a constant error that a line of sight blocked from some moment on explains, m."""
-_HEIGHTS, _LEAST_LEVEL = (1.0, 2.0, 3.0, 4.0), 0.1
+_HEIGHTS, _LEAST_LEVEL = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 0.1
 """Heights that nobody gave, m, and the least level distance below an anchor, m: an anchor passed nearby and seen from afar at
 another time seems to have two places."""
 _LIKE_HEIGHT = 0.5
