@@ -36,6 +36,20 @@ def test_motions_are_found_whatever_the_mounting(mounting):
     np.testing.assert_allclose(away, _FIRST_GATE**2)
 
 
+def test_along_a_bare_corridor_a_scan_matches_the_next_one_no_better_if_the_robot_stood():
+    """Readings end 6 m ahead, wherever the robot is; what one scan shows beyond the other's reach tells nothing."""
+    stamps, truth = drive([(0.9, 0.0, 0.0)], [6.0])
+    lidar = scans(
+        stamps, truth, box(80, 3), beams=360, sweep=1e-6, range_max=6.0, noise=0.005, rng=np.random.default_rng(1)
+    )  # fmt: skip
+    exact = np.array([[0.9, 0.0, 0.0]])
+    first = np.array([0])
+    second = np.array([int(np.argmin(np.abs(lidar.stamps - lidar.stamps[0] - 1.0)))])
+    moved, stood = (misfits(lidar, NOMINAL, first, second, motion) for motion in (exact, 0.0 * exact))
+    assert moved < 0.02**2
+    assert stood < 0.02**2
+
+
 @pytest.mark.filterwarnings("error")
 def test_scans_that_see_nothing_match_nothing():
     lidar, exact = seen(range_max=0.1)

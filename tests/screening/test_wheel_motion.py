@@ -8,8 +8,6 @@ from uwblite.screening import wheel_motion
 from uwblite.screening.wheel_motion import (
     Pairs,
     _chosen,
-    _factor,
-    _ratios,
     _span,
     _within,
     compare,
@@ -151,19 +149,6 @@ def test_only_pairs_within_a_time_that_match_measure_it():
     assert np.flatnonzero(_within(found, 2.0, 6.5)).tolist() == [2, 3, 5, 6]
     assert np.flatnonzero(_within(found, 2.1, 6.4)).tolist() == [3, 5]
     assert (seen(found, 2.0, 5.5), seen(found, 2.1, 5.5)) == (True, False)
-
-
-def test_ratios_are_those_along_the_wheels_of_clear_motions():
-    rng = np.random.default_rng(1)
-    wheels, lidar = rng.normal(size=(50, 2)) * 0.1, rng.normal(size=(50, 2))
-    rows, ratio = _ratios(wheels, lidar, 0.08)
-    expected = [k for k in range(50) if np.hypot(*wheels[k]) > 0.08]
-    assert rows.tolist() == expected
-    # The factor by which the wheels' motion comes nearest to the lidar's.
-    np.testing.assert_allclose(ratio, [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in expected])
-    assert _factor(wheels, lidar, 0.08) == np.median(ratio)
-    assert _factor(wheels[expected][:12], lidar[expected][:12], 0.0) == np.median(ratio[:12])
-    assert (_factor(wheels[:11], lidar[:11], 0.0), _factor(wheels[:11], lidar[:11], 0.0, 7.0)) == (1.0, 7.0)
 
 
 def test_the_way_ratio_is_of_measured_pairs_with_a_clear_way():

@@ -65,11 +65,40 @@ def scan_steps(
 def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the mean square distance (e,), m^2, at which pairs of scans match at given motions T_first_second (e, 3).
 
-    Points without a match count as one at the gate.
+    Points without a match count as one at the gate, unless the first scan could not see there: along a bare corridor, where
+    readings end at the lidar's reach, those of two scans would otherwise match best if the robot stood.
     """
     built, raster, i, _, points = _pairs(scans, mounting, first, second)
+    points = _in_sight(built, i, motion, points, scans, mounting)
     found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
     return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+
+
+def _in_sight(
+    built: Clouds, i: Ints, motion: Floats, points: PairPoints, scans: LaserScans, mounting: SensorMounting
+) -> PairPoints:
+    """Return the points of pairs that the first scan looks at, and not from much farther than it sees; all where few are left.
+
+    Parameters
+    ----------
+    i : (e,) clouds of the first scans. motion : (e, 3) T_first_second.
+    """
+    in_laser = se2.transform(se2.inverse(mounting.T_base_laser), built.points.astype(np.float64))
+    away = np.hypot(in_laser[:, 0], in_laser[:, 1])
+    ends = zip(built.offsets[:-1].tolist(), built.offsets[1:].tolist(), strict=True)
+    reach = np.array([np.quantile(away[a:b], _WELL_SEEN) if b > a else 0.0 for a, b in ends])
+    T_laser_first = se2.compose(se2.inverse(mounting.T_base_laser), motion)[:, None]
+    at = se2.transform(T_laser_first, built.points.astype(np.float64).take(points.row, axis=0))
+    bearing = np.arctan2(at[..., 1], at[..., 0]) * (-1.0 if mounting.laser_flipped else 1.0)
+    middle, half = 0.5 * (scans.angles[0] + scans.angles[-1]), 0.5 * abs(scans.angles[-1] - scans.angles[0])
+    seen = (np.abs(se2.wrap_angle(bearing - middle)) <= half) & (np.hypot(at[..., 0], at[..., 1]) <= reach[i, None])
+    seen &= points.row >= 0
+    few = seen.sum(axis=1) < _LEAST_IN_SIGHT * (points.row >= 0).sum(axis=1)
+    return PairPoints(np.where(seen | few[:, None], points.row, -1).astype(np.int32))
+
+
+_WELL_SEEN, _LEAST_IN_SIGHT = 0.9, 0.5
+"""Quantile of a scan's readings up to which it sees whatever is there, and the share of the points that must be nearer."""
 
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:

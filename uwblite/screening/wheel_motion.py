@@ -13,6 +13,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, Remark, SensorLog
+from .motion_ratios import ratios, undiluted
 
 _PAIRS = 250
 """Pairs of scans compared over the whole recording."""
@@ -102,10 +103,15 @@ def compare(log: SensorLog) -> Pairs | None:
 
 
 def _fit_better(log: SensorLog, first: Ints, second: Ints, one: Floats, other: Floats) -> Bools:
-    """Return for which pairs of scans (e,) one motion (e, 3) matches better than another in every direction."""
+    """Return for which pairs of scans (e,) one motion (e, 3) matches better than another in every direction.
+
+    What lies in sight of both must match better as well: of a bare corridor a scan shows as many metres as the lidar reaches,
+    wherever it was taken, and the ends of two scans coincide where the robot stood.
+    """
     assert log.scans is not None
     a, b = (directional_shares(log.scans, log.mounting, first, second, motion) for motion in (one, other))
-    return np.asarray((a > b + _GAIN) & (a > _EVERYWHERE))
+    near, far = (misfits(log.scans, log.mounting, first, second, motion) for motion in (one, other))
+    return np.asarray((a > b + _GAIN) & (a > _EVERYWHERE) & _clearly_worse(far, near))
 
 
 def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
@@ -174,7 +180,12 @@ def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
     What a robot at rest measures twice differs by the noise of its lidar, and some motion fits that better.
     """
     moving, rest = (_misfits(log, pairs, motion) for motion in (pairs.lidar, 0.0 * pairs.lidar))
-    return rest > np.maximum(_WORSE_AT_REST * moving, _NOISE_AT_REST**2)
+    return _clearly_worse(rest, moving)
+
+
+def _clearly_worse(one: Floats, other: Floats) -> Bools:
+    """Return which pairs (e,) match worse at mean square distances one than at the other, m^2, by more than noise."""
+    return one > np.maximum(_CLEARLY_WORSE * other, _NOISE**2)
 
 
 def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
@@ -184,10 +195,10 @@ def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
     return misfits(log.scans, log.mounting, first, second, motion)
 
 
-_NOISE_AT_REST = 0.02
+_NOISE = 0.02
 """Rms distance of matches of two scans from one place, m: lidars of robots have 1 to 2 cm."""
-_WORSE_AT_REST = 2.0
-"""Factor between the mean square distances of matches if the robot stood and as it moved, from which it did not stand."""
+_CLEARLY_WORSE = 2.0
+"""Factor between the mean square distances of matches at two motions from which one of them is wrong."""
 
 
 def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Remark]:
@@ -199,7 +210,8 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     own = pairs.rows(pairs.measured)
     if len(own.start) < 4 * _LEAST_PAIRS:
         return []
-    way, turn = _factor(own.wheels[:, :2], own.lidar[:, :2], 0.03), _factor(own.wheels[:, 2:], own.lidar[:, 2:], 0.03)
+    parts = slice(0, 2), slice(2, 3)
+    way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], _CLEAR_MOTION, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
     off, larger = own.lidar - wheels, np.maximum(np.abs(own.lidar), np.abs(wheels))
     bad = np.hypot(off[:, 0], off[:, 1]) > _ABSOLUTE[0] + _RELATIVE * np.hypot(larger[:, 0], larger[:, 1])
@@ -242,23 +254,15 @@ _NOISE_SHARE = 0.4
 
 
 def way_ratio(pairs: Pairs) -> float:
-    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions.
-
-    Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
-    other's motions is taken as well, and of both the one that is nearer to 1.
-    """
-    own, nan = pairs.rows(pairs.measured), float("nan")
-    wheels, lidar = own.wheels[:, :2], own.lidar[:, :2]
-    ratio, inverse = _factor(wheels, lidar, _CLEAR_WAY, nan), _factor(lidar, wheels, _CLEAR_WAY, nan)
-    if not (ratio > 0.0 and inverse > 0.0):
-        return ratio
-    return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
+    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
+    own = pairs.rows(pairs.measured)
+    return undiluted(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY, float("nan"))
 
 
 def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
     """Return the longest stretch in which ways or turns have another ratio than elsewhere."""
     for columns, clear in ((slice(0, 2), _CLEAR_WAY), (slice(2, 3), _CLEAR_TURN)):
-        rows, ratio = _ratios(own.wheels[:, columns], own.lidar[:, columns], clear)
+        rows, ratio = ratios(own.wheels[:, columns], own.lidar[:, columns], clear)
         if len(rows) < 3 * _CHUNK:
             continue
         parts = np.array_split(np.arange(len(rows)), len(rows) // _CHUNK)
@@ -277,22 +281,11 @@ def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
     return []
 
 
-def _ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
-    """Return the pairs with a clear motion by either, and the ratio of lidar to wheels along the larger of the two."""
-    size = np.sqrt(np.sum(wheels**2, axis=1))
-    rows = np.flatnonzero(size > clear)
-    return rows, np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
-
-
+_CLEAR_MOTION = 0.03
+"""Way, m, or turn, rad, of most pairs of a robot that drives or turns."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.1
 """Ways, m, and turns, rad, whose ratio is no noise."""
 _CHUNK = 12
 """Pairs whose median ratio is taken."""
 _OTHER_RATIO, _RATIO_SIGMAS = 0.15, 5.0
 """Relative difference of ratios, and in their standard deviations, from which they are not the same."""
-
-
-def _factor(wheels: Floats, lidar: Floats, clear: float, otherwise: float = 1.0) -> float:
-    """Return the factor of the wheels' motions (e, d) that most agree on; `otherwise` where there are too few."""
-    ratio = _ratios(wheels, lidar, clear)[1]
-    return float(np.median(ratio)) if len(ratio) >= 2 * _LEAST_PAIRS else otherwise
