@@ -16,7 +16,8 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join
+from uwblite.pipeline.joining import _laid_on, _one_bootstrap, _one_graph, join
+from uwblite.pipeline.shared_anchors import Places
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -53,38 +54,17 @@ def test_anchors_of_one_recording_alone_keep_what_it_says_and_none_is_no_bootstr
     assert _one_bootstrap(estimates[1:2], [np.zeros(3)], [np.zeros(0, int)], 0) is None
 
 
-@pytest.mark.parametrize(("off", "moved"), [(0.9, False), (2.0, True)])
-def test_an_anchor_that_lies_further_off_than_first_places_may_does_not_join_in(off, moved):
-    """0.5 m, and twice the root of 0.2^2 + 0.15^2 m^2 = 0.25 m, which is 0.5 m more."""
-    motion, recording = np.array([3.0, -2.0, 0.7]), SimpleNamespace(name="other.log")
-    places = {"A": [0.0, 0.0], "B": [8.0, 0.0], "C": [0.0, 6.0], "D": [7.0, 7.0]}
-    placed = {name: (np.array(place), 0.2) for name, place in places.items()}
-    found = {name: (se2.transform(se2.inverse(motion), place), 0.15) for name, (place, _) in placed.items()}
-    found["D"] = (se2.transform(se2.inverse(motion), placed["D"][0] + [off, 0.0]), 0.15)
-    laid, gone = _laid_on(found, placed, recording)
-    assert list(gone) == (["D"] if moved else [])
-    if moved:
-        np.testing.assert_allclose(laid, motion, atol=1e-6)
-        assert gone["D"] == pytest.approx(off)
+def test_a_recording_that_nothing_lays_on_the_others_is_refused():
+    """One anchor in common leaves the heading open; two whose distance differs by 3 m are no common frame."""
+    placed = Places(("A", "B"), np.array([[0.0, 0.0], [8.0, 0.0]]), 0.04 * np.eye(4))
+    recording = SimpleNamespace(name="other.log")
     with pytest.raises(DataError, match=r"other.log shares 1 placed anchors with the others \(B\)"):
-        _laid_on({"B": found["B"], "X": found["A"]}, placed, recording)
-
-
-def test_a_moved_anchor_is_called_as_the_earlier_recording_that_found_it_there():
-    here, placed = np.array([2.0, 2.0]), {"A#2": (np.array([2.0, 2.6]), 0.0), "A#3": (np.array([2.0, 2.4]), 0.0)}
-    assert _FIRST_TOLERANCE == 0.5
-    assert _other_name("A", here, 0.0, 3, placed) == "A#3"
-    assert _other_name("A", here, 0.06, 3, placed) == "A#2"
-    assert _other_name("A", here, 0.0, 2, placed) == "A#3"
-    assert _other_name("A", here + 5.0, 0.0, 3, placed) == "A#4"
-
-
-def test_an_anchor_that_was_moved_while_recorded_is_called_so_in_later_recordings():
-    """The second recording hears it under its first name, where the first one heard it last."""
-    placed = {"A": (np.array([9.0, 0.0]), 0.0), "B@2": (np.zeros(2), 0.0), "A@2": (np.zeros(2), 0.0)}
-    assert _other_name("A", np.array([0.3, 0.3]), 0.0, 1, placed) == "A@2"
-    assert _other_name("A@2", np.array([9.2, 0.3]), 0.0, 1, placed) == "A"
-    assert _other_name("A", np.array([0.4, 0.4]), 0.0, 1, placed) == "A#2"
+        _laid_on(replace(placed, names=("X", "B")), placed, recording)
+    with pytest.raises(DataError, match=r"other\.log has the anchors A, B in common with the others, but in no two"):
+        _laid_on(replace(placed, at=np.array([[0.0, 0.0], [11.0, 0.0]])), placed, recording)
+    motion, agree = _laid_on(placed.moved(np.array([3.0, -2.0, 0.7])), placed, recording)
+    np.testing.assert_allclose(motion, se2.inverse(np.array([3.0, -2.0, 0.7])), atol=1e-9)
+    assert agree == [(0, 0), (1, 1)]
 
 
 def mapped(seed, tag, ids):

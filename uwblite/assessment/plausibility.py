@@ -23,6 +23,7 @@ from .half_tests import check_halves
 from .range_agreement import check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .residual_tests import check_residuals
 from .untied_parts import check_untied_parts
+from .untied_recordings import check_untied_recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is worth a warning."""
@@ -64,6 +65,7 @@ def judge(
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)
+    check_untied_recordings(estimate, task)
     check_other_minimum(estimate, task)
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)

@@ -67,6 +67,22 @@ def calibration_covariance(graph: Graph) -> Floats:
     return covariance
 
 
+def anchor_covariance(graph: Graph, anchors: Ints) -> Floats:
+    """Return the covariance (2a, 2a) of the places of some free anchors (a,); huge in directions that are open."""
+    normal = filled(graph, subtrees=True)
+    number = normal.unknowns.number["anchors"][anchors].ravel()
+    right = np.zeros((normal.unknowns.size, len(number)))
+    right[number, np.arange(len(number))] = 1.0
+    covariance = factor_of(normal).solve(right)[number]
+    unseen = np.flatnonzero(normal.diagonal[number] <= 0.0)
+    covariance[unseen, unseen] = _OPEN
+    return np.asarray(covariance)
+
+
+_OPEN = 1e12
+"""m^2; of what no edge touches."""
+
+
 def _end(graph: Graph, poses: Ints | None) -> tuple[dict[str, Ints], int, Floats, Floats, Ints]:
     """Return the end of a graph's factor H = L D L^T: what is left once all else is eliminated.
 

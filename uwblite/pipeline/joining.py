@@ -16,20 +16,17 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from ..graph import calibration
 from ..graph.graph import Calibration, Graph, PriorEdges
-from ..graph.marginals import marginals
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
-from ..sensor_log.anchor_names import first_place, numbered, radio_name
-from .constraint_edges import consensus
+from ..sensor_log.anchor_names import first_place, numbered
 from .estimate import Estimate, Task
 from .recordings import Recording, Recordings
+from .shared_anchors import Pairs, Places, agreement, other_place, places_of, together
 
 _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
-_MOST_VARIANCE = 25.0
-"""m^2; an anchor whose first place is less sure, or open, still has to lie within some metres to join in."""
 
 
 def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
@@ -47,24 +44,25 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     DataError : a recording shares fewer than two placed anchors with the others.
     """
     recordings = task.recordings
-    found = [_places(estimate) for estimate in estimates]
-    placed = dict(found[0])
+    found = [places_of(estimate) for estimate in estimates]
+    placed = found[0]
     motions = [np.zeros(3) for _ in estimates]
     names = [list(estimate.anchor_ids) for estimate in estimates]
     waiting = list(range(1, len(estimates)))
     while waiting:
-        number = max(waiting, key=lambda n: (len(found[n].keys() & placed.keys()), -n))
-        motions[number], moved = _laid_on(found[number], placed, recordings.each[number])
+        number = max(waiting, key=lambda n: (len(set(found[n].names) & set(placed.names)), -n))
         waiting.remove(number)
-        for k, name in enumerate(names[number]):
-            here, spread = found[number].get(name, (None, 0.0))
-            if here is None:
-                continue
-            here = se2.transform(motions[number], here)
-            if name in moved:
-                names[number][k] = _other_name(name, here, spread, number, placed)
-                warn_of_moved_anchor(task, name, moved[name], number, names[number][k])
-            placed.setdefault(names[number][k], (here, spread))
+        own = found[number]
+        motions[number], agree = _laid_on(own, placed, recordings.each[number])
+        own = own.moved(motions[number])
+        called = list(own.names)
+        for k, name in enumerate(own.names):
+            if name in placed.names and (k, placed.names.index(name)) not in agree:
+                called[k] = other_place(own, placed, agree, k) or numbered(name, number)
+                off = float(np.hypot(*(own.at[k] - placed.at[placed.names.index(name)])))
+                warn_of_moved_anchor(task, name, off, number, called[k])
+                names[number][names[number].index(name)] = called[k]
+        placed = together(placed, own, called)
     return _one_graph(estimates, motions, names, recordings)
 
 
@@ -77,48 +75,26 @@ def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: in
     )  # fmt: skip
 
 
-def _other_name(name: str, here: Floats, spread: float, number: int, placed: dict[str, tuple[Floats, float]]) -> str:
-    """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
-    for other, (place, sigma) in placed.items():
-        if radio_name(other) == radio_name(name) and np.hypot(*(place - here)) < tolerance(spread, sigma):
-            return other
-    return numbered(name, number)
-
-
 def tolerance(one: float, other: float) -> float:
     """Return how far two first places of one anchor with these standard deviations may lie apart, m."""
     return _FIRST_TOLERANCE + 2.0 * float(np.hypot(one, other))
 
 
-def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
-    """Return place (2,) and standard deviation (m) of the unambiguous anchors; of all placed if these are few."""
-    if estimate.bootstrap is None:
-        return {}
-    placed = np.flatnonzero(estimate.placed & ~estimate.bootstrap.ambiguous)
-    if len(placed) < 2:
-        placed = np.flatnonzero(estimate.placed)
-    spread = marginals(estimate.graph.with_edges(*estimate.odometry_and_ranges)).covariances.anchors
-    return {
-        estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, _MOST_VARIANCE))))
-        for k in placed
-    }
-
-
-def _laid_on(
-    found: dict[str, tuple[Floats, float]], placed: dict[str, tuple[Floats, float]], recording: Recording
-) -> tuple[Floats, dict[str, float]]:
-    """Return the motion (3,) of a recording into the common frame, and the anchors that do not join in, with how far off."""
-    common = sorted(found.keys() & placed.keys())
+def _laid_on(found: Places, placed: Places, recording: Recording) -> tuple[Floats, Pairs]:
+    """Return the motion (3,) of a recording into the common frame, and which anchors agree there."""
+    common = sorted(set(found.names) & set(placed.names))
     if len(common) < 2:
         raise DataError(
             f"{recording.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two "
             "or more are needed to bring it into their frame: map it alone, or record where common anchors are in reach"
         )
-    here, there = (np.array([side[name][0] for name in common]) for side in (found, placed))
-    most = np.array([tolerance(found[name][1], placed[name][1]) for name in common])
-    motion = consensus(here, there, most)
-    off = np.hypot(*(se2.transform(motion, here) - there).T)
-    return motion, {name: float(d) for name, d, limit in zip(common, off, most, strict=True) if d > limit}
+    motion, pairs = agreement(found, placed)
+    if not pairs:
+        raise DataError(
+            f"{recording.name} has the anchors {', '.join(common)} in common with the others, but in no two of them do their "
+            "places agree: they were moved, or it is of another place; map it alone"
+        )
+    return motion, pairs
 
 
 def _one_graph(

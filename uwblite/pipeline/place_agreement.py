@@ -3,11 +3,13 @@
 A move is found along a given trajectory, as if that were exact. Where a first trajectory is bent, or the lidar sees too little
 to hold the last one, ranges from two stretches of it seem to be from two places, of which one may be a mirror image. Here all
 measurements are in one graph, and the trajectory is free. Where one place costs no more than chance explains, there is one:
-a test by the ratio of likelihoods, which holds as well where a place is known along a curve only.
+a test by the ratio of likelihoods, which holds as well where a place is known along a curve only. Places that recordings have
+of an anchor are found at fixed poses, too, and compared in the same way.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -39,6 +41,7 @@ def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     task.stages.end("places merged", anchors=len(same))
     merged = with_range_noise(_merged(estimate, same), task.config, steady=estimate.joint is not None)
+    task.stages.withdraw("moved-anchor", "new_id", but=merged.anchor_ids)
     return solved(merged, task.config.solver)
 
 
@@ -62,17 +65,18 @@ def _most_cost(count: int) -> float:
 
 
 def _successive(estimate: Estimate) -> list[tuple[int, int]]:
-    """Return pairs of placed anchors of which the second is the next place of the first within a recording."""
+    """Return pairs of placed anchors of which the second is another recording's place, or the next in a recording, of the
+    first."""
     number = {name: k for k, name in enumerate(estimate.anchor_ids) if estimate.placed[k]}
-    pairs = []
-    for name, k in number.items():
+    pairs = [pair for pair in combinations(number, 2) if first_place(pair[0]) == first_place(pair[1])]
+    for name in number:
         place = first_place(name)
         base, which = name_and_number(place)
         before = base if which == 2 else f"{base}@{which - 1}"
         of_before = [n for n in (before + name[len(place) :], before) if n in number]
         if which > 1 and of_before:
-            pairs.append((number[of_before[0]], k))
-    return pairs
+            pairs.append((of_before[0], name))
+    return [(number[one], number[other]) for one, other in pairs]
 
 
 def _cost_of_one(apart: Estimate, pair: tuple[int, int], solver: SolverConfig) -> float:

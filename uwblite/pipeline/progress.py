@@ -1,6 +1,6 @@
 """Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 from ..errors import Cancelled
 from ..graph.solver import SolverSummary
@@ -58,9 +58,12 @@ class Stages:
         """Add something the user should know."""
         self.warnings.append(Notice(kind, text, figures))
 
-    def withdraw(self, kind: str, figure: str) -> None:
-        """Remove all warnings of a kind that have a figure: they are made again from what is known now."""
-        self.warnings = [notice for notice in self.warnings if notice.kind != kind or figure not in notice.figures]
+    def withdraw(self, kind: str, figure: str, but: Container[object] = ()) -> None:
+        """Remove all warnings of a kind that have a figure, but those where it is one of some values."""
+        self.warnings = [
+            notice for notice in self.warnings
+            if notice.kind != kind or figure not in notice.figures or notice.figures[figure] in but
+        ]  # fmt: skip
 
     def doubt(self, kind: str, text: str, **figures: object) -> None:
         """Add a reason not to trust the result."""
