@@ -187,10 +187,20 @@ def test_the_second_place_of_a_moved_anchor_is_no_new_anchor(other):
     assert said([HERE, HERE], [("A",), (other,)], ("A", other)) == []
 
 
-def test_ranges_that_do_not_count_are_no_hearing():
+def named(estimate, task):
+    name_new_and_absent_anchors(estimate, task)
+    return list(task.stages.warnings)
+
+
+def test_readings_without_a_distance_are_no_hearing_and_ranges_without_weight_are():
+    """Of a recording that has too few ranges to an anchor to place it, these have no weight."""
     estimate, task = estimate_and_task([HERE, HERE], ["A", "AB"])
     first = estimate.ranges.pose < STEPS
-    estimate.ranges = replace(estimate.ranges, weights=np.where(first & (estimate.ranges.anchor == 0), 0.0, 1.0))
+    of_a = first & (estimate.ranges.anchor == 0)
+    estimate.ranges = replace(estimate.ranges, weights=np.where(of_a, 0.0, 1.0))
+    assert [w.figures["anchor"] for w in named(estimate, task)] == ["B"]
+    task.stages.warnings.clear()
+    estimate.ranges = replace(estimate.ranges, ranges=np.where(of_a, 0.0, 1.0))
     name_new_and_absent_anchors(estimate, task)
     assert sorted(w.figures["anchor"] for w in task.stages.warnings) == ["A", "B"]
     assert "anchor B has ranges only from recording 2 on: recording 1 drove within its reach" in task.stages.warnings[1].text

@@ -139,15 +139,16 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
     recording_of, number = task.recordings.of_keyframe, len(task.recordings)
     # Where an anchor was moved, one place follows the other: that is reported, and the anchor has ranges all the time.
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
-    alive = np.flatnonzero(ranges.alive)
+    # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
+    heard = np.flatnonzero(ranges.ranges > 0.0)
     counts = np.zeros((len(names), number), dtype=np.int64)
-    np.add.at(counts, (ranges.anchor[alive], recording_of[ranges.pose[alive]]), 1)
+    np.add.at(counts, (ranges.anchor[heard], recording_of[ranges.pose[heard]]), 1)
     for k in np.flatnonzero(estimate.placed).tolist():
         present = counts[names == names[k]].sum(axis=0) > 0
         if present.all():
             continue
         away = np.hypot(*(estimate.graph.poses[:, :2] - estimate.graph.anchors[k]).T)
-        own = ranges.pose[alive[ranges.anchor[alive] == k]]
+        own = ranges.pose[heard[ranges.anchor[heard] == k]]
         within = away <= np.median(away[own])
         near = np.bincount(recording_of[within], minlength=number)
         rate = within[own].sum() / max(int(near[present].sum()), 1)
