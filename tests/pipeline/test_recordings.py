@@ -15,6 +15,7 @@ from uwblite.graph.calibration import unknowns
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline.recordings import gather
 from uwblite.sensor_log import SensorMounting
 
@@ -233,6 +234,17 @@ def test_two_recordings_through_a_simulated_hall(tmp_path):
     result = build_map(logs)
     assert joint_ate(result, truths)[0] <= max(single) + 0.002
     assert result.warnings == ()
+
+
+def test_recordings_of_one_log_are_refused_and_robots_that_stand_alike_are_not(two):
+    """A copy, and a part that overlaps by four seconds; of two that stand, odometry at one place is no sign."""
+    (one, _), (other, _) = two
+    later = one.crop(start=float(one.odometry.stamps[-1]) - 4.0)
+    for copy in (one, later, replace(one, ranges=None)):
+        with pytest.raises(DataError, match=r"recordings 2 \(.*\) and 3 \(.*\) are of one log"):
+            gather([other, one, copy], KeyframeConfig())
+    still = replace(one, odometry=replace(one.odometry, poses=np.zeros_like(one.odometry.poses)))
+    gather([still, still], KeyframeConfig())
 
 
 def test_recordings_lie_a_kilometre_apart_on_the_way():

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -108,11 +109,30 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
 
     Raises
     ------
-    DataError : there is no recording.
+    DataError : there is no recording, or two have the same measurements.
     """
     if not logs:
         raise DataError("no recording to map; give one or more")
+    for (n, one), (m, other) in combinations(enumerate(logs), 2):
+        if _alike(one, other):
+            raise DataError(
+                f"recordings {n + 1} ({one.notes.source}) and {m + 1} ({other.notes.source}) are of one log, in part or "
+                "as a whole: measurements would count twice; give each recording once"
+            )
     return _joined(logs, [keyframes.of(log, config) for log in logs])
+
+
+def _alike(one: SensorLog, other: SensorLog) -> bool:
+    """Return whether two recordings have the same odometry at the same moments, of a robot that moves."""
+    a, b = one.odometry, other.odometry
+    _, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
+    same = np.all(a.poses[i] == b.poses[j], axis=1)
+    moving = np.any(a.poses[i] != a.poses[np.maximum(i - 1, 0)], axis=1)
+    return int(np.sum(same & moving)) > _ALIKE
+
+
+_ALIKE = 20
+"""Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
 
 
 def later(recordings: Recordings, shift: float) -> Recordings:
