@@ -109,9 +109,13 @@ def _seen_through(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats, gaps: 
     some, open_ = rays.rows(slice(None, None, 1 + len(rays.keyframe) // _SAMPLE)), np.zeros(len(gaps.one), dtype=bool)
     ended = se2.transform_each(sensors, some.keyframe, some.points)
     normal, way = surfaces.normal, surfaces.tangent
+    reach = np.hypot(*some.points.T).max(initial=0.0) + 0.5 * _GAP
     for gap, wall in enumerate(gaps.one.tolist()):
         ahead = (sensors[:, :2] - surfaces.place[wall]) @ normal[wall]
-        rows = np.flatnonzero((ahead > _FRONT)[some.keyframe])
+        middle = surfaces.place[wall] + 0.5 * (gaps.first[gap] + gaps.last[gap]) * way[wall]
+        # No ray is longer than the reach.
+        near = np.hypot(*(sensors[:, :2] - middle).T) < reach
+        rows = np.flatnonzero(((ahead > _FRONT) & near)[some.keyframe])
         behind = (ended[rows] - surfaces.place[wall]) @ normal[wall]
         rows, behind = rows[behind < -_BEHIND], behind[behind < -_BEHIND]
         begin = sensors[some.keyframe[rows], :2]

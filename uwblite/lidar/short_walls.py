@@ -103,7 +103,7 @@ def pieces_of(rays: ScanPoints, free: Bools) -> tuple[Pieces, SurfaceRays]:
     inner = last - first - 2
     piece = np.repeat(np.arange(len(first)), inner)
     on = rows[np.arange(len(piece)) + (first + 1 - np.cumsum(inner) + inner)[piece]]
-    return found, replace(as_rays(rays).rows(on), surface=piece).bundled()
+    return found, replace(as_rays(rays.rows(on)), surface=piece).bundled()
 
 
 def _apart(scan: Ints, ray: Ints, points: Floats, reach: Floats, sigma: Floats) -> Bools:
