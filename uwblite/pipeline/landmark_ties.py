@@ -23,7 +23,8 @@ from ..lidar.clouds import Clouds
 from ..lidar.columns import Landmarks, find_columns, fit_circle
 from . import map_frame
 from .estimate import Estimate, Task
-from .lidar_stages import refine_jointly, solve_by_own_errors
+from .lidar_stages import refine_jointly, solve_by_own_errors, solved
+from .radio_stages import rough
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
@@ -100,10 +101,10 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
     motion = map_frame.alignment_of(estimate, task)
     tied = ties(given, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
-    solved = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
-    estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(solved)
+    optimum = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
+    estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(optimum)
     if estimate.joint is not None:
-        estimate = solve_by_own_errors(refine_jointly(estimate, task), task)
+        estimate = solved(solve_by_own_errors(refine_jointly(estimate, task), task), rough(config.solver))
     figures = outcome(task, tied, estimate.graph)
     task.stages.end("landmark distances", distances=figures)
     return estimate

@@ -230,7 +230,8 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
-    constrains these, and it is matched again. The last optimum is a rough one: the adjustment to surfaces goes on from there.
+    constrains these, and it is matched again. With the ranges corrected by what they err by in common in each direction, the
+    adjustment to surfaces solves once more.
     """
     if estimate.ranges is None or estimate.joint is None:
         return estimate
@@ -246,7 +247,7 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         estimate = with_range_noise(estimate, task.config)
     del optimizer  # What it analysed is as large as the covariances.
     task.stages.report("joint refinement", 1, 1)
-    return solved(_without_pattern(estimate, task), quick)
+    return _without_pattern(estimate, task)
 
 
 def _without_pattern(estimate: Estimate, task: Task) -> Estimate:

@@ -34,7 +34,7 @@ from .estimate import Estimate, ScanClouds, Task
 from .lidar_stages import solved
 from .surface_search import FoundSurfaces, find_surfaces
 
-_ROUNDS, _STILL = 6, 5e-4
+_ROUNDS, _STILL = 6, 1e-3
 """Most Gauss-Newton steps; the change of the poses, rms, m, that ends them once noise and pairs have settled."""
 _SETTLING = 2
 """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
@@ -52,8 +52,10 @@ surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with poses adjusted to rays on walls and columns, and its pairs of clouds in accordance."""
     joint, scans = estimate.joint, estimate.scans
-    if joint is None or scans is None or not len(joint):
+    if joint is None or scans is None:
         return estimate
+    if not len(joint):
+        return solved(estimate, task.config.solver)
     fixed = estimate.graph.fixed_calibration | estimate.graph.calibration.of_kinds(*LASER)
     graph = replace(estimate.graph, fixed_calibration=fixed)
     graph, found = _adjusted(graph, estimate, task)
