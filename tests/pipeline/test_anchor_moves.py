@@ -170,7 +170,7 @@ def test_ranges_shorter_than_the_distance_are_counted_and_late_ones_not():
 def test_a_recording_whose_names_stay_is_not_bootstrapped_again(monkeypatch):
     """The result is to the last bit that of recordings that were never called otherwise."""
     whole = recording(two_rounds()).without(lidar=True)
-    logs = [whole.crop(100.0, 190.0), whole.crop(160.0, 250.0)]
+    logs = [whole.crop(70.0, 160.0), whole.crop(160.0, 250.0)]
     task = Task(gather(logs, MappingConfig().keyframes), MappingConfig(), Constraints(), Stages(None, None))
     middle = float(logs[1].ranges.stamps.mean())
     # A copy of the first, as _of_all makes one.
