@@ -92,8 +92,9 @@ def test_correlated_range_errors_count_for_all_or_for_anchors_at_given_poses_whe
     monkeypatch.setattr(final_stages, "with_correlated_errors", lambda *a: of_all.append(a) or a[0].covariances)
     monkeypatch.setattr(final_stages, "anchors_with_correlated_errors", lambda *a: of_anchors.append(a) or marker)
     graph, config = loop()[0], MappingConfig()
-    i, still = np.zeros(1, dtype=int), np.zeros((1, 3))
-    scans = ScanEdges(i, i + 1, still, np.eye(3)[None], still, still, np.full(4, -1))
+    i = np.arange(len(graph.poses) - 1) if lidar else np.zeros(1, dtype=int)
+    still = np.zeros((len(i), 3))
+    scans = ScanEdges(i, i + 1, still, np.tile(np.eye(3), (len(i), 1, 1)), still, still, np.full(4, -1))
     ranges = graph.edges[2]
     estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
     none = SimpleNamespace(have_scans=False)

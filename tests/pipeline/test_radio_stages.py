@@ -13,9 +13,10 @@ from uwblite import se2
 from uwblite.arrays import spread
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
-from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.pipeline import radio_stages
 from uwblite.pipeline.estimate import Estimate, Task
+from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import reestimate_ranges, select_range_priors
@@ -40,6 +41,16 @@ def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(mo
     made.clear()
     select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
     assert made == ["noise True", "solve 7"] * 2 + ["noise False", "solve 7"] * 2 + ["priors"]
+    # Where scans were matched, but next to none, that is known.
+    made.clear()
+    still = np.zeros((1, 3))
+    step = ScanEdges(np.array([0]), np.array([1]), still, np.eye(3)[None], still, still, np.full(4, -1))
+    few = replace(estimate, ranges=graph.edges[2], steps=step)
+    assert few.held_by_scans.tolist() == [True, True] + [False] * (len(graph.poses) - 2)
+    assert (few.rests_on_ranges, replace(few, ranges=None).rests_on_ranges) == (True, False)
+    select_range_priors(few, task)
+    assert made == ["priors"]
+    assert refine_jointly(few, task) is few
 
 
 @pytest.mark.parametrize(("growth", "gone"), [

@@ -11,8 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Bools
-from ..graph.pose_edges import ScanEdges
 from ..radio.change_points import ON_GIVEN_PATH, ON_OWN_PATH, Evidence, Move, find_moves
 from ..radio.range_noise import short_term_sigma
 from ..radio.trilateration import usable
@@ -34,7 +32,7 @@ def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) 
     logs : the recordings with the names as they were recorded.
     """
     # Of several recordings, one with a lidar holds the anchors that those without one have in common with it.
-    given = any(held_by_scans(estimate)[recording.rows].mean() >= _MOSTLY for recording in task.recordings.each)
+    given = any(estimate.held_by_scans[recording.rows].mean() >= _MOSTLY for recording in task.recordings.each)
     moves = _moves_of_all(estimate, task, logs, ON_GIVEN_PATH if given else ON_OWN_PATH)
     renamed = [_renamed(log, found) for log, found in zip(logs, moves, strict=True)]
     now = [recording.log.ranges for recording in task.recordings.each]
@@ -45,15 +43,6 @@ def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) 
 _MOSTLY = 0.5
 """Share of a recording's keyframes that a lidar must have matched to hold its trajectory: one that sees next to nothing in a
 yard matched a tenth of them, and ranges bent the rest."""
-
-
-def held_by_scans(estimate: Estimate) -> Bools:
-    """Return which poses (k,) some match of clouds constrains."""
-    held = np.zeros(len(estimate.graph.poses), dtype=bool)
-    for edges in estimate.graph.edges:
-        if isinstance(edges, ScanEdges):
-            held[edges.i] = held[edges.j] = True
-    return held
 
 
 def first_with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[SensorLog] | None:

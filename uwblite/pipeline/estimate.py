@@ -118,6 +118,20 @@ class Estimate:
         return (self.closures.edges,) if self.steps is None else (self.steps, self.closures.edges)
 
     @property
+    def held_by_scans(self) -> Bools:
+        """(k,) poses that some match of clouds constrains."""
+        held = np.zeros(len(self.graph.poses), dtype=bool)
+        for edges in (*self.graph.edges, self.steps, self.joint):
+            if isinstance(edges, ScanEdges):
+                held[edges.i] = held[edges.j] = True
+        return held
+
+    @property
+    def rests_on_ranges(self) -> bool:
+        """Whether ranges alone determine the trajectory: there is no lidar, or it sees next to nothing."""
+        return self.ranges is not None and float(self.held_by_scans.mean()) < _NEXT_TO_NOTHING
+
+    @property
     def problem(self) -> Graph:
         """The graph with every measurement in it."""
         lidar = self.steps_and_closures if self.joint is None else (self.joint,)
@@ -139,3 +153,8 @@ class Estimate:
             tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in self.bootstrap.hypotheses
         )
         return replace(self, bootstrap=replace(self.bootstrap, hypotheses=moved))
+
+
+_NEXT_TO_NOTHING = 0.1
+"""Share of the poses that matches of clouds constrain, below which a lidar helps no map; in a nearly empty hall of 70 x 45 m,
+where it does, they constrain a quarter."""

@@ -11,7 +11,6 @@ from ..graph.covariances import Covariances
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..graph.range_edges import RangeEdges
 from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns
 from ..grid.geometry import GridGeometry
@@ -69,7 +68,7 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
         estimate = estimate.with_estimates_of(with_nonnegative_heights(found.corrected()))
     covariances = found.covariances
     if estimate.ranges is not None:
-        covariances = _with_correlated_ranges(found, stated, estimate.graph, estimate.ranges, task.config.ranges)
+        covariances = _with_correlated_ranges(found, stated, estimate, task.config.ranges)
     if not task.recordings.have_scans:
         return estimate, covariances
     return estimate, replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
@@ -79,11 +78,11 @@ _ALONG = 60
 """Poses along the trajectory whose errors stand for those of all."""
 
 
-def _with_correlated_ranges(
-    found: Marginals, stated: Graph, graph: Graph, ranges: RangeEdges, config: RangeNoiseConfig
-) -> Covariances:
+def _with_correlated_ranges(found: Marginals, stated: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
     """Add the correlated errors of ranges: to anchors alone where the lidar determines the poses, else to all."""
-    if not any(isinstance(e, ScanEdges) for e in stated.edges):
+    graph, ranges = estimate.graph, estimate.ranges
+    assert ranges is not None
+    if estimate.rests_on_ranges:
         return with_correlated_errors(found, stated, ranges, config)
     about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
     given, plain = at_given_poses(replace(graph, edges=about_anchors)), found.covariances

@@ -94,10 +94,8 @@ def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
     """Return some steps of the odometry (r,) as the clouds measure them from the estimate's poses."""
     scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i[rows]
-    guess = se2.between(poses[i], poses[i + 1])
-    return scan_to_scan.descend(
-        scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate, task.config.scan_to_scan
-    )
+    config, guess = task.config, se2.between(poses[i], poses[i + 1])
+    return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
 def _with_keyframes_where_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Ints | None]:
@@ -209,7 +207,9 @@ def _refine(
 
 
 def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
-    """Let all overlapping clouds constrain all poses; re-estimate the ranges' noise on the trajectory that results."""
+    """Let all overlapping clouds constrain all poses, where there are enough; re-estimate the ranges' noise on what results."""
+    if estimate.steps is not None and estimate.rests_on_ranges:
+        return estimate
     scans, config = estimate.lidar, task.config
     if estimate.ranges is not None:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))

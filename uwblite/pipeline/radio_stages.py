@@ -209,8 +209,9 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None:
         return estimate
-    weak = _with_learnt_ranges(estimate, task, steady=True)
-    estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
+    if estimate.steps is None or not estimate.rests_on_ranges:
+        weak = _with_learnt_ranges(estimate, task, steady=True)
+        estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
     edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
 
