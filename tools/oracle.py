@@ -36,9 +36,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-_ROUNDS = 8
+ROUNDS = 8
 """Gauss-Newton steps, at most."""
-_CONVERGED = 1e-5
+CONVERGED = 1e-5
 """m and rad; the largest step at which the search ends."""
 _AT_ONCE = 200_000
 """Rays linearised at once."""
@@ -89,11 +89,11 @@ class _Rays:
 
 
 class _Layout:
-    """Where each unknown stands in the vector of all: poses after the first, anchors, scalars, and four of each surface."""
+    """Where each unknown stands in the vector of all: poses after the fixed ones, anchors, scalars, four of each surface."""
 
-    def __init__(self, poses: int, anchors: int, surfaces: int) -> None:
-        self.poses = np.arange(poses)[:, None] * 3 + np.arange(3) - 3
-        begin = 3 * poses - 3
+    def __init__(self, poses: int, anchors: int, surfaces: int, fixed: int = 1) -> None:
+        self.poses = (np.arange(poses)[:, None] - fixed) * 3 + np.arange(3)
+        begin = 3 * (poses - fixed)
         self.anchors = begin + np.arange(2 * anchors).reshape(-1, 2)
         begin += 2 * anchors
         self.wheels = begin + np.arange(_WHEELS)
@@ -117,7 +117,9 @@ class Oracle:
     range offset, nor that what is seen of a column from all sides is one circle.
     """
 
-    def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True, pieces: bool = False) -> None:
+    def __init__(
+        self, recording: Recording, log: SensorLog, lidar: bool = True, pieces: bool = False, first_known: bool = True
+    ) -> None:
         self.recording, self.log, self.rooms = recording, log, recording.settings.rooms
         self.frames = keyframes.select(log.odometry, KeyframeConfig())
         self.truth = self._at(self.frames.stamps)
@@ -129,8 +131,10 @@ class Oracle:
         seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.int64)
         self.seen = seen
         self.anchors = len(recording.anchors) if self.has_ranges else 0
-        self.layout = _Layout(len(self.frames), self.anchors, len(seen))
+        self.layout = _Layout(len(self.frames), self.anchors, len(seen), 1 if first_known else 0)
         self.x = self._start()
+        self.sharing = np.ones(self.layout.size)
+        """Recordings that have each unknown in common: its prior is that of all together."""
         self._whitening = self._wheel_whitening()
         self._range_factors: dict[int, tuple[Floats, bool]] = {}
         """Of the covariance of each anchor's ranges, at the true places."""
@@ -156,7 +160,8 @@ class Oracle:
     def _start(self) -> Floats:
         """Return the truth as the vector of unknowns."""
         x, layout = np.zeros(self.layout.size), self.layout
-        x[layout.poses[1:].ravel()] = self.truth[1:].ravel()
+        free = layout.poses[:, 0] >= 0
+        x[layout.poses[free].ravel()] = self.truth[free].ravel()
         x[layout.scale] = self.recording.settings.radio.scale
         if self.anchors:
             x[layout.anchors] = self.recording.anchors
@@ -170,38 +175,25 @@ class Oracle:
         return x
 
     def poses(self) -> Floats:
-        """Return the poses (k, 3), the first fixed at its true place."""
-        return np.concatenate([self.truth[:1], self.x[self.layout.poses[1:].ravel()].reshape(-1, 3)])
+        """Return the poses (k, 3), the first at its true place where it is fixed."""
+        poses, free = self.truth.copy(), self.layout.poses[:, 0] >= 0
+        poses[free] = self.x[self.layout.poses[free]]
+        return poses
 
     def solve(self) -> OracleFigures:
         """Descend from the truth and judge the optimum and its covariance."""
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             factor, step = self._step()
             self.x += step
-            if np.abs(step).max() < _CONVERGED:
+            if np.abs(step).max() < CONVERGED:
                 break
         return self._figures(factor)
 
     def _step(self) -> tuple[tuple[Floats, bool], Floats]:
-        """Return the factor of the normal equations with surfaces eliminated, and the Gauss-Newton step (size,).
+        """Return the factor of the normal equations with surfaces eliminated, and the Gauss-Newton step (size,)."""
+        return step_of(*self.normal(), self.layout.shared)
 
-        No two surfaces share a ray: their part of the matrix is made of blocks of four, and goes first.
-        """
-        layout = self.layout
-        shared = layout.shared
-        whole, matrix, gradient = self._normal()
-        own = _blocks_of_four(whole[shared:, shared:])
-        inverse = sparse.block_diag(np.linalg.inv(own), format="csr") if len(own) else sparse.csr_matrix((0, 0))
-        across = whole[shared:, :shared]
-        onto = inverse @ across
-        matrix += (whole[:shared, :shared] - across.T @ onto).toarray()
-        factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
-        step = np.zeros(layout.size)
-        step[:shared] = -cho_solve(factor, gradient[:shared] - onto.T @ gradient[shared:], check_finite=False)
-        step[shared:] = -(inverse @ gradient[shared:]) - onto @ step[:shared]
-        return factor, step
-
-    def _normal(self) -> tuple[sparse.csr_matrix, Floats, Floats]:
+    def normal(self) -> tuple[sparse.csr_matrix, Floats, Floats]:
         """Return the normal equations at the present estimate: a sparse part, a dense one of what surfaces are not in, and
         the gradient."""
         layout = self.layout
@@ -308,6 +300,7 @@ class Oracle:
         sd = np.concatenate([[0.05, 0.05, 0.02], bias, [_UNIT], patterns, offsets, radii])
         off = self.x.copy()
         off[layout.scale] -= model.scale
+        sd *= np.sqrt(self.sharing[which])
         return self._rows(which[:, None], 1.0 / sd[:, None]), off[which] / sd
 
     def _antenna_sd(self) -> float:
@@ -469,6 +462,29 @@ class Oracle:
         return OracleFigures(
             float(np.sqrt((off**2).sum(axis=1).mean())), anchors, float(np.sqrt(2.0 * variance[:path].mean())), bound
         )
+
+
+def step_of(
+    whole: sparse.csr_matrix, matrix: Floats, gradient: Floats, shared: int
+) -> tuple[tuple[Floats, bool], Floats]:
+    """Return the factor of normal equations with surfaces eliminated, and the Gauss-Newton step (size,).
+
+    No two surfaces share a ray: their part of the matrix is made of blocks of four, and goes first.
+
+    Parameters
+    ----------
+    whole : (size, size) sparse part. matrix : (shared, shared) dense part, which is used up. shared : unknowns before surfaces.
+    """
+    own = _blocks_of_four(whole[shared:, shared:])
+    inverse = sparse.block_diag(np.linalg.inv(own), format="csr") if len(own) else sparse.csr_matrix((0, 0))
+    across = whole[shared:, :shared]
+    onto = inverse @ across
+    matrix += (whole[:shared, :shared] - across.T @ onto).toarray()
+    factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+    step = np.zeros(len(gradient))
+    step[:shared] = -cho_solve(factor, gradient[:shared] - onto.T @ gradient[shared:], check_finite=False)
+    step[shared:] = -(inverse @ gradient[shared:]) - onto @ step[:shared]
+    return factor, step
 
 
 def _blocks_of_four(matrix: sparse.csr_matrix) -> Floats:
