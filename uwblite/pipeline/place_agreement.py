@@ -64,11 +64,18 @@ def _most_cost(count: int) -> float:
     return -2.0 * float(np.log(_FALSE_MOVES / max(count / _PER_MOMENT, 1.0)))
 
 
+_NEAR = 1.0
+"""m; places of two recordings further apart are two: what noise and bent paths leave of one place is less."""
+
+
 def _successive(estimate: Estimate) -> list[tuple[int, int]]:
     """Return pairs of placed anchors of which the second is another recording's place, or the next in a recording, of the
     first."""
     number = {name: k for k, name in enumerate(estimate.anchor_ids) if estimate.placed[k]}
-    pairs = [pair for pair in combinations(number, 2) if first_place(pair[0]) == first_place(pair[1])]
+    pairs = [
+        (one, other) for one, other in combinations(number, 2) if first_place(one) == first_place(other)
+        and np.hypot(*(estimate.graph.anchors[number[one]] - estimate.graph.anchors[number[other]])) < _NEAR
+    ]  # fmt: skip
     for name in number:
         place = first_place(name)
         base, which = name_and_number(place)
