@@ -12,7 +12,6 @@ import one_thread  # noqa: F401
 
 import argparse
 import sys
-from pathlib import Path
 
 import numpy as np
 import oracle
@@ -132,9 +131,9 @@ def main(argv: list[str] | None = None) -> int:
         rows.append([seed, made, best, f"{made / best:.2f}", "yes" if made <= max(BAR, RATIO * best) else "**no**", doubts])
         print(f"site {seed}: {made:.4f} {best:.4f}", file=sys.stderr, flush=True)
     text = (
-        f"## A site of several recordings\n\nThree recordings of {MINUTES:g} min at 0.4 m/s of the simulator's `site`, two robots, "
-        "the third on the next day, in one map;\nATE of all together after one rigid motion, m. *Oracle*: as above, for the three "
-        f"together (tools/site_oracle.py).\nBar: {BAR:g} m, or {RATIO:g} times the oracle's.\n\n"
+        f"## A site of several recordings\n\nThree recordings of {MINUTES:g} min at 0.4 m/s of the simulator's `site`, two "
+        "robots, the third on the next day, in one map;\nATE of all together after one rigid motion, m. *Oracle*: as above, "
+        f"for the three together (tools/site_oracle.py).\nBar: {BAR:g} m, or {RATIO:g} times the oracle's.\n\n"
         + table(["seed", "ATE", "oracle", "ratio", "kept", "doubts"], rows)
     )
     if args.print:

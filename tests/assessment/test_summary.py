@@ -326,17 +326,34 @@ def named(*ids):
     return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
 
 
+ONE = SimpleNamespace(of_keyframe=np.zeros(1, dtype=np.int64))
+"""The only recording, of one keyframe."""
+
+
 def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
     ranges = plain_ranges(np.zeros(6, int), np.array([0, 1, 1, 2, 2, 2]), np.ones(6), 0.1)
     ranges = replace(ranges, stamps=np.array([7.0, 9.0, 8.0, 30.0, 20.0, 25.0]))
-    moved = _with_times(named("A", "B", "B@2", "C"), ranges)
+    moved = _with_times(named("A", "B", "B@2", "C"), ranges, ONE)
     np.testing.assert_array_equal([a.since for a in moved], [np.nan, 8.0, 20.0, np.nan])
     for alike in (named("A", "B", "C"), named("A", "B@2")):
-        assert _with_times(alike, ranges) is alike
+        assert _with_times(alike, ranges, ONE) is alike
     pair = named("A", "A@2")
-    assert _with_times(pair, None) is pair
-    unheard = _with_times(named("A", "B", "C", "C@2"), ranges)
+    assert _with_times(pair, None, ONE) is pair
+    unheard = _with_times(named("A", "B", "C", "C@2"), ranges, ONE)
     np.testing.assert_array_equal([a.since for a in unheard], [np.nan, np.nan, 20.0, np.nan])
+
+
+def test_the_clock_of_a_move_is_that_of_the_recording_that_shows_it():
+    """The first recording has B where it was, the second sees the move at 900 s, the third begins behind it, at 0 s."""
+    recording, anchor = np.array([0, 1, 1, 2, 2]), np.array([0, 0, 1, 1, 1])
+    ranges = replace(plain_ranges(recording, anchor, np.ones(5), 0.1), stamps=np.array([50.0, 800.0, 900.0, 0.0, 5.0]))
+    three = SimpleNamespace(of_keyframe=np.arange(3))
+    one, other = named("B", "B@2")
+    moved = _with_times((one, replace(other, position=np.array([40.0, 0.0]))), ranges, three)
+    assert [a.since for a in moved] == [800.0, 900.0]
+    assert [a.status for a in _without_leaps(moved, ranges, three)] == ["ok", "ok"]
+    quick = replace(ranges, stamps=np.array([50.0, 890.0, 900.0, 0.0, 5.0]))
+    assert [a.status for a in _without_leaps(moved, quick, three)] == ["distrusted", "distrusted"]
 
 
 @pytest.mark.parametrize(("way", "silent", "other", "leaps"), [
@@ -349,9 +366,9 @@ def test_an_anchor_that_leaps_farther_than_it_is_carried_has_a_wrong_place(way, 
     left_out = np.array([1.0, 1.0, 1.0, 0.0, 1.0])
     ranges = replace(ranges, stamps=np.array([0.0, 3.0, 10.0, 12.0, 10.0 + silent]), weights=left_out)
     places = {"A": (other, 0.0), "B": (0.0, 0.0), "B@2": (way, 0.0)}
-    anchors = _with_times(tuple(replace(a, position=np.array(places[a.id])) for a in named(*places)), ranges)
-    assert [a.status for a in _without_leaps(anchors, ranges)] == ["ok", *["distrusted" if leaps else "ok"] * 2]
-    assert _without_leaps(anchors, None) == anchors
+    anchors = _with_times(tuple(replace(a, position=np.array(places[a.id])) for a in named(*places)), ranges, ONE)
+    assert [a.status for a in _without_leaps(anchors, ranges, ONE)] == ["ok", *["distrusted" if leaps else "ok"] * 2]
+    assert _without_leaps(anchors, None, ONE) == anchors
 
 
 @pytest.mark.parametrize(("short", "count", "distrusted"), [(3, 20, False), (4, 20, True), (4, 80, False), (5, 80, True)])
@@ -364,10 +381,10 @@ def test_an_anchor_with_ranges_shorter_than_the_distance_is_elsewhere_at_times(s
 
 def test_both_places_of_an_anchor_are_uncertain_where_one_is_mirror_ambiguous():
     ranges = replace(plain_ranges(np.zeros(3, int), np.array([0, 1, 2]), np.ones(3), 0.1), stamps=np.array([0.0, 3.0, 10.0]))
-    a, b, later = _with_times(named("A", "B", "B@2"), ranges)
-    found = _without_leaps((a, replace(b, status="mirror-ambiguous"), later), ranges)
+    a, b, later = _with_times(named("A", "B", "B@2"), ranges, ONE)
+    found = _without_leaps((a, replace(b, status="mirror-ambiguous"), later), ranges, ONE)
     assert [anchor.status for anchor in found] == ["ok", "mirror-ambiguous", "distrusted"]
-    found = _without_leaps((a, b, replace(later, status="mirror-ambiguous")), ranges)
+    found = _without_leaps((a, b, replace(later, status="mirror-ambiguous")), ranges, ONE)
     assert [anchor.status for anchor in found] == ["ok", "distrusted", "mirror-ambiguous"]
 
 

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, spread_about_median
+from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.covariances import Covariances, shape_error
 from ..graph.graph import Graph
@@ -44,8 +45,8 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     # By the scatter of ranges to a typical anchor; by its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
-    anchors = _with_times(_without_strange_biases(anchors), ranges)
-    anchors = anchors if recordings.have_scans else _without_leaps(anchors, ranges)
+    anchors = _with_times(_without_strange_biases(anchors), ranges, recordings)
+    anchors = anchors if recordings.have_scans else _without_leaps(anchors, ranges, recordings)
     listed = {
         u.key: u
         for r in recordings.each
@@ -185,32 +186,53 @@ _FEW_SHORT, _SHARE_SHORT = 3, 0.05
 """Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
 
 
-def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
-    """Report of anchors that were moved from when on each place holds."""
-    bases = [name_and_number(a.id)[0] for a in anchors]
+def _with_times(
+    anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None, recordings: Recordings
+) -> tuple[AnchorEstimate, ...]:
+    """Report of anchors that were moved from when on each place holds, on the clock of the recording that shows it."""
+    bases = np.array([name_and_number(a.id)[0] for a in anchors])
     if ranges is None or len(set(bases)) == len(bases):
         return anchors
-    first = [float(np.min(ranges.stamps[ranges.anchor == k], initial=np.inf)) for k in range(len(anchors))]
-    return tuple(
-        replace(a, since=t) if bases.count(base) > 1 and np.isfinite(t) else a
-        for a, base, t in zip(anchors, bases, first, strict=True)
-    )
+    recording, dated = recordings.of_keyframe[ranges.pose], list(anchors)
+    for k in range(len(anchors)):
+        own = ranges.anchor == k
+        if np.sum(bases == bases[k]) > 1 and own.any():
+            at = _shown_in(k, bases, ranges, recording)
+            dated[k] = replace(anchors[k], since=float(np.min(ranges.stamps[own & (recording == at)])))
+    return tuple(dated)
 
 
-def _without_leaps(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
+def _shown_in(k: int, bases: NDArray[np.str_], ranges: RangeEdges, recording: Ints) -> int:
+    """Return the first recording with ranges to an anchor's place and to another of its places; else the first with the one.
+
+    Parameters
+    ----------
+    bases : (a,) names of anchors before they were moved. recording : (m,) of each range.
+    """
+    own, others = ranges.anchor == k, np.isin(ranges.anchor, np.flatnonzero(bases == bases[k]))
+    both = np.intersect1d(recording[own], recording[others & ~own])
+    return int((both if len(both) else recording[own]).min())
+
+
+def _without_leaps(
+    anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None, recordings: Recordings
+) -> tuple[AnchorEstimate, ...]:
     """Return the anchors, two places of one distrusted where nobody carries it from one to the other in the time between.
 
     Without a lidar, ranges alone hold the path, and one of the two may be a mirror image, or the move may be false; where one
     is known to be ambiguous, so is the move. Where names were exchanged, they leap, too, but to the place of another anchor.
     """
     names = [name_and_number(a.id)[0] for a in anchors]
+    bases = np.array(names)
     leaps: dict[int, str] = {}
     for k, a in enumerate(anchors):
         earlier = [j for j, b in enumerate(anchors) if names[j] == names[k] and b.since < a.since]
         if ranges is None or not earlier:
             continue
         before = max(earlier, key=lambda j: anchors[j].since)
-        pause = a.since - float(ranges.stamps[(ranges.anchor == before) & ranges.alive].max(initial=-np.inf))
+        recording = recordings.of_keyframe[ranges.pose]
+        there = (ranges.anchor == before) & ranges.alive & (recording == _shown_in(k, bases, ranges, recording))
+        pause = a.since - float(ranges.stamps[there].max(initial=-np.inf))
         way = float(np.hypot(*(a.position - anchors[before].position)))
         others = np.array([b.position for j, b in enumerate(anchors) if names[j] != names[k]]).reshape(-1, 1, 2)
         apart = np.hypot(*np.moveaxis(others - [a.position, anchors[before].position], -1, 0))

@@ -1,10 +1,8 @@
 """Which parts of a graph edges tie together; one that they tie to nothing fixed may stand anywhere as a whole."""
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
-from ..arrays import Bools, Ints
+from ..arrays import Bools, Ints, connected
 from .distance_edges import PointDistanceEdges
 from .graph import Graph, PriorEdges
 from .point_edges import LandmarkEdges
@@ -24,7 +22,7 @@ def floating_components(graph: Graph) -> Ints:
     free = free_unknowns(graph)
     tied += [first[name] + np.flatnonzero(~free[name]) for name in first]
     one, other = np.concatenate(links, axis=1)
-    label = part_of_each(one, other, nodes)
+    label = connected(one, other, nodes)
     begins = np.unique(label[:n], return_index=True)
     start = np.full(nodes, -1)
     start[begins[0]] = begins[1]
@@ -52,11 +50,5 @@ def tied_chains(graph: Graph, chains: Ints) -> Bools:
         elif isinstance(e, RangeEdges | LandmarkEdges):
             ends.append((chains[e.pose], count + e.anchor))
     one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
-    label = part_of_each(one, other, count + len(graph.anchors))
+    label = connected(one, other, count + len(graph.anchors))
     return np.asarray(label[chains] == label[0], dtype=np.bool_)
-
-
-def part_of_each(one: Ints, other: Ints, nodes: int) -> Ints:
-    """Return the number (nodes,) of the part that each node belongs to, by links (l,) between nodes `one` and `other`."""
-    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(nodes, nodes))
-    return np.asarray(connected_components(links, directed=False)[1])

@@ -7,8 +7,7 @@ two ends of the stretch that they move. A wheel slips once; it does not make goo
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
-from ..graph.components import part_of_each
+from ..arrays import Bools, Floats, Ints, connected
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 
@@ -78,7 +77,7 @@ def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools) ->
             good = (_fixed(edges) >= least) & _agrees(edges, graph)
             i.append(edges.i[good])
             j.append(edges.j[good])
-    return part_of_each(np.concatenate(i), np.concatenate(j), len(graph.poses))
+    return connected(np.concatenate(i), np.concatenate(j), len(graph.poses))
 
 
 def _agrees(edges: ScanEdges, graph: Graph) -> Bools:
