@@ -99,6 +99,17 @@ def test_scans_go_to_the_nearest_keyframe_and_to_one_only(seed, limit):
         assert sorted(chosen[owner == k]) == sorted(best)
 
 
+@pytest.mark.parametrize(
+    ("path", "beams", "scans", "each"), [(700, 682, 0, 2), (900, 682, 0, 1), (900, 180, 0, 2), (900, 682, 3, 3)]
+)
+def test_one_scan_of_a_fine_lidar_is_a_cloud_where_a_robot_drives_far(path, beams, scans, each):
+    stamps = np.arange(0.0, path / 2.0 + 0.01, 0.05)
+    wheels, config = Odometry(stamps, np.column_stack([2.0 * stamps, 0.0 * stamps, 0.0 * stamps])), KeyframeConfig(scans=scans)
+    lidar = LaserScans(stamps[:-1], np.ones((len(stamps) - 1, beams), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    owner, _ = choose_scans(lidar, select(wheels, replace(config, distance=0.5)), config)
+    assert np.median(np.bincount(owner)) == each
+
+
 @pytest.mark.parametrize("flipped", [False, True])
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.2, -0.1, 2.0)])
 def test_rays_are_deskewed_like_a_loop_over_rays(flipped, mount):

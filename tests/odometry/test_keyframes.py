@@ -125,6 +125,18 @@ def test_keyframes_are_scans_where_there_are_any():
     assert frames.path.sum() == pytest.approx(10.0)
 
 
+@pytest.mark.parametrize(("path", "step"), [(300.0, 0.3), (1000.0, 0.375), (3000.0, 0.45)])
+def test_who_drives_far_with_a_lidar_has_keyframes_farther_apart(path, step):
+    """Unless a distance is set, or there is no lidar."""
+    stamps = np.arange(0.0, path / 2.0 + 0.01, 0.02)
+    wheels = Odometry(stamps, np.column_stack([2.0 * stamps, 0.0 * stamps, 0.0 * stamps]))
+    lidar = LaserScans(stamps[1:-1], np.ones((len(stamps) - 2, 2), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    # A keyframe stands at a scan, every 0.04 m.
+    assert step - 0.041 < np.median(select(wheels, KeyframeConfig(), scans=lidar).path) <= step + 1e-9
+    assert np.median(select(wheels, KeyframeConfig(distance=0.2), scans=lidar).path) == pytest.approx(0.2)
+    assert np.median(select(wheels, KeyframeConfig()).path) == pytest.approx(0.28)
+
+
 @pytest.mark.parametrize(("first", "moving"), [(0.3, True), (0.02, False)])
 def test_the_first_scan_of_a_robot_under_way_has_a_keyframe_of_its_own(first, moving):
     """Laid to the first pose it would turn the whole map by what the wheels erred by until then."""

@@ -99,7 +99,8 @@ def choose_scans(scans: LaserScans, keyframes: Keyframes, config: KeyframeConfig
     distance = np.abs(middle - keyframes.stamps[owner])
     order = np.lexsort((distance, owner))
     rank = np.arange(len(order)) - np.searchsorted(owner[order], owner[order])
-    kept = np.sort(order[rank < np.where(keyframes.alone, 1, config.scans)[owner[order]]])
+    each = config.scans_each(float(keyframes.path.sum()), scans.ranges.shape[1])
+    kept = np.sort(order[rank < np.where(keyframes.alone, 1, each)[owner[order]]])
     return owner[kept].astype(np.int64), kept
 
 

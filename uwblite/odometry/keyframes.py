@@ -13,14 +13,34 @@ from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
 class KeyframeConfig:
     """When a new keyframe begins, and how much lidar it gets."""
 
-    distance: float = 0.3
-    """Travelled distance after which a new keyframe begins, m. Smaller: finer trajectory, slower."""
+    distance: float = 0.0
+    """Travelled distance after which a new keyframe begins, m. Smaller: finer trajectory, slower. 0 = 0.3; with a lidar it
+    grows from 800 m of driving on, up to 0.45 from 1.2 km on."""
     angle: float = 0.35
     """Turned angle after which a new keyframe begins, rad."""
     duration: float = 1.5
     """Time in motion after which a new keyframe begins where there is a lidar, s: wheels that slip hardly measure distance."""
-    scans: int = 2
-    """Scans gathered into the cloud of one keyframe, nearest in time first; more average the lidar's noise."""
+    scans: int = 0
+    """Scans gathered into the cloud of one keyframe, nearest in time first; more average the lidar's noise. 0 = 2, and 1 in a
+    recording of more than 800 m by a lidar of at least 500 beams."""
+
+    def spacing(self, path: float, lidar: bool) -> float:
+        """Return the travelled distance after which a new keyframe begins, m, where a robot drives so far in all, m."""
+        if self.distance > 0.0:
+            return self.distance
+        return _SPACING * (min(max(path / _LONG, 1.0), _WIDER) if lidar else 1.0)
+
+    def scans_each(self, path: float, beams: int) -> int:
+        """Return the scans of a cloud where a robot drives so far in all, m, with a lidar of so many beams."""
+        return self.scans or (1 if path > _LONG and beams >= _FINE else _SCANS)
+
+
+_SPACING, _SCANS = 0.3, 2
+"""Usual distance between keyframes, m, and scans of a cloud."""
+_LONG, _WIDER, _FINE = 800.0, 1.5, 500
+"""Path from which on keyframes are farther apart, m, in proportion to it; how many times as far at most; and beams with which
+one scan is a cloud there. Whoever drives far in a building sees its walls again and again, and noise averages out over the
+visits: what is left of the error hardly depends on how many clouds there are (docs/performance.md)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +92,7 @@ def select(
     """
     moments, sample, seen = _moments(odometry, scans)
     _, path, turned = _travelled(odometry, moments, sample)
-    ways = [path / config.distance, turned / config.angle]
+    ways = [path / config.spacing(float(path[-1]), scans is not None), turned / config.angle]
     if scans is not None:
         moves = np.hypot(np.diff(ways[0]), np.diff(ways[1])) > _STANDING * np.diff(moments)
         ways.append(np.concatenate([[0.0], np.cumsum(moves * np.diff(moments))]) / config.duration)
