@@ -54,9 +54,12 @@ class GridConfig:
     clear_weight: float = 0.5
     """Weight of a beam that saw nothing against one that passed through to a hit, 0..1 (in steps of 1/16)."""
     move_distance: float = 0.1
-    """A scan is traced when the laser has moved this far since the last traced one, m; 0 = every scan."""
+    """A scan is traced when the laser has moved this far since the last traced one, m; of more than 8,000 of a recording, 8,000
+    evenly spread; 0 = every scan, however many."""
     move_angle: float = 0.2
     """... or has turned this far, rad."""
+    most_scans: ClassVar[int] = 8000
+    """Scans of a recording that are traced, at most: a cell of a large building is seen in a hundred of so many."""
     max_cells: int = 40_000_000
     """Largest grid, cells (12 bytes each while it is made); a larger map is drawn with larger cells."""
 
