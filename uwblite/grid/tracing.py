@@ -103,8 +103,9 @@ def from_sweeps(
 
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
     chosen = moved_scans(sweeps.first, config.move_distance, config.move_angle)
-    if config.move_distance > 0.0 and len(chosen) > config.most_scans:
-        chosen = chosen[np.arange(config.most_scans) * len(chosen) // config.most_scans]
+    most = max(config.most_scans, len(chosen) // 3)
+    if config.move_distance > 0.0 and len(chosen) > most:
+        chosen = chosen[np.arange(most) * len(chosen) // most]
     return _Task(sweeps.scans, np.arange(len(sweeps.first)), sweeps.first, sweeps.last, sweeps.flipped, config).rows(chosen)
 
 
