@@ -476,7 +476,7 @@ def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monke
         raise Cancelled("enough")
 
     monkeypatch.setattr("uwblite.mapping.scan_selection.prepared", prepared)
-    for logs in (minute, [minute], (minute, minute)):
+    for logs in (minute, [minute], (minute,)):
         with pytest.raises(Cancelled):
             build_map(logs)
     assert [log is minute for log in asked] == [True] * 3

@@ -36,7 +36,7 @@ from .pipeline import (
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stage, Stages
-from .pipeline.recordings import gather
+from .pipeline.recordings import check_distinct, gather
 from .sensor_log import SensorLog
 
 __all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
@@ -65,10 +65,12 @@ def build_map(
 
     Raises
     ------
-    DataError : there is nothing to map, or recordings share too few anchors. Cancelled : the callback asked to stop.
+    DataError : there is nothing to map, or recordings share too few anchors, or measurements.
+    Cancelled : the callback asked to stop.
     """
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
+    check_distinct(logs)
     logs = [scan_selection.prepared(log, config) for log in logs]
     config = odometry_units.with_units_checked(config, logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)

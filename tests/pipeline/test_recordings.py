@@ -15,8 +15,7 @@ from uwblite.graph.calibration import unknowns
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline.recordings import gather
+from uwblite.pipeline.recordings import check_distinct, gather
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
@@ -242,9 +241,9 @@ def test_recordings_of_one_log_are_refused_and_robots_that_stand_alike_are_not(t
     later = one.crop(start=float(one.odometry.stamps[-1]) - 4.0)
     for copy in (one, later, replace(one, ranges=None)):
         with pytest.raises(DataError, match=r"recordings 2 \(.*\) and 3 \(.*\) are of one log"):
-            gather([other, one, copy], KeyframeConfig())
+            check_distinct([other, one, copy])
     still = replace(one, odometry=replace(one.odometry, poses=np.zeros_like(one.odometry.poses)))
-    gather([still, still], KeyframeConfig())
+    check_distinct([still, still])
 
 
 def test_recordings_lie_a_kilometre_apart_on_the_way():

@@ -109,17 +109,26 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
 
     Raises
     ------
-    DataError : there is no recording, or two have the same measurements.
+    DataError : there is no recording.
     """
     if not logs:
         raise DataError("no recording to map; give one or more")
+    return _joined(logs, [keyframes.of(log, config) for log in logs])
+
+
+def check_distinct(logs: Sequence[SensorLog]) -> None:
+    """Refuse recordings of which two have the same measurements.
+
+    Raises
+    ------
+    DataError : two are copies or parts of one log that overlap.
+    """
     for (n, one), (m, other) in combinations(enumerate(logs), 2):
         if _alike(one, other):
             raise DataError(
                 f"recordings {n + 1} ({one.notes.source}) and {m + 1} ({other.notes.source}) are of one log, in part or "
                 "as a whole: measurements would count twice; give each recording once"
             )
-    return _joined(logs, [keyframes.of(log, config) for log in logs])
 
 
 def _alike(one: SensorLog, other: SensorLog) -> bool:
