@@ -50,6 +50,8 @@ class AnchorEstimate:
     """(2,) the mirrored position, m, where the status is 'mirror-ambiguous'."""
     since: float = float("nan")
     """First range from this place, s, where the anchor was moved during the recording; else nan."""
+    short: int = 0
+    """Ranges shorter than the distance to its place, by more than noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from uwblite.assessment.range_agreement import (
+    check_short_ranges,
     check_sustained_outliers,
     check_unit,
     check_wheels_against_lidar,
     outlier_stretches,
 )
+from uwblite.map_result import AnchorEstimate
 from uwblite.pipeline.progress import Stages
 
 
@@ -159,3 +161,16 @@ def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
 def test_too_few_ranges_that_agree_decide_nothing(residual, options):
     stages = against(residual, **options)
     assert ([n.kind for n in stages.doubts], stages.warnings) == (["wheels-against-lidar"], [])
+
+
+@pytest.mark.parametrize(("short", "alone", "doubted"), [(78, True, True), (22, True, False), (78, False, False)])
+def test_ranges_that_are_too_short_are_a_doubt_where_they_alone_hold_the_trajectory(short, alone, doubted):
+    """More than one in twenty of one anchor's: with a lidar the anchor was elsewhere, and the map is right."""
+    anchors = [
+        AnchorEstimate(name, np.zeros(2), np.eye(2), 458, 1.0, 0.0, 0.1, 0.1, "ok", short=n)
+        for name, n in (("A", short), ("B", 1))
+    ]
+    stages = Stages(None, None)
+    check_short_ranges(anchors, SimpleNamespace(rests_on_ranges=alone), SimpleNamespace(stages=stages))
+    assert [n.kind for n in stages.doubts] == ["short-ranges"] * doubted
+    assert not doubted or str(stages.doubts[0]).startswith("78 of 458 ranges to A ")

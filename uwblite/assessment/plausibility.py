@@ -20,7 +20,7 @@ from ..sensor_log.anchor_names import name_and_number
 from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
-from .range_agreement import check_sustained_outliers, check_unit, check_wheels_against_lidar
+from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .residual_tests import check_residuals
 from .untied_parts import check_untied_parts
 from .untied_recordings import check_untied_recordings
@@ -34,8 +34,7 @@ _UNRELATED = 0.2
 """Factor of the odometry's turns below which these have nothing in common with those of the map: slip takes half of them."""
 _WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
 """Relative error of the odometry's turns beyond which their sign is no longer sure: where they are too small, and where too
-large. Wheels that slip in turns count too much, never too little: skid steering turns as if its track were wider, here by
-two thirds at most."""
+large. Wheels that slip count too much, never too little: skid steering as if its track were wider, by two thirds at most."""
 _POOR_FIT = 4.0
 """chi2 per degree of freedom beyond which errors are twice what the noise allows: the model does not hold."""
 
@@ -62,6 +61,7 @@ def judge(
         check_displaced_stretches(table, anchors, task)
     check_residuals(estimate, table["residual"] if table else np.zeros(0), grid, task)
     check_unit(anchors, task)
+    check_short_ranges(anchors, estimate, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)

@@ -20,6 +20,7 @@ from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
 from ..sensor_log.anchor_names import name_and_number
 from . import plausibility
+from .range_agreement import many_short
 from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
@@ -137,8 +138,8 @@ def _anchor(
     if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
-        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason,
-        alternative,
+        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason, alternative,
+        short=short,
     )
 
 
@@ -177,13 +178,9 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
 
 def _reason_of_short_ranges(short: int, count: int) -> str:
     """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
-    if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
+    if not many_short(short, count):
         return ""
     return f"{short} of its {count} ranges are too short for its place by {SHORT} m or more: it stood elsewhere for a time?"
-
-
-_FEW_SHORT, _SHARE_SHORT = 3, 0.05
-"""Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
 
 
 def _with_times(
