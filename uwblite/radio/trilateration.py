@@ -20,7 +20,7 @@ from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE
 class TrilaterationConfig:
     """Search for anchor positions."""
 
-    raster: int = setting(40, minimum=2, maximum=1000, advanced=True)
+    raster: int = setting(40, minimum=2, maximum=400, advanced=True)
     """Cells along the longer side of the searched area."""
     samples: ClassVar[int] = 100
     """Ranges used for the search, spread evenly over the path."""
