@@ -109,6 +109,11 @@ def test_toml_that_is_none_is_one_clear_error():
         parse_toml("a = " + "[" * 100_000, "deep.toml")
 
 
+def test_a_number_of_thousands_of_digits_is_no_internal_error():
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        parse_toml("x = " + 5000 * "9")
+
+
 def test_leaves_name_every_setting():
     names = [name for name, _ in leaves(Outer)]
     assert names[0] == "icp.max_iterations"

@@ -88,7 +88,7 @@ def override(config: Settings, assignments: Iterable[str]) -> Settings:
 def _parse_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:  # not TOML, or a number of thousands of digits
         return text
 
 
@@ -96,7 +96,7 @@ def parse_toml(text: str, path: str = "") -> dict[str, Any]:
     """Return the nested dicts of a TOML text; path is its name for error messages."""
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits is a plain ValueError
         raise ConfigError(f"{path or 'TOML'}: not valid TOML: {error or 'nested too deeply'}") from None
 
 

@@ -70,7 +70,9 @@ def test_a_result_of_map_is_planned_in_with_its_anchors(tmp_path, monkeypatch, c
     assert "no map.yaml" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("bad", ["--from 1", "--from 1,2,3,4", "--to nan,1", "--radius -1", "--step 0"])
+@pytest.mark.parametrize("bad", [
+    "--from 1", "--from 1,2,3,4", "--from 1e308,0", "--to nan,1", "--radius -1", "--radius 1e300", "--step 0",
+])  # fmt: skip
 def test_wrong_words_are_usage_errors(rooms, capsys, bad):
     assert main([*rooms, "--from", "3,1", "--to", "3,3", *bad.split()]) == 2
     assert "error" in capsys.readouterr().err

@@ -89,6 +89,15 @@ def test_numbers_that_nobody_measures_are_refused(value):
         SensorLog(Odometry(np.array([0.0, 1.0, 1e300]), poses))
 
 
+@pytest.mark.parametrize("mounting", [
+    SensorMounting(T_base_laser=np.array([250.0, 0.0, 0.0])), SensorMounting(tag_position=np.array([0.0, 1e200, 0.4])),
+    SensorMounting(T_base_laser=np.array([np.nan, 0.0, 0.0])),
+])  # fmt: skip
+def test_sensors_stand_on_the_robot(log, mounting):
+    with pytest.raises(DataError, match="from the base, on which it is mounted"):
+        replace(log, mounting=mounting)
+
+
 def test_a_thousand_anchors_are_enough():
     names = tuple(f"A{k}" for k in range(1001))
     radio = UwbRanges(np.arange(3.0), np.zeros(3, dtype=np.int64), np.ones(3), np.full(3, 100.0), names)

@@ -126,11 +126,15 @@ def numbers(count: int, most: int = 0) -> Callable[[str], tuple[float, ...]]:
             values = tuple(float(part) for part in text.split(","))
         except ValueError:
             values = ()
-        if not count <= len(values) <= max(most, count) or not all(map(math.isfinite, values)):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted} numbers separated by commas")
+        if not count <= len(values) <= max(most, count) or not all(abs(value) <= _LARGEST for value in values):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted} numbers separated by commas, of at most {_LARGEST:g}")
         return values
 
     return parse
+
+
+_LARGEST = 1e7
+"""m; no place on Earth is farther from another one."""
 
 
 def apply_mounting(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from", dest="start", metavar="X,Y[,THETA]", type=numbers(2, 3), required=True, help=f"{where}, rad")
     parser.add_argument("--to", dest="goal", metavar="X,Y", type=numbers(2), required=True, help=where)
     parser.add_argument("--via", metavar="X,Y", type=numbers(2), action="append", default=[], help="pass here; repeatable")
-    parser.add_argument("--radius", metavar="M", type=number(least=0), required=True, help="of the robot, m")
+    parser.add_argument("--radius", metavar="M", type=number(0, 1000), required=True, help="of the robot, m")
     text = "unknown space: refuse it (default), or price it five times as dear as free space"
     parser.add_argument("--unknown", choices=("refuse", "price"), default="refuse", help=text)
     parser.add_argument("--step", metavar="M", type=number(least=0.001), default=0.1, help="largest step of the path, m (0.1)")

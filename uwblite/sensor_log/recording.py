@@ -17,6 +17,8 @@ _Sensor = TypeVar("_Sensor", Odometry, UwbRanges, LaserScans, Gyro)
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20
 """Numbers beyond these are no measurements: a quarter of the Earth's girth, and more than any time in any unit."""
+_FARTHEST_ON_ROBOT = 100.0
+"""m; no robot is larger."""
 MOST_ANCHORS = 1000
 """A building may have hundreds."""
 
@@ -80,6 +82,10 @@ class SensorLog:
                 raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
             if m and not 0 <= self.ranges.anchor.min() <= self.ranges.anchor.max() < len(self.ranges.anchor_ids):
                 raise DataError("ranges.anchor holds an index outside anchor_ids")
+        for name, places in (("laser", self.mounting.T_base_laser[:2]), ("tag", self.mounting.tags)):
+            if not np.all(np.abs(places) <= _FARTHEST_ON_ROBOT):
+                away = f"{np.abs(places).max():.3g} m from the base, on which it is mounted"
+                raise DataError(f"the {name} stands {away}; lengths are in m, not mm")
         for name in (*(() if self.ranges is None else self.ranges.anchor_ids), *self.mounting.anchor_heights):
             if fault := fault_of_id(name):
                 raise DataError(f"the anchor's id {fault}")
