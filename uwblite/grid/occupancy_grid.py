@@ -59,8 +59,8 @@ class GridConfig:
     move_angle: float = 0.2
     """... or has turned this far, rad."""
     most_scans: ClassVar[int] = 8000
-    """Scans of a recording that are traced, at most, if these are a third of all: a cell of a building of 60 x 40 m is seen in a
-    hundred of so many, and a robot that drives 10 km sees more cells."""
+    """Scans of a recording that are traced, at most, if these are a third of all: a cell of a building of 60 x 40 m is seen in
+    a hundred of so many, and a robot that drives 10 km sees more cells."""
     max_cells: int = 40_000_000
     """Largest grid, cells (12 bytes each while it is made); a larger map is drawn with larger cells."""
 
