@@ -1,9 +1,9 @@
-"""The page that is the algorithm: from recordings to trajectories, anchors and map.
+"""The algorithm on one page: from recordings to trajectories, anchors and map.
 
 ``build_map`` goes through the stages of ``_stages`` as the paper does: keyframes and edges, first optimisation with
-odometry and ranges, sub-maps and loop closures, second optimisation with lidar edges, occupancy grid. Beyond the paper
-stand the calibration in the same least squares, noise estimated from the data, scan-to-scan matching between neighbouring
-clouds and the joint refinement of all of them. One Estimate goes into every stage and comes out of it.
+odometry and ranges, sub-maps and loop closures, second optimisation with lidar edges, occupancy grid. Additions to the paper
+are the calibration in the same least squares, noise estimated from the data, scan-to-scan matching between neighbouring
+clouds and the joint refinement of all of them. Every stage takes one Estimate and returns one.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -91,7 +91,7 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, 
     if np.all(factors == 1.0):
         return estimate, task, logs
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
-    # A unit that the ranges have set says nothing about the ranges' own.
+    # A unit that was set by the ranges gives no information about the unit of the ranges.
     free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
     task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
     return radio_stages.first_optimisation(task), task, logs

@@ -1,15 +1,15 @@
 """Adjustment of all poses and surfaces: single rays on straight walls and round columns, beside matched pairs of clouds.
 
-A pair of clouds, condensed to its relative pose, has lost two things that show where the robot was: that metres of wall, seen
-from many places, are one straight line, and that what is seen of a column from all sides is one circle. And a range offset of
-a surface, which bends a pair, shows in the rays of many scans. So after the joint refinement walls and columns become
+A pair of clouds, condensed to its relative pose, has lost two constraints on the robot's poses: metres of wall, seen from
+many places, are one straight line, and the views of a column from all sides show one circle. And a range offset of
+a surface, which distorts a pair, shows in the rays of many scans. So after the joint refinement walls and columns become
 unknowns themselves, with their offsets, and rays on them measure poses beside the pairs; surfaces are eliminated
-(graph/eliminated.py). Then the pairs get the relative poses that were found, so that later stages go on from there; the rays
-count once more for the covariances.
+(graph/eliminated.py). Then the pairs get the resulting relative poses, so that later stages start from there; the rays
+are used again for the covariances.
 
-How much a ray weighs, residuals show (lidar/ray_noise.py). Where rays are as good as independent, pairs have nothing to add on
-walls and columns, and their points there hardly count any more; where walls bend and columns are no circles, as most are in
-real offices, rays of one place weigh as few, and pairs keep their weight.
+The weight of a ray is learnt from the residuals (lidar/ray_noise.py). Where rays are nearly independent, pairs add nothing
+on walls and columns, and their points there get hardly any weight; where walls bend and columns are no circles, as in most
+real offices, all rays of one place get the weight of a few, and pairs keep their weight.
 """
 
 from dataclasses import dataclass, replace
@@ -45,12 +45,12 @@ _LEAST = 0.03
 """Least weight of a point in pairs of clouds."""
 _PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
 """Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm and a surface's 12 mm,
-see lidar/surface_errors.py), and radius, m. Those of turn and place must say nothing even of how the whole map is turned: four
+see lidar/surface_errors.py), and radius, m. Those of turn and place must not even constrain the heading of the whole map: four
 surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the first pose to 0.01 rad."""
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with poses adjusted to rays on walls and columns, and its pairs of clouds in accordance."""
+    """Return the estimate with poses adjusted to rays on walls and columns, and its pairs of clouds measured at these poses."""
     joint, scans = estimate.joint, estimate.scans
     if joint is None or scans is None:
         return estimate
@@ -73,7 +73,7 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaysOfGraph:
-    """What rays say of a graph's unknowns, for covariances."""
+    """Information of the rays about a graph's unknowns, for covariances."""
 
     sums: RaySums
     surfaces: Surfaces
@@ -86,9 +86,9 @@ class RaysOfGraph:
 
 
 def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, RaysOfGraph]:
-    """Return a graph, and what the rays say of it, for covariances.
+    """Return a graph, and the information of the rays about it, for covariances.
 
-    Rays count as in the adjustment. Pairs of clouds have seen the same points, and more: they count half.
+    Rays have the weight of the adjustment. Pairs of clouds contain the same points, and others: they get half their weight.
     """
     edges = [
         replace(e, sqrt_information=np.sqrt(0.5) * e.sqrt_information) if isinstance(e, ScanEdges) else e for e in graph.edges
@@ -101,7 +101,7 @@ def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lidar:
-    """Where the lidar was at each keyframe (k), and which unknowns that depends on beside the pose."""
+    """Pose of the lidar at each keyframe (k), and the unknowns on which it depends beside the pose of the base."""
 
     sensors: Floats
     """(k, 3) frames of the clouds in the map."""
@@ -111,7 +111,7 @@ class _Lidar:
     """(4,) indices of the mounting's x, y, theta and of the delay in the calibration block; -1 = not an unknown."""
 
     def by_lidar(self, poses: Floats) -> Floats:
-        """Return what turns derivatives by the pose of each keyframe into those by mounting and delay, (k, 4, 3)."""
+        """Return the matrices (k, 4, 3) that turn derivatives by the pose of each keyframe into those by mounting and delay."""
         c, s = se2.cos_sin(poses[:, 2])
         arm, found = self.sensors[:, :2] - poses[:, :2], np.zeros((len(poses), 4, 3))
         found[:, 0, 0] = found[:, 1, 1] = c
@@ -123,13 +123,13 @@ class _Lidar:
 
 
 def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
-    """Return where the lidar was at the graph's estimates."""
+    """Return the poses of the lidar at the graph's estimates."""
     twist = task.recordings.twist
     return _Lidar(joint.sensor_poses(graph, np.arange(len(graph.poses)), twist)[0], twist, joint.calibration)
 
 
 def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, MeasuredSurfaces]:
-    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; without rays, as it was."""
+    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; unchanged without rays."""
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
     floor, certainty = floors.even(wheels), np.zeros((0, 3, 3))
     assert joint is not None
@@ -173,14 +173,14 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
 def _measured_again(
     joint: ScanEdges, graph: Graph, scans: ScanClouds, kind: NDArray[np.int8], noise: RayNoise, task: Task
 ) -> ScanEdges:
-    """Return the pairs with points on surfaces weighted by what these points' rays do not say already."""
+    """Return the pairs, with points on surfaces weighted by the information that the rays leave."""
     weight = np.append(np.maximum(1.0 - 1.0 / noise.alike, _LEAST), 1.0)[kind]
     return measured_again(joint, graph, scans.clouds, scans.raster, task.config.refinement, weight)
 
 
 def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> Blocks:
-    """Return the normal equations of rays and of what is known of surfaces beforehand."""
-    # Of an index -1 the number is -1: fixed.
+    """Return the normal equations of rays and of the priors of surfaces."""
+    # An index -1 gives the number -1: fixed.
     of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
     number = np.column_stack([unknowns.number["poses"], np.tile(of_lidar, (len(graph.poses), 1))])
     by = np.concatenate([np.tile(np.eye(3), (len(graph.poses), 1, 1)), lidar.by_lidar(graph.poses)], axis=1)

@@ -39,7 +39,7 @@ _AT_ONCE = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundSurfaces:
-    """Surfaces of a map, and what may be told better once poses have been adjusted to them."""
+    """Surfaces of a map, and the points and rays that are classified again once poses have been adjusted to them."""
 
     measured: MeasuredSurfaces
     kind: NDArray[np.int8]
@@ -52,7 +52,7 @@ class FoundSurfaces:
     def revised(
         self, measured: MeasuredSurfaces, clouds: Clouds, sensors: Floats, poses: Floats, information: Floats
     ) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
-        """Return the surfaces without columns that are none, with pieces of one wall joined, and more rays on short walls;
+        """Return the surfaces without false columns, with pieces of one wall joined, and with more rays on short walls;
         and the kinds (p,) of the clouds' points.
 
         Parameters
@@ -72,7 +72,7 @@ class FoundSurfaces:
 
 
 _MISFIT = 1.3
-"""Rms residual of the rays of a column, by their noise, beyond which it is none; of what is round it is 1."""
+"""Rms residual of the rays of a column, relative to their noise, beyond which it is not round; that of a circle is 1."""
 
 
 def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> FoundSurfaces:
@@ -110,7 +110,7 @@ def _on_stretches(rays: ScanPoints, scans: ScanClouds, parts: Stretches) -> tupl
 def _off_stretches(
     free: tuple[Bools, ...], poses: Floats, columns: Floats, scans: ScanClouds, task: Task
 ) -> tuple[SurfaceRays, Pieces, SurfaceRays, SurfaceRays]:
-    """Return the rays around columns (c, 3); of the free ones of all others the short pieces and the rays on these; and all
+    """Return the rays around columns (c, 3); of all other free rays, the short pieces and the rays on these; and all
     of these others."""
     around, pieces, on, others, first, near_columns = [], [], [], [], 0, surroundings(columns, NEAR)
     for rays, unseen in zip(_rays(scans, task), free, strict=True):
