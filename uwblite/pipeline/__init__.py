@@ -1,1 +1,1 @@
-"""The stages that ``mapping.py`` names, in the order of a recording's way through them."""
+"""The stages that ``mapping.py`` calls, from a recording to its final graph and grid."""

@@ -1,4 +1,4 @@
-"""How high are anchors of which no height is given? Slant ranges to high ones look like another unit of the wheels.
+"""Heights of anchors where none is given: slant ranges to high anchors look like a wrong unit of the odometry.
 
 Two hypotheses, low or as high as in a large hall, are solved and compared by marginal likelihood at their optima.
 """
@@ -23,9 +23,9 @@ from .mapping_config import MappingConfig
 _LIKELIER = float(np.log(3.0))
 """Difference of the logarithms of marginal likelihoods from which on the other hypothesis is taken (positive evidence)."""
 _REFUTED = 20.0
-"""The same from which on a hypothesis is refuted: noise that is not quite as assumed makes up the half of it."""
+"""The difference from which on a hypothesis is refuted: wrong assumptions about the noise can cause half of it."""
 _COMPARED = 1e-5
-"""Share of chi2 that no longer matters where likelihoods are compared; a hypothesis that is taken is solved on."""
+"""Relative decrease of chi2 that ends the optimisations whose likelihoods are compared; the chosen one is then continued."""
 _NOTICEABLE = 1.0
 """Height above the tag, m, from which on anchors can look like another unit; lower ones lengthen short ranges only."""
 _ELSEWHERE = 0.4
@@ -33,9 +33,9 @@ _ELSEWHERE = 0.4
 
 
 def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
-    """Return the estimate under the likelier of the two hypotheses, and what the other one says where it is not refuted.
+    """Return the estimate under the likelier of the two hypotheses, with the other one where it is not refuted.
 
-    Recordings that were joined are asked alone first: only where they do not refute high anchors, all are solved together.
+    Recordings that were joined are tested alone first: only where they do not refute high anchors, all are solved together.
     """
     low = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     heights = low.calibration.of_kinds(HEIGHT)
@@ -77,7 +77,7 @@ def _with_high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Opt
 def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
     """Return whether recordings (r,), each on its own, refute together that anchors are high.
 
-    One that has ranges to the anchors of others alone is not asked; nor does one say anything that does not determine them.
+    A recording whose anchors all occur in earlier ones is not tested; one that does not determine its anchors does not count.
     """
     gain, asked = 0.0, set[str]()
     for own in alone:
@@ -89,7 +89,7 @@ def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
 
 
 def compared(solver: SolverConfig) -> SolverConfig:
-    """Return the rules of an optimisation whose likelihood is compared with another one's."""
+    """Return the solver settings for an optimisation whose likelihood is compared with that of another one."""
     return replace(solver, relative_decrease=max(solver.relative_decrease, _COMPARED))
 
 

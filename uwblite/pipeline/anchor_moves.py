@@ -89,7 +89,7 @@ def named_so(task: Task, renamed: Sequence[SensorLog]) -> bool:
 
 
 def short_ranges(estimate: Estimate) -> int:
-    """Return how many ranges are shorter than the distance to the anchor's place: of wrong poses or names there are many."""
+    """Return how many ranges are shorter than the distance to the anchor's place: wrong poses or names cause many."""
     ranges = estimate.ranges
     return 0 if ranges is None else int(np.sum(ranges.residuals(estimate.graph)[:, 0] * ranges.sigma > SHORT))
 
@@ -106,7 +106,7 @@ def _of_all(log: SensorLog, moves: Moves) -> Moves:
     """Return all moves as moves of all anchors; one of several at about the same time stands for them."""
     every = sorted((move for found in moves.values() for move in found), key=lambda move: move.stamp)
     apart = [m for k, m in enumerate(every) if k == 0 or m.stamp - every[k - 1].stamp > _TOGETHER]
-    # What was carried is only known of its own anchor.
+    # The time during which an anchor was carried is known for this anchor only.
     apart = [replace(move, left=move.stamp) for move in apart]
     return {} if log.ranges is None else dict.fromkeys(log.ranges.anchor_ids, apart)
 
@@ -154,11 +154,11 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task,
 
 
 def said_of_places(task: Task, names: Sequence[str]) -> list[SensorLog]:
-    """Return the recordings without what was said of places that a map does not have: they are one with those before.
+    """Return the recordings without remarks about places that are not in the map: these were joined with earlier ones.
 
     Parameters
     ----------
-    names : the map's anchors. Where ranges were left out as made on the way, that is still said.
+    names : the map's anchors. Remarks about ranges left out because the anchor was being carried are kept.
     """
     places = {first_place(name) for name in names}
     return [_said_of(recording.log, places) for recording in task.recordings.each]

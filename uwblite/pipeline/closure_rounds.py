@@ -34,7 +34,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         if pieces is None or pieces.bent(built, base.poses) > _BENT:
             pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
             (pieces, free), built = _static(pieces, base, estimate), base.poses
-        # No name holds the covariance: among a thousand sub-maps it is a hundred megabytes.
+        # No variable refers to the covariance, so that it is freed: for a thousand sub-maps it takes a hundred megabytes.
         candidates = closure_candidates.propose(
             base, JointCovariance(base.with_edges(found.edges), pieces.reference), pieces, recordings.of_keyframe,
             tried, missed, with_ranges, config.loop_closure,
@@ -67,7 +67,7 @@ _BENT = 0.01
 def _with_long_stretches_tied(
     base: Graph, found: Closures, estimate: Estimate, task: Task
 ) -> tuple[Graph, Closures, Submaps | None]:
-    """Close loops whose ends are too uncertain for a search of sub-maps, the surest first; each round makes others surer.
+    """Close loops whose ends are too uncertain for a search of sub-maps, the most certain first, in rounds.
 
     Returns
     -------
@@ -128,7 +128,7 @@ _WIDE_ROUNDS = 12
 def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Closures, Estimate]:
     """Match both sides of each link that no scan measures once more; solve with the matches that hold.
 
-    Where these contradict the odometry it counts for little from then on: if it stood still, no match would win against it.
+    Where these contradict the odometry, its step gets little weight afterwards: if it stood still, no match would outweigh it.
     """
     recordings, scans, rules, wheels = task.recordings, estimate.lidar, task.config.loop_closure, estimate.odometry
     links = loose_links.loose_links(wheels, base)
@@ -178,7 +178,7 @@ def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _static(pieces: Submaps, graph: Graph, estimate: Estimate) -> tuple[Submaps, list[FreeSpace]]:
-    """Return sub-maps without what moved in them, and what each saw to be free."""
+    """Return sub-maps without moving objects, and the observed free space of each."""
     free = visibility.observed_free_space(estimate.lidar.clouds, pieces, graph.poses)
     return visibility.static_points(pieces, free), free
 
@@ -187,7 +187,7 @@ def _verified(
     candidates: Candidates, pieces: Submaps, free: Sequence[FreeSpace], rules: LoopClosureConfig, task: Task,
     report: Callable[[int, int], None] | None = None,
 ) -> Closures:  # fmt: skip
-    """Match candidates and return what became of them."""
+    """Match candidates and return the outcome of each."""
     found = verification.find(candidates, pieces, rules, task.config.correlative, report, free, task.executor)
     return _without_forbidden(found, task)
 

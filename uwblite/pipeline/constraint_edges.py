@@ -1,8 +1,8 @@
-"""What the user gives beforehand, as edges of a graph in the user's frame.
+"""Prior knowledge given by the user, as edges of a graph in the user's frame.
 
 When the first estimate stands in the frame of the odometry, a rigid motion found from surveyed anchors and pinned poses
-brings it over; which of them agree is found at the same time, so that an anchor that was moved since does not bend the
-map but is named.
+transforms it; the anchors and poses that agree are found at the same time, so that an anchor that was moved since does not
+bend the map but is reported.
 """
 
 from dataclasses import dataclass, replace
@@ -47,18 +47,18 @@ def apply_given(estimate: Estimate, task: Task) -> Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Applied:
-    """A graph with what is known beforehand in it."""
+    """A graph with the prior knowledge given by the user."""
 
     graph: Graph
     """In the user's frame, where that is known, with the further edges."""
     motion: Floats
-    """(3,) T_new_old: what the frame was moved by."""
+    """(3,) T_new_old: the motion of the frame."""
     moved: dict[str, float]
-    """Anchors that are not where they were given, by id: their distance from there, m."""
+    """By id, anchors that are not at their given place: their distance from it, m."""
 
 
 def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
-    """Bring a first estimate into the user's frame and add what is known to its edges.
+    """Bring a first estimate into the user's frame and add the prior knowledge to its edges.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def _present(given: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
 def _fit(
     given: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
 ) -> tuple[Floats, dict[str, float]]:
-    """Return the rigid motion (3,) that brings most known places together, and anchors that do not join in."""
+    """Return the rigid motion (3,) that aligns most known places, and the anchors that disagree with it."""
     if given.poses:
         first = min(given.poses, key=lambda p: p.sigma)
         motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
@@ -177,7 +177,7 @@ def _closures(given: Constraints, clock: Clock) -> list[Edges]:
 
 
 def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
-    """Fix the heading of the first pose where one given place alone leaves it open."""
+    """Fix the heading of the first pose where only one place is given, which does not determine it."""
     if given.poses or sum(a.id not in moved for a in given.anchors) > 1:
         return []
     root = np.diag([0.0, 0.0, 1e4])[None]

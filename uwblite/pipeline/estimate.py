@@ -1,4 +1,4 @@
-"""One value on its way through the stages: estimates, and the measurements they rest on, by origin."""
+"""The value that each stage takes and returns: estimates, and the measurements behind them, by origin."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -23,14 +23,14 @@ from .recordings import Recordings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What every stage is given beside the estimate."""
+    """The further input of every stage, beside the estimate."""
 
     recordings: Recordings
     config: MappingConfig
     given: Constraints
-    """What the user gave beforehand."""
+    """Prior knowledge given by the user."""
     stages: Stages
-    """Takes the stages' figures, warnings and doubts."""
+    """Collects the stages' figures, warnings and doubts."""
     executor: Executor | None = None
 
     def following(self, estimate: "Estimate") -> "Task":
@@ -68,10 +68,10 @@ class OtherHeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """What is known of one recording, or of several joined, after a stage."""
+    """The estimate of one recording, or of several joined, after a stage."""
 
     graph: Graph
-    """Estimates and priors; what the user gave stands among its edges. After the final optimisation it holds every
+    """Estimates and priors; the user's prior knowledge is among its edges. After the final optimisation it holds every
     measurement."""
     odometry: OdometryEdges
     ranges: RangeEdges | None

@@ -37,22 +37,22 @@ _LARGE_GRID = 5_000_000
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
-    """Put every measurement into the graph; where the lidar has refined the poses, give anchors the weights that suit them.
+    """Put every measurement into the graph; where the lidar has refined the poses, estimate anchors with other weights.
 
-    Poses are estimated with ranges that weigh by their own errors (lidar_stages.solve_by_own_errors), anchors with those that
-    all ranges from one direction have in common as well, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
+    For poses, a range is weighted by its own errors (lidar_stages.solve_by_own_errors); for anchors, also by the errors that
+    all ranges from one direction have in common, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
     graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
     """
     if estimate.joint is not None and estimate.ranges is not None:
         estimate = _anchors_alone(estimate, task)
     estimate = _with_range_errors(estimate, task)
-    # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
+    # Data for matching takes most of the memory; walls are needed once more where the map's axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
     return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
 
 
 def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Covariances]:
-    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show, and its covariances.
+    """Return the estimate corrected for the estimated errors of ranges to surfaces, and its covariances.
 
     These contain the correlated errors of the lidar's ranges and of the radio's.
     """
@@ -75,7 +75,7 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
 
 
 _ALONG = 60
-"""Poses along the trajectory whose errors stand for those of all."""
+"""Number of poses along the trajectory whose joint covariance represents the whole trajectory."""
 
 
 def _with_correlated_ranges(found: Marginals, stated: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
@@ -114,7 +114,7 @@ rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 
 def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
-    """Return for each keyframe (k,) the time in which a random walk gets as far as the mean pose of its scans is off, s.
+    """Return for each keyframe (k,) the time in which a random walk has the variance that the mean of its scans' poses has, s.
 
     1 / n^2 times the sum over pairs of n scans on one side of the keyframe of the shorter time between scan and keyframe.
     """
@@ -131,7 +131,7 @@ def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with what errors of ranges to surfaces do to its scan edges."""
+    """Return the estimate with the sensitivity of its scan edges to errors of ranges to surfaces."""
     scans = estimate.scans
     if scans is None:
         return estimate
@@ -168,7 +168,7 @@ def _with_alike_heights(given: Graph, estimate: Estimate, task: Task) -> Graph:
 
 
 def at_given_poses(graph: Graph) -> Graph:
-    """Return the graph with anchors and the systematic errors of their ranges free, as far as they were, and nothing else."""
+    """Return the graph with only anchors and the systematic errors of their ranges free, as far as they were free before."""
     fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
     return replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed)
 
@@ -204,7 +204,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
 
 
 def _check_resolution(geometry: GridGeometry, asked: float, task: Task) -> None:
-    """Say where the map is drawn coarser than asked for; one that no building fills is a doubt."""
+    """Warn where the map is drawn with larger cells than requested; a map larger than any building is a doubt."""
     edge = geometry.resolution
     if edge <= asked:
         return
@@ -218,7 +218,7 @@ def _check_resolution(geometry: GridGeometry, asked: float, task: Task) -> None:
 
 
 _COARSEST = 10.0
-"""Times the cells asked for up to which a map is large; beyond, poses or readings are astray."""
+"""Ratio of the cell size to the requested one, up to which a map counts as large; beyond it, poses or readings are wrong."""
 
 
 def _sweeps(recording: Recording, graph: Graph) -> Sweeps:

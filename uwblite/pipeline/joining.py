@@ -1,8 +1,8 @@
 """Many recordings in one graph: anchors have ids, so recordings of other days and robots share a frame.
 
 Each recording is bootstrapped on its own. The anchors that two have in common then give the pose of one in the frame of
-the other; one that was moved in between does not join in, gets a place of its own for each recording (``5C0B`` and
-``5C0B#2``) and is named. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
+the other; one that was moved in between is left out of this, gets a place of its own for each recording (``5C0B`` and
+``5C0B#2``) and is reported. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
 Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
 """
 
@@ -32,7 +32,7 @@ _FIRST_TOLERANCE = 0.5
 def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
 
-    Recordings join in the order of how many anchors they share with those already in, so that a third may link two.
+    Recordings are joined in the order of how many anchors they share with those already joined, so that a third may link two.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Keyframes that are moved in time or added after the first optimisation, and what was reported from them before.
+"""Keyframes that are moved in time or added after the first optimisation, and the edges made from them before.
 
 The lidar's clock is known only once scans have been matched, and so is where the odometry needs more keyframes. Poses are
-then read off the trajectory; odometry and ranges are measurements of the recording and are made from it again.
+then interpolated on the trajectory; the edges of odometry and ranges are made from the recording again.
 """
 
 from dataclasses import replace
@@ -50,7 +50,7 @@ def _cut(odometry: OdometryEdges, number: Ints, after: Recordings) -> OdometryEd
 
     Parameters
     ----------
-    number : (k,) what each keyframe is called among the new ones.
+    number : (k,) the new number of each keyframe.
     """
     begins = np.concatenate([r.first + np.arange(len(r.frames) - 1) for r in after.each])
     way = np.concatenate([r.frames.path + r.frames.turned + _STANDING * r.frames.duration for r in after.each])

@@ -1,9 +1,9 @@
 """Measured distances between landmarks (columns, corners) as constraints on the poses that see them.
 
-A landmark is a place in the map as it comes out before its distances are used. The keyframes that see what stands there
-carry it along: of each visit the one that saw most keeps the landmark's place in its own frame. A measured distance ties each
-visit of one landmark to each visit of the other, so that walls, wheels and calibration move with it; all ties together
-weigh as much as the one measurement that they are.
+A landmark is a place in the map before its distances are used. It is fixed to keyframes with points there: of each visit, the
+keyframe with most of these points keeps the landmark's place in its own frame. A measured distance constrains each
+visit of one landmark against each visit of the other, so that walls, odometry and calibration adapt to it; all these edges
+together have the weight of the one measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from .radio_stages import rough
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
 _LEAST_POINTS = 3
-"""Points of a cloud that make an observation."""
+"""Least number of points of a cloud that make an observation."""
 _ONE_VISIT = 3.0
 """Observations belong to one visit while less than this is travelled between two, m."""
 _VISITS = 4
@@ -83,14 +83,14 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
 
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
-    """Return where one cloud has a column (2,): the place in the whole map gives where to look, the cloud what was seen."""
+    """Return where one cloud has a column (2,): the column's place in the whole map bounds the search in the cloud."""
     near = points[np.hypot(*(points - place).T) < radius + _NEAR]
     centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
     return centre if np.hypot(*(centre - place)) < _NEAR else place
 
 
 def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
-    """Let given distances between landmarks act on the map as it is without them.
+    """Add given distances between landmarks to the map that was made without them.
 
     Raises
     ------
@@ -138,14 +138,14 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
         a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
         flat = np.ones(len(a))
         ends = (one.keyframe[a], other.keyframe[b], one.position[a], other.position[b])
-        # All ties of one measurement together weigh as much as it does.
+        # All edges of one measurement together have its weight.
         rows.append((*ends, given.distance * flat, given.sigma * np.sqrt(len(a)) * flat, np.full(len(a), number)))
     i, j, p, q, distance, sigma, measured = (np.concatenate(column) for column in zip(*rows, strict=True))
     return Ties(PointDistanceEdges(i, j, p, q, distance, sigma), measured)
 
 
 def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
-    """Return the distances as a map has them, ready for a report; warn of those that it does not keep."""
+    """Return the distances in the map, ready for a report; warn of those that differ from the measured ones."""
     lengths = tied.edges.lengths(graph)
     figures: list[dict[str, object]] = []
     for number, given in enumerate(task.given.landmark_distances):

@@ -38,9 +38,9 @@ def make_clouds(estimate: Estimate, task: Task) -> Estimate:
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """Make clouds and match neighbouring ones; where the lidar's clock is found to be off, move keyframes and clouds with it.
 
-    Keyframes then stand at the moments of the scans: between these the odometry's own velocity would have to bridge the
-    offset, and that is poor where the robot turns fast. The clouds are made here, and not in a stage before, so that nobody
-    holds those that are replaced.
+    Keyframes are then at the times of the scans: otherwise the odometry's velocity would have to bridge the offset, and it is
+    inaccurate where the robot turns fast. The clouds are made here, and not in an earlier stage, so that no reference keeps
+    the replaced ones in memory.
     """
     estimate, steps = _descended(make_clouds(estimate, task), task)
     estimate, former = _with_keyframes_where_contradicted(estimate, steps, task)
@@ -81,9 +81,9 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
 
 
 def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
-    """Return the estimate by odometry and a weak hold of the ranges, and the steps that the clouds measure from there.
+    """Return the estimate from odometry and weakly weighted ranges, and the steps that the clouds measure from there.
 
-    False ranges would tear neighbours apart; with weak ones, neighbours follow the odometry until clouds correct it.
+    False ranges of full weight would displace neighbours; with weak ones, these follow the odometry until clouds correct it.
     """
     weak, config = _with_inflated_ranges(estimate), task.config
     whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
@@ -101,7 +101,7 @@ def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
 def _with_keyframes_where_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Ints | None]:
     """Cut the steps of the odometry that the clouds contradict at the scans within them.
 
-    Where little happens between two scans, the second is found by any odometry.
+    Where the robot moves little between two scans, any odometry is good enough as a start of matching.
 
     Returns
     -------
@@ -130,11 +130,11 @@ _CUTS = 4
 _CLOCK_TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
 _SIGNIFICANT = 3.0
-"""Standard deviations from which an offset of the lidar's clock is no noise."""
+"""Standard deviations from which an offset of the lidar's clock is significant."""
 _SAME_STEPS = 0.015
 """Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
 _RETIMINGS = 4
-"""Most times that clouds are made again; each time a quarter of the error is left."""
+"""Most times that clouds are made again; a quarter of the error remains each time."""
 
 
 def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
@@ -153,7 +153,7 @@ def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
 
 
 def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, **figures: object) -> Estimate:
-    """Let neighbouring clouds constrain the poses of a graph, matches being sought up to the gate, m, at first."""
+    """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
     scans, rules = estimate.lidar, task.config.refinement
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     i, j = _pairs(graph, scans, settings, task)
@@ -226,7 +226,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
 
 
 def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
-    """Solve everything with ranges that weigh by their own errors alone.
+    """Solve everything with ranges that are weighted by their own errors alone.
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
@@ -238,14 +238,14 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
     before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
     estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
-        # Of other pairs of clouds nothing stays that was analysed, and it is large.
+        # The analysis of other pairs of clouds cannot be used again, and it is large.
         optimizer = Optimizer()
         estimate = _matched_once_more(estimate, shift, task)
         before = estimate.graph.poses
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if estimate.moved_since(before) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
-    del optimizer  # What it analysed is as large as the covariances.
+    del optimizer  # The optimizer's analysis takes as much memory as the covariances.
     task.stages.report("joint refinement", 1, 1)
     return _without_pattern(estimate, task)
 
@@ -259,11 +259,11 @@ def _without_pattern(estimate: Estimate, task: Task) -> Estimate:
 
 
 _STILL = 0.001
-"""Root mean square by which poses must have moved for their ranges to show another noise, m."""
+"""Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
 
 
 def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate:
-    """Match all clouds again after the poses moved by a shift, m, and solve with what they measure."""
+    """Match all clouds again after the poses moved by a shift, m, and solve with these matches."""
     scans, settings = estimate.lidar, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
     i, j = _pairs(estimate.graph, scans, settings, task)
     refined = _refine(estimate.graph, estimate.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
@@ -295,6 +295,6 @@ def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
 
 
 _VIOLATION = 0.05
-"""Share of points in free space from which visits do not show the same place; people, glass and doors leave half of it."""
+"""Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
 _ENOUGH_VISITS = 5
-"""Keyframes of either visit from which their free-space violation counts."""
+"""Least number of keyframes of either visit for which their free-space violation counts."""

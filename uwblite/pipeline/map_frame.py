@@ -1,4 +1,4 @@
-"""Where the map's axes lie, and which part of it is kept. The data are turned, so that the yaw of the map stays 0."""
+"""The map's axes, and the part of the map that is kept. The data are rotated, so that the yaw of the map stays 0."""
 
 from dataclasses import replace
 
@@ -20,8 +20,8 @@ the origin and the last one lies along x."""
 def wall_direction(normals: Floats) -> float:
     """Return the angle of the walls' main direction, rad in (-pi/4, pi/4]; walls at right angles count as one direction.
 
-    The mean direction of exp(4 i angle) finds the neighbourhood; a kernel of five degrees around it, tightened once, leaves
-    out whatever stands aslant.
+    The mean direction of exp(4 i angle) gives a first value; a kernel of five degrees around it, tightened once, excludes
+    oblique walls.
 
     Parameters
     ----------
@@ -55,13 +55,13 @@ def _quarter(angle: Floats) -> Floats:
 
 
 def align_axes(estimate: Estimate, task: Task) -> Estimate:
-    """Put the map's axes where the settings want them; walls are needed no more after it."""
+    """Align the map's axes as the settings ask; walls are not needed after this."""
     motion = alignment_of(estimate, task)
     return replace(estimate, graph=moved(estimate.graph, motion), scans=None).with_hypotheses_moved(motion)
 
 
 def alignment_of(estimate: Estimate, task: Task) -> Floats:
-    """Return T_new_map (3,), the motion that turns the map to where the settings want its axes."""
+    """Return T_new_map (3,), the motion that aligns the map's axes as the settings ask."""
     graph, normals = estimate.graph, np.zeros((0, 2))
     if task.config.align == "walls" and estimate.scans is not None:
         clouds = estimate.scans.clouds
@@ -82,7 +82,7 @@ def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
     Raises
     ------
     ConfigError : there is no such alignment.
-    DataError : the recording has not what it needs.
+    DataError : the recording lacks the data that the alignment needs.
     """
     if how == "odometry":
         return np.zeros(3)

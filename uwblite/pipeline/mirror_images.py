@@ -1,6 +1,6 @@
-"""Has an anchor a second place that explains its ranges? A path that is nearly straight leaves its mirror image.
+"""Mirror ambiguity: anchors with a second place that explains their ranges, as a nearly straight path leaves it.
 
-The bootstrap asks this of ranges along odometry that drifts. Here it is asked once more along the final trajectory and with
+The bootstrap tests this with ranges along odometry that drifts. Here it is tested again along the final trajectory and with
 the ranges' final noise, which contains the correlation of neighbouring errors: a curve, other anchors or the lidar decide then.
 Where the lidar sees little, or there is none, the ranges have bent a straight trajectory to suit the place that was found; so
 along straight ways the poses are free too.
@@ -18,8 +18,8 @@ from ..graph.solver import optimize
 from .estimate import Estimate, Task
 
 _CLEAR = 30.0
-"""Difference of chi2 between two places from which on the worse one is excluded. By chance alone 9 would do, but
-poses that are off by decimetres, which chi2 does not count, brought it to 11; the wrong side of a bent path, to hundreds."""
+"""Difference of chi2 between two places from which on the worse one is excluded. For noise alone 9 would be enough, but
+poses that are off by decimetres, which chi2 does not contain, gave up to 11; the wrong side of a bent path gives hundreds."""
 _LIKELIER = 10.0
 """The same where correlated ranges count once, three standard deviations: a hundred ranges that come along one aisle may
 prefer the wrong side of it by 34, and by 1.3 as what they are worth. Where neither place was right it was 9, and the mirror
@@ -119,7 +119,7 @@ def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Float
 
 
 def _costs(graph: Graph, ranges: RangeEdges, worth: Floats | Bools) -> Floats:
-    """Return the cost (a,) of each anchor's ranges by what each is worth (m,), and of the priors of its bias and height.
+    """Return the cost (a,) of each anchor's ranges with weights (m,), and of the priors of its bias and height.
 
     A range that counts a hundredth is no outlier at ten standard deviations: many of them together may exclude a place.
     """

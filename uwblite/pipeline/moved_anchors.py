@@ -21,19 +21,19 @@ from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
 _LEAST_MOVE = 0.25
-"""An anchor that two recordings see nearer together than this was not moved, m."""
+"""An anchor whose places in two recordings are nearer to each other than this was not moved, m."""
 _MOVED = 20.0
 """Squared Mahalanobis distance between two recordings' places of an anchor from which on it was moved (2 degrees of
 freedom; 5e-5 by chance, the rest for errors that the sigmas leave out)."""
 
 
 def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
-    """Give anchors that were moved between recordings a place of their own, and one to others, once poses are known well.
+    """Give anchors that were moved between recordings several places, and all others one place, once poses are known well.
 
-    With the poses fixed, every recording's ranges determine where each anchor stood then; places whose distance their
-    uncertainty does not explain are not the same. Recordings that were joined may have had an anchor and its mirror image: such
-    an anchor was not moved, if its places are now as near as joining would have asked. Ranges weigh little so far beside the
-    lidar: a wrong anchor bends no trajectory yet, and all is solved once, with the names that result.
+    With the poses fixed, every recording's ranges determine where each anchor stood then; places are different where their
+    uncertainty does not explain their distance. Before joining, one recording may have had an anchor's mirror image: such
+    an anchor was not moved, if its places are now within the tolerance of joining. Ranges have little weight so far beside the
+    lidar: a wrong anchor does not bend the trajectory yet, and all is solved once, with the resulting names.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
         return estimate
@@ -83,9 +83,9 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _solved_again(estimate: Estimate, task: Task) -> Estimate:
-    """Return the optimum, or from where to begin after a joint refinement, with ranges to other anchors than before.
+    """Return the optimum, or the start for it after a joint refinement, with ranges assigned to other anchors than before.
 
-    It begins where all ranges of an anchor put it: from the place that one recording shows those of others look like outliers.
+    It starts at the place from all ranges of an anchor: from the place of one recording, ranges of others look like outliers.
     """
     assert estimate.ranges is not None
     together = np.zeros(len(estimate.ranges), dtype=np.int64)
@@ -137,7 +137,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
     if len(task.recordings) == 1 or ranges is None:
         return estimate
     recording_of, number = task.recordings.of_keyframe, len(task.recordings)
-    # Where an anchor was moved, one place follows the other: that is reported, and the anchor has ranges all the time.
+    # Where an anchor was moved, one place follows the other: the move is reported, and the anchor was present all the time.
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
     # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
     heard = np.flatnonzero(ranges.ranges > 0.0)
@@ -159,7 +159,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
 
 
 _EXPECTED = 10.0
-"""Ranges to an anchor that a recording should have, by those of others from the same places, for their absence to count."""
+"""An anchor is absent from a recording that should have so many ranges to it, by other recordings at the same places."""
 
 
 def _warn_of_absence(task: Task, anchor: str, first: int, last: int, absent: Ints) -> None:
@@ -181,6 +181,6 @@ def _warn_of_absence(task: Task, anchor: str, first: int, last: int, absent: Int
 
 
 def _drove_there(numbers: list[int]) -> str:
-    """Return which recordings drove within reach of an anchor without hearing it."""
+    """Return which recordings passed within reach of an anchor but have no ranges to it."""
     which = ", ".join(map(str, numbers))
     return f"recording{'s' if len(numbers) > 1 else ''} {which} drove within its reach without hearing it"

@@ -1,4 +1,4 @@
-"""Is the unit of the odometry right? Ranges, which are times of flight, may show another one; lidar and heights count, too."""
+"""Test of the odometry's unit: ranges, which are times of flight, may show another one; lidar and heights count, too."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,7 +57,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
 
 
 def _lidar_agrees(recording: Recording, factor: float) -> bool:
-    """Return whether the lidar measures ways that are longer than the wheels' by a factor, more likely than as long."""
+    """Return whether lidar distances that are a factor longer than the odometry's are likelier than equal ones."""
     screening = recording.log.screening
     ratio = float("nan") if screening is None else screening.lidar_by_wheels
     return abs(ratio - factor) < abs(ratio - 1.0)

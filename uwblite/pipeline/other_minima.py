@@ -1,9 +1,9 @@
-"""Is there a better optimum than the one of the bootstrap? Without a lidar, a trajectory may be caught in a poor one.
+"""Search for a better optimum than that of the bootstrap: without a lidar, a trajectory may end in a poor local minimum.
 
-Along a line of anchors, ranges do not show on which side of it a robot drives: each way along a corridor fits on either side,
-and only the odometry between the ways decides. An optimisation that began with one of them on the wrong side stays there, and
-its covariance knows nothing of the other side. So wherever the trajectory comes near the line, all that follows is put on the
-other side once, and the same problem is solved from there; and again from each optimum that is found so.
+Along a line of anchors, ranges do not show on which side of it a robot drives: each pass along a corridor fits on either side,
+and only the odometry between the passes decides. An optimisation that started with one of them on the wrong side stays there,
+and its covariance does not contain the other side. So wherever the trajectory comes near the line, all poses after this are put
+on the other side once, and the same problem is solved from there; and again from each optimum found in this way.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ from .estimate import Estimate, Task
 _ACROSS, _SHARE = 1.0, 0.2
 """Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
 _LEAST = 5
-"""Anchors of which one may stand beside the line of the others."""
+"""Number of anchors from which on one of them may be off the line of the others."""
 _NEAR = 0.7
 """Distance from the line up to which a trajectory may have changed sides, m."""
 _ENDS = 3
-"""Poses at either end of a trajectory that are too few to be put elsewhere."""
+"""Poses at either end of a trajectory within which no change of sides is tried."""
 _MOST = 4
-"""Optima from which the search goes on."""
+"""Most optima from which the search is continued."""
 _SAME = 0.1
-"""Optima nearer to each other, m rms, are one."""
+"""Optima nearer to each other than this, m rms, count as one."""
 _WORSE = 40.0
-"""Difference of chi2 to the best from which on an optimum leads nowhere."""
+"""Difference of chi2 to the best from which on the search is not continued from an optimum."""
 
 
 def at_best(estimate: Estimate, task: Task) -> Estimate:

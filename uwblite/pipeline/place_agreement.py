@@ -21,17 +21,17 @@ from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
 _FALSE_MOVES = 0.05
-"""Share of maps of anchors that stand still in which places may differ by chance."""
+"""Share of maps with unmoved anchors in which two places are wrongly kept (significance level)."""
 _PER_MOMENT = 8
-"""Ranges for each moment that is tried independently of the others: as many determine a place."""
+"""Ranges per independent test: as many determine a place."""
 _GIVEN = 10.0
-"""Times the limit up to which poses that give way are tried where one place costs more at given ones."""
+"""Factor on the limit up to which the test is repeated with free poses where one place costs more at fixed ones."""
 
 
 def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with successive places of an anchor as one where one place explains their ranges as well."""
     ranges = estimate.ranges
-    # What the user has given of anchors counts them as they are.
+    # Prior knowledge of the user refers to anchors by their present numbers.
     given = bool(task.given.anchors or task.given.distances)
     pairs = [] if ranges is None or given else _successive(estimate)
     if ranges is None or not pairs:
@@ -46,7 +46,7 @@ def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _same(estimate: Estimate, pairs: Sequence[tuple[int, int]], most: float, solver: SolverConfig) -> list[tuple[int, int]]:
-    """Return the pairs of places of which one place costs no more than so much: at given poses, or where poses give way."""
+    """Return the pairs of places that one place replaces at no more than this cost: at fixed poses, or with free ones."""
     here = solved(replace(estimate, graph=at_given_poses(estimate.graph)), solver)
     costs = {pair: _cost_of_one(here, pair, solver) for pair in pairs}
     near = [pair for pair, cost in costs.items() if most < cost <= _GIVEN * most]
@@ -57,7 +57,7 @@ def _same(estimate: Estimate, pairs: Sequence[tuple[int, int]], most: float, sol
 
 
 def _most_cost(count: int) -> float:
-    """Return the quantile of chi-square, 2 degrees of freedom, for the moments that were tried among so many ranges.
+    """Return the quantile of chi-square, 2 degrees of freedom, for the number of tests among so many ranges.
 
     Bonferroni: each of them is tried at a level that makes _FALSE_MOVES of all together.
     """
@@ -87,7 +87,7 @@ def _successive(estimate: Estimate) -> list[tuple[int, int]]:
 
 
 def _cost_of_one(apart: Estimate, pair: tuple[int, int], solver: SolverConfig) -> float:
-    """Return by how much chi2 grows where two places are one, beginning at either."""
+    """Return by how much chi2 grows where two places are joined, with either of them as the start."""
     one = _merged(apart, [pair])
     costs = []
     for start in pair:

@@ -9,14 +9,14 @@ from ..sensor_log import SensorLog
 
 
 class Stage(str):
-    """What progress is made with: text for people, such as ``loop closure 2``, and its parts for programs."""
+    """A stage in a progress report: text for people, such as ``loop closure 2``, and its parts for programs."""
 
     name: str
-    """Of the stage, without its lap."""
+    """Name of the stage, without its number."""
     lap: int
     """1, 2, ... of a stage that is repeated until nothing changes; else 0."""
     detail: str
-    """What the user should know before it begins; empty as a rule."""
+    """Information for the user before the stage begins; usually empty."""
 
     def __new__(cls, name: str, lap: int = 0, detail: str = "") -> "Stage":
         """Make the text of the parts."""
@@ -55,7 +55,7 @@ class Stages:
             raise Cancelled(f"stopped by the caller during {stage}")
 
     def warn(self, kind: str, text: str, **figures: object) -> None:
-        """Add something the user should know."""
+        """Add a warning."""
         self.warnings.append(Notice(kind, text, figures))
 
     def withdraw(self, kind: str, figure: str, but: Container[object] = ()) -> None:
@@ -70,7 +70,7 @@ class Stages:
         self.doubts.append(Notice(kind, text, figures))
 
     def settle(self, doubt: Notice, by: str) -> None:
-        """Make a warning of a doubt, and say by what it is settled."""
+        """Turn a doubt into a warning, and add the reason that settles it."""
         self.doubts.remove(doubt)
         self.warn(doubt.kind, f"{doubt.text}; {by}", **doubt.figures)
 
@@ -79,7 +79,7 @@ class Stages:
         return tuple(self.warnings), tuple(self.doubts)
 
     def back_to(self, mark: tuple[tuple[Notice, ...], tuple[Notice, ...]]) -> None:
-        """Return to what had been reported then, because the stages that reported the rest run again."""
+        """Restore an earlier list of notices, because the stages that reported the later ones run again."""
         self.warnings, self.doubts = list(mark[0]), list(mark[1])
 
     def end(self, stage: str, **figures: object) -> None:

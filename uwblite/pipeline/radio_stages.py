@@ -81,7 +81,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
 
 
 def tag_rises(recording: Recording) -> tuple[float, ...]:
-    """Return the height of each of a robot's tags above the first, m."""
+    """Return the height of each of a robot's tags above the first tag, m."""
     heights = recording.log.mounting.tags[:, 2]
     return tuple((heights - heights[0]).tolist())
 
@@ -104,7 +104,7 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
-    # The bootstrap starts in the middle of the path; the map begins where the odometry did.
+    # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.
     back = se2.compose(estimate.graph.poses[0], se2.inverse(found.graph.poses[0]))
     graph = estimate.graph.with_estimates_of(map_frame.moved(found.graph, back))
     graph = replace(graph, fixed_anchors=~found.placed)
@@ -113,10 +113,10 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
 
 
 def _optimised(estimate: Estimate, task: Task) -> Estimate:
-    """Optimise odometry and ranges together, estimating the ranges' noise on the way.
+    """Optimise odometry and ranges together, alternating with estimates of the ranges' noise.
 
-    Recordings that were joined have been through all laps alone: with the noise that each has shown they are solved together
-    once, and without a lidar in one more lap that shows noise and priors of all.
+    Recordings that were joined have been through all laps alone: they are solved together once with the noise learnt for
+    each, and without a lidar in one more lap that estimates noise and priors of all.
     """
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
@@ -153,7 +153,7 @@ def _solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer) -> t
 
 
 _NOISE_ROUNDS = 3
-"""Times that noise is estimated and the graph optimised; in the last one the radio's calibration is free too."""
+"""Number of laps: each estimates noise and optimises the graph; in the last one the radio's calibration is free too."""
 
 
 def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
@@ -173,8 +173,9 @@ def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool 
 def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate anchors and range noise on the trajectory that matches of neighbouring clouds have stiffened.
 
-    Odometry alone is soft enough to be bent until ranges with errors that last for minutes seem to fit. On the stiffer
-    chain, to which ranges gave way so far, such errors stand out; unless scans see so little that this chain is soft as well.
+    Odometry alone can be bent until ranges with errors that last for minutes seem to fit. On the stiffer chain of scan
+    matches, beside which ranges had little weight so far, such errors show in the residuals, unless scans see so little that
+    this chain can be bent as well.
     """
     config, steps, optimizer = task.config, estimate.steps, Optimizer()
     if estimate.ranges is None or steps is None:
@@ -193,19 +194,20 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
 
 
 def rough(solver: SolverConfig) -> SolverConfig:
-    """Return the rules of an optimisation whose weights are re-estimated afterwards, and which is followed by another one."""
+    """Return the solver settings for an optimisation after which weights are re-estimated and another one follows."""
     iterations, decrease = min(solver.max_iterations, _ROUGH_ITERATIONS), max(solver.relative_decrease, _ROUGH_DECREASE)
     return replace(solver, max_iterations=iterations, relative_decrease=decrease)
 
 
 _ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
-"""Most iterations of such an optimisation, and the share of chi2 that no longer matters in it."""
+"""Most iterations of such an optimisation, and the relative decrease of chi2 that ends it."""
 
 
 def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors.
 
-    Ranges weigh little meanwhile, so that an anchor that lies for long stands out; unless nothing but ranges holds the poses.
+    Ranges have little weight meanwhile, so that sustained outliers of an anchor show in its residuals, unless ranges alone
+    constrain the poses.
     """
     if estimate.ranges is None:
         return estimate
@@ -220,7 +222,7 @@ def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Esti
     """Return the optimum with ranges whose noise was learnt there; steady: see range_measurements.learn_noise."""
     optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
-        # The marginal likelihood is one about the optimum of the very weights that it is computed with.
+        # The marginal likelihood is valid only at the optimum for the weights with which it is computed.
         estimate = with_range_noise(estimate, task.config, steady=steady)
         edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
         estimate = estimate.with_estimates_of(optimizer.optimize(estimate.graph.with_edges(*edges), solver)[0])
@@ -228,17 +230,17 @@ def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Esti
 
 
 def _let_go(held: Estimate, weak: Estimate) -> bool:
-    """Return whether poses left most anchors' ranges where these weighed little: nothing else holds the poses.
+    """Return whether most anchors' residuals grew where ranges had little weight: then nothing else constrains the poses.
 
-    Noise learnt there would be the poses' own error, and hold them where they are. An anchor that lies leaves residuals too,
-    but its own alone.
+    Noise learnt there would be the error of the poses, and would fix them where they are. Sustained outliers of one anchor
+    cause residuals too, but of this anchor only.
     """
     growth = np.array([b / max(a, _LEAST_SCATTER) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
     return len(growth) > 0 and float(np.median(growth)) > _MOST_GROWTH
 
 
 def _scatter(estimate: Estimate) -> list[float]:
-    """Return how far the ranges of each anchor that has any scatter about the estimate, m."""
+    """Return the scatter of ranges about the estimate, m, of each anchor that has ranges."""
     ranges = estimate.ranges
     assert ranges is not None
     off, alive = ranges.residuals(estimate.graph)[:, 0] * ranges.sigma, ranges.alive
@@ -246,6 +248,6 @@ def _scatter(estimate: Estimate) -> list[float]:
 
 
 _MOST_GROWTH = 1.3
-"""Scatter of a typical anchor's ranges, as a multiple, that weaker ranges leave where the lidar holds the poses."""
+"""Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
 _LEAST_SCATTER = 0.03
-"""Scatter below which ranges are as good as any radio's, m."""
+"""Scatter that is usual for radios, m; below it the test does not apply."""

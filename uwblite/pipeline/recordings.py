@@ -14,7 +14,7 @@ from ..odometry.keyframes import KeyframeConfig, Keyframes
 from ..sensor_log import SensorLog
 
 _APART = 1000.0
-"""Travelled distance between the end of a recording and the begin of the next, m: never the same epoch."""
+"""Travelled distance assumed between the end of a recording and the start of the next, m: they are different visits."""
 
 
 _SPARSE = 0.15
@@ -66,7 +66,7 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Name of the recording in messages."""
         source = self.log.notes.source
         return f"recording {self.number + 1}{f' ({source})' if source else ''}"
 
@@ -100,7 +100,7 @@ class Recordings:
 
     @property
     def clock(self) -> Clock:
-        """When the keyframes were."""
+        """Times of the keyframes."""
         return Clock(self.stamps, self.of_keyframe)
 
 
@@ -145,7 +145,7 @@ _ALIKE = 20
 
 
 def later(recordings: Recordings, shift: float) -> Recordings:
-    """Return the recordings with all keyframes of those with lidar later by a shift, s: its clock is late by so much more."""
+    """Return the recordings with all keyframes of those with lidar later by a shift, s: the further delay of its clock."""
     shifts = [shift if s.has_scans else 0.0 for s in recordings.each]
     frames = [keyframes.at(s.log, s.frames.stamps + t, s.frames.alone) for s, t in zip(recordings.each, shifts, strict=True)]
     return _joined([s.log for s in recordings.each], frames)
@@ -172,7 +172,7 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
 
 
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
-    """Return stamps between two others, both excluded, evenly chosen where they are too many."""
+    """Return the stamps strictly between two others; an even selection where they are too many."""
     within = stamps[np.searchsorted(stamps, begin, "right") : np.searchsorted(stamps, end, "left")]
     return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.int64)[1:-1]]
 

@@ -1,4 +1,4 @@
-"""The clouds of all keyframes and their rasters; made again only where scans or moments have changed."""
+"""The clouds of all keyframes and their rasters; made again only where scans or times have changed."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def make(recordings: Recordings, config: MappingConfig, delay: float) -> ScanClo
 
 
 def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> tuple[ScanClouds, Ints]:
-    """Return the clouds of recordings to which keyframes were added; what did not change is taken over.
+    """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def _blocks(recording: Recording, which: Ints, config: MappingConfig, delay: flo
 
 
 def _former(before: Recording, after: Recording, config: MappingConfig, delay: float) -> Ints:
-    """Return the keyframe (k,) of the graph before whose moment and scans each new one has as well; -1 = there is none."""
+    """Return the former keyframe (k,) with the same time and scans as each new one; -1 = there is none."""
     stamps, old = after.frames.stamps, before.frames.stamps
     at = np.minimum(np.searchsorted(old, stamps), len(old) - 1)
     same = old[at] == stamps

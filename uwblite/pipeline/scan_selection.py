@@ -1,7 +1,7 @@
-"""What of a recording is used: its sensors, and the scans that a map looks at.
+"""The part of a recording that is used: its sensors, and the scans that a map needs.
 
-A map looks at the scans nearest to each keyframe, and traces one whenever the laser has moved far enough. Of a slow
-robot's recording that is every fifth scan or so.
+A map uses the scans nearest to each keyframe, and traces one whenever the laser has moved far enough. In the recording of a
+slow robot that is about every fifth scan.
 """
 
 from dataclasses import replace
@@ -23,9 +23,9 @@ _STEPS = 2
 
 
 def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
-    """Return a recording screened, with the sensors in use and only the scans that a map looks at.
+    """Return a recording screened, with the sensors in use and only the scans that a map needs.
 
-    Of one that was screened before, nothing but sensors is left out.
+    From one that was screened before, only unused sensors are removed.
     """
     log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
     if log.screening is not None:
@@ -34,9 +34,9 @@ def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
 
 
 def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:
-    """Return the recording with the scans that a map of it may look at; the notes count the others.
+    """Return the recording with the scans that a map of it may need; the notes count the others.
 
-    What is left stays when it is thinned again with the same settings.
+    Thinning the result again with the same settings changes nothing.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
-"""What the odometry does in turns: its scale, where it is one constant, never what a turn that went wrong makes of it; and
-the point about which the robot turns."""
+"""The odometry in turns: its scale, which must be one constant that no single wrong turn changes; and the point about which
+the robot turns."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ from .estimate import Estimate, Task
 def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
     """Fix each scale of turns at the lidar's from step to step, where the scale of the whole estimate contradicts it.
 
-    A turn that the wheels missed, or a heading lost in a fast turn, then stays an error of its place. Where the steps ask for
-    the larger correction, the estimate keeps its own, and the map is judged at the end: the lidar may be what is wrong.
+    A turn that the wheels missed, or a heading lost in a fast turn, then stays a local error. Where the scale of the steps is
+    the larger correction, the estimate keeps its own, and the map is checked at the end: the lidar may be wrong.
     """
     graph = estimate.graph
     if estimate.steps is None:
@@ -47,7 +47,7 @@ def check_turn_scales(estimate: Estimate, task: Task) -> None:
 
 
 def _judge(found: TurnScale, used: float, task: Task) -> None:
-    """Say what is wrong with the scale that a map uses."""
+    """Return the text about what is wrong with the scale that a map uses."""
     if found.varies:
         parts = ", ".join(f"{1.0 + value:.2f}" for value in found.stretches)
         task.stages.doubt(
@@ -71,17 +71,17 @@ def _shown(found: TurnScale) -> str:
 
 
 _WRONG = 0.1
-"""Difference of the scale of turns that does not come from noise: a tenth of all turns missing or too much."""
+"""Difference of the scale of turns that noise does not explain: a tenth of all turns missing or too much."""
 
 
 def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
     """Let the robot turn about another point than the base's origin, where the lidar seems to be mounted off its place.
 
-    Wheels that slip in turns (skid steering) look like a lidar mounted elsewhere, to the last residual: a base whose origin is
-    shifted has the same scans and the same wheels. So the offset h that the lidar has without slip is shared out by how likely
-    it is beforehand: p that the robot slips, 1 - p that the lidar is not where it is said to be. Priors N(0, p h^2) of the slip
+    Wheels that slip in turns (skid steering) have exactly the same residuals as a lidar mounted elsewhere: a base whose origin
+    is shifted has the same scans and the same wheels. So the offset h that the lidar has without slip is split by the prior
+    probabilities: p that the robot slips, 1 - p that the lidar's given mounting is wrong. Priors N(0, p h^2) of the slip
     and N(0, (1 - p) h^2) of the mounting give mean p h and variance p (1 - p) h^2, those of the two alternatives. Where no
-    mounting is given, the base's origin is wherever the wheels turn about.
+    mounting is given, the base's origin is the point about which it turns.
     """
     graph, config = estimate.graph, task.config.calibration
     at, slips = graph.calibration.index("laser_x"), graph.calibration.of_kinds(TURNING)
@@ -102,14 +102,14 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
 
 
 _SMALL = 0.01
-"""m; nobody measures a mounting, or says where a base begins, better than to this."""
+"""m; a mounting, or the origin of a base, is not known better than this."""
 _BY_TAPE = 0.03
 """Standard deviation of a mounting that is given and right, m."""
 _SIGNIFICANT = 3.0
-"""Standard deviations from which an offset of the lidar is none of noise."""
+"""Standard deviations from which an offset of the lidar is significant."""
 _WRONG_FRAME = 0.1
-"""Share of given mountings that are those of another robot or frame, and off by the setting's `laser_offset`."""
+"""Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
 _NEVER = 1e-300
-"""Probability density of an offset that nothing explains; the mounting then takes it."""
+"""Probability density of an offset without a known cause; it is then assigned to the mounting."""
 _SLIPS = 0.5
-"""Odds beforehand of a robot that slips in turns against one that does not."""
+"""Prior odds of a robot that slips in turns against one that does not."""
