@@ -1,8 +1,8 @@
 """Surfaces between the beams of a coarse lidar: points on the chord of two beams that hit one straight surface.
 
-With beams a degree apart the hits on a wall are 0.1 m apart at 6 m already, and far more where they graze it: too few for a
-line, and too far apart for a nearest point. Where three beams side by side hit one line, that line is the surface between
-them as well; elsewhere nothing is known of what is between two beams.
+With beams a degree apart, the hits on a wall are 0.1 m apart at 6 m already, and much farther at grazing incidence: too few for
+a line, and too far apart for a nearest point. Where three neighbouring beams hit one line, this line is taken as the surface
+between them as well; elsewhere the space between two beams is unknown.
 """
 
 from dataclasses import replace
@@ -15,16 +15,16 @@ from ..odometry.attached import ScanPoints
 _SPACING = 0.1
 """Distance between points, m, that makes lines: a neighbourhood of 0.2 m holds four others."""
 _COARSE = 0.0075
-"""Angle between two beams, rad (0.43 degrees), from which on they are coarse. Finer beams that hit far apart graze a surface;
-what bends it between them nobody has seen, and where they do not graze it they are dense enough."""
+"""Angle between two beams, rad (0.43 degrees), from which on they are coarse. Finer beams that hit far apart graze a surface,
+whose shape between them is not measured; where they do not graze it they are dense enough."""
 _WIDEST = 0.6
-"""Wider gaps stay, m: niches and doors hide in them."""
+"""Wider gaps are not filled, m: they may contain niches and doors."""
 _REACH = 15.0
-"""Gaps farther away stay, m: the tables of nearest points take memory with the square of a cloud's extent."""
+"""Gaps farther away are not filled, m: the memory of the tables of nearest points grows with the square of a cloud's extent."""
 _NOISE, _BEND = 0.04, 0.08
-"""By how much the next hit may lie off the line through two, m and share of its distance."""
+"""Largest distance of the next hit from the line through two others, m and as a share of its distance along this line."""
 _LEAST_BESIDE = 0.4
-"""Share of a gap that the one beside it has at least on one line, however much the beams graze it."""
+"""Least ratio of neighbouring gaps on one line, at any grazing angle."""
 
 
 def filled(rays: ScanPoints) -> ScanPoints:
@@ -59,18 +59,18 @@ def _on_one_line(rays: ScanPoints) -> Ints:
     reach = np.hypot(beam[:, 0], beam[:, 1])
     coarse = np.abs(step[wide, 0] * beam[:, 1] - step[wide, 1] * beam[:, 0]) > _COARSE * reach * reach
     wide = wide[coarse & (reach < _REACH)]
-    # No gap is behind the last hit, and none before the first: the last stands for what is before it.
+    # There is no gap behind the last hit and none before the first: the last one stands for it.
     before, after = (short[wide + k] & _continues(step[wide], step[wide + k]) for k in (-1, 1))
     return np.asarray(wide[before | after])
 
 
 def _beside(scan: Ints, ray: Ints) -> Bools:
-    """Return after which hits (p,) the next beam hit something as well."""
+    """Return which hits (p,) are followed by a hit of the next beam."""
     return np.append((np.diff(scan) == 0) & (np.diff(ray) == 1), False)
 
 
 def _continues(step: Floats, other: Floats) -> Bools:
-    """Return which steps (p, 2) from hit to hit go on along others (p, 2) beside them, whose lengths change little."""
+    """Return which steps (p, 2) from hit to hit continue neighbouring ones (p, 2) in a straight line with similar lengths."""
     length = np.hypot(step[:, 0], step[:, 1])
     along = np.sum(step * other, axis=1) / length
     across = np.abs(step[:, 0] * other[:, 1] - step[:, 1] * other[:, 0]) / length

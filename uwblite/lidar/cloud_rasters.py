@@ -53,7 +53,7 @@ class CloudRasters:
 
 
 def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
-    """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
+    """Build the rasters: each point with a normal writes its number into the cells within reach, nearest cells last.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _claim_cells(
     clouds: Clouds, some: slice, cells: NDArray[np.signedinteger], start: Ints, low: Floats, shape: Ints, cell: float,
     offsets: list[tuple[int, int]],
 ) -> None:
-    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right.
+    """Write the points of some clouds into the cells at these offsets from their own; later offsets overwrite earlier ones.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
 def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
     """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
     per_cell = 1.0 / raster.cell
-    # Truncation takes what lies up to a cell below the raster into its rim, which names no point.
+    # Truncation puts coordinates up to a cell below the raster into its rim, which names no point.
     cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
     cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
     wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)

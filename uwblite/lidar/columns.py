@@ -20,13 +20,13 @@ class Landmarks:
 
 
 def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float = 1.0, cell: float = 0.05) -> Landmarks:
-    """Return where the columns stand in a map, by the place whose circle catches most cells and whose surroundings least.
+    """Return where the columns stand in a map: the place with most cells on its circle and fewest around it.
 
     Parameters
     ----------
     occupied : (n, 2) m, centres of the occupied cells, in the frame of the expected places.
     expected : where the columns should be, and their radii.
-    search_radius : m; cut to 0.45 of the distance to the nearest other column, lest one is taken for the other.
+    search_radius : m; limited to 0.45 of the distance to the nearest other column, so that columns are not confused.
     cell : m, size of a cell.
     """
     tree = cKDTree(occupied) if len(occupied) else None
@@ -84,7 +84,7 @@ def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Flo
             return centre
         weight = (1.0 - (residual[near] / gate) ** 2) ** 2
         unit = ray[near] / np.maximum(distance[near], 1e-9)[:, None]
-        # A column seen from one side is hardly measured across the line of sight: the start fixes it there.
+        # A column seen from one side is hardly measured across the line of sight: the initial value fixes it there.
         normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
         step = np.linalg.solve(normal, (weight * residual[near]) @ unit)
         centre = centre + step

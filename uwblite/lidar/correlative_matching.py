@@ -1,12 +1,12 @@
-"""Correlative search: where a cloud fits into another one when the guess may be out by metres and tens of degrees.
+"""Correlative scan matching: the pose of a cloud in another one when the guess may be wrong by metres and tens of degrees.
 
 The target becomes a field that at each cell holds exp(-d^2 / 2 spread^2) times the nearest surface's normal as a complex
 number; the source becomes an image of its normals. For one heading the scores of all shifts are one correlation,
 
     score(T) = mean over source points of exp(-d^2 / 2 spread^2) cos(angle between normals),
 
-done by FFT (after Olson, Real-time correlative scan matching, ICRA 2009, which evaluates it shift by shift). A wall
-seen from its other side counts against a pose. Every pose of the grid is scored: nothing is pruned, nothing missed.
+computed by FFT (after Olson, Real-time correlative scan matching, ICRA 2009, which evaluates it shift by shift). A wall
+seen from its other side lowers the score. Every pose of the grid is scored; none is pruned.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ _CELLS_PER_REACH = 4
 
 @dataclass(frozen=True, slots=True)
 class CorrelativeConfig:
-    """Grid of poses and what is made of its scores."""
+    """Grid of poses, and how candidates are chosen by their scores."""
 
     resolution: float = setting(0.15, above=0.0, advanced=True)
     """Step of x and y, m; time goes with its inverse square."""

@@ -1,6 +1,6 @@
-"""Degenerate directions of a registration: those in which only the scatter of the normals seems to fix a pose.
+"""Degenerate directions of a registration: those in which only the scatter of the normals seems to constrain a pose.
 
-Normals scatter, and a wall whose normals scatter seems to resist being slid along. With the variance v of a normal's
+Scattered normals of a wall add spurious information about the motion along it. With the variance v of a normal's
 angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t is the spurious information of scatter alone. In
 the basis B that diagonalises both, H = B V diag(l) V^T B^T and N = B B^T, a direction was measured where its l exceeds
 a multiple of 1. That depends neither on units nor on the frame.
@@ -27,7 +27,7 @@ def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Float
 
 
 def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Return information (..., 3, 3) and gradient (..., 3) less what the scatter of the normals may have added.
+    """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added.
 
     A direction keeps its Gauss-Newton step with the share 1 - MEASURED / l of its information, none where l is below MEASURED.
     """

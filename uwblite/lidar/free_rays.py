@@ -1,7 +1,7 @@
-"""Rays that end on no stretch of their own cloud: which of them end on short walls, once the map shows these.
+"""Rays that end on no stretch of their own cloud, assigned to short walls once the map shows these.
 
-A scan that sees a few rays of a door jamb shows no line. Where the jamb is, other scans have shown; then single rays are
-enough, where they end on it, within what it has been seen to cover, and on nothing else.
+A scan with a few rays on a door jamb shows no line. Other scans have shown where the jamb is; then single rays are
+used where they end on it, within its observed extent, and on nothing else.
 """
 
 from dataclasses import replace
@@ -15,11 +15,11 @@ from .round_columns import surroundings
 from .surface_rays import INCIDENCE, ROUGHNESS, MeasuredSurfaces, SurfaceRays, Surfaces, in_map
 
 _CELL, _SHOWN = 0.05, 3
-"""Length of the cells of a wall, m, and rays that must have shown each."""
+"""Length of the cells of a wall, m, and least number of rays in each."""
 _NEAR = 0.15
-"""Distance from a cell's middle up to which it is asked whether a ray ends in it, m."""
+"""Distance from a cell's middle up to which a ray is tested for ending in it, m."""
 _MOST = 12
-"""Cells that are asked, at most."""
+"""Most cells that are tested for each ray."""
 _GATE, _ALONE = 3.0, 6.0
 """Standard deviations within which a ray ends on a wall, and beyond which it does not end on any other."""
 

@@ -1,7 +1,8 @@
 """Free space seen from some places, and points that contradict it.
 
-From one place it was free in every direction as far as the nearest surface. A point of another cloud, put into the map by a
-hypothetical pose, contradicts that where it lies well short of it; where it lies beyond, it was hidden and shows nothing.
+Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud, put into the
+map by a hypothetical pose, contradicts that where it lies well in front of this surface; a point behind the surface was hidden
+and gives no information.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from ..arrays import Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeSpace:
-    """How far it was free around v places, by bearing."""
+    """Extent of the free space around v places, by bearing."""
 
     poses: Floats
     """(v, 3) of the places in the cloud's frame; m, m, rad."""
@@ -30,7 +31,7 @@ def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
     poses : (v, 3) T_cloud_base of each; m, m, rad.
     nearest : (v, b) m, distance of the nearest surface in each part of the circle, from -pi on; inf = none was seen, so that
         nothing is known: dark and oblique walls return nothing. A bearing is free only as far as its neighbours on either
-        side, too: a ray grazing a wall or an edge must not contradict it.
+        side, so that a ray that grazes a wall or an edge does not contradict it.
     """
     reach = np.where(np.isfinite(nearest), nearest, 0.0)
     free = reach.copy()
@@ -62,7 +63,7 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
 
 
 def contradiction(free: FreeSpace, points: Floats, margin: float) -> tuple[float, float]:
-    """Return what share of points (m, 2) in view lies where free space was seen, and what share was in view, 0..1.
+    """Return the share of points (m, 2) in view that lie in observed free space, and the share that was in view, 0..1.
 
     The first is 0 where none was in view; see seen_beyond.
     """

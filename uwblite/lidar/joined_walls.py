@@ -1,8 +1,8 @@
 """Pieces of wall that are one wall: on one line, with one range offset, and nothing was seen through the gap between them.
 
-Clouds show a wall in pieces, since what stands in front of it hides parts. One wall of many metres holds headings better than
-its pieces do; but the wall on the other side of a door is painted, and built, on its own. So pieces are joined where their
-places, directions and range offsets agree, where the gap is short, and where no ray has passed through it.
+Clouds show a wall in pieces, since objects in front of it hide parts. One wall of many metres constrains headings better than
+its pieces do; but the wall on the other side of a door may have another colour and another plane. So pieces are joined where
+their places, directions and range offsets agree, where the gap is short, and where no ray has passed through it.
 """
 
 from dataclasses import dataclass, replace
@@ -17,17 +17,17 @@ from .surface_rays import MeasuredSurfaces, SurfaceRays, Surfaces
 _LEAN, _OFF = 0.15, 0.05
 """Largest difference of directions, rad, and of places across, m, with which pieces are compared at all."""
 _GAP, _CLOSE = 2.0, 0.1
-"""Longest gap, m, and one that is too short to be seen through."""
+"""Longest gap, m, and longest gap that is joined without a test for rays through it, m."""
 _CHI2 = 11.3
 """Largest chi2 of three between pieces: its 99 % quantile."""
 _BENT = np.array([0.002, 0.003, 0.0])
-"""What pieces of one wall differ by in direction, rad, place, m, and offset, m, beside the noise of their rays."""
+"""Differences of pieces of one wall in direction, rad, place, m, and offset, m, beside the noise of their rays (1 sigma)."""
 _FRONT, _BEHIND = 0.05, 0.12
 """A ray has passed through a gap that begins in front of the wall and ends behind it by so much, m."""
 _THROUGH = 3
-"""Rays that show that a gap is open."""
+"""Least number of rays through a gap that show it to be open."""
 _SAMPLE = 1 << 17
-"""Rays that are asked whether they passed, at most."""
+"""Most rays that are tested for passing through a gap."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ def with_joined_walls(found: MeasuredSurfaces, information: Floats, sensors: Flo
     asked = np.flatnonzero(number[gaps.one] != number[gaps.other])
     closed[asked] = ~_seen_through(surfaces, rays, sensors, gaps.rows(asked))
     number = connected(gaps.one[closed], gaps.other[closed], len(surfaces.facing))
-    # Each goes on as the piece of most rays.
+    # Each joined wall takes the values of its piece with most rays.
     by_rays = np.lexsort((np.bincount(rays.surface, minlength=len(number)), number))
     largest = by_rays[np.flatnonzero(np.diff(number[by_rays], append=-1))]
     kept, of = np.unique(largest[number], return_inverse=True)

@@ -1,4 +1,4 @@
-"""Joint refinement: all overlapping clouds pull on all poses at once.
+"""Joint refinement: all overlapping clouds constrain all poses at once.
 
 Every round looks up matches of every pair of clouds that see the same surfaces, condenses each pair into one
 relative-pose edge and solves the whole graph again, wheels, radio and calibration included; the gate shrinks from
@@ -195,8 +195,8 @@ def refine(
     twist : (k, 3) velocity of the base at each keyframe.
     delay : of the lidar's clock, s, with which the clouds were made.
     """
-    # Lines seen obliquely lean a little, so the cloud that gives the points seems shifted towards where it was seen from:
-    # half a millimetre per pair, always to the same side. Every other pair the other way round, that averages out.
+    # Lines seen obliquely are tilted a little, so the cloud that gives the points seems shifted towards its laser: half a
+    # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
     points = pair_points(clouds, j, config.points)
@@ -205,7 +205,7 @@ def refine(
     none = np.zeros((0, 3)), np.zeros((0, 3, 3))
     probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     optimizer = Optimizer()
-    # The next round looks all matches up again: one good step is enough, but one it has to be.
+    # The next round looks all matches up again: one successful step is enough.
     brief = replace(solver, max_iterations=12, relative_decrease=0.5)
     T_i_j = probe.relative(graph)
     while True:
@@ -229,15 +229,15 @@ def refine(
         creeping = fit > (1.0 - _BETTER) * before_fit
         if rounds >= config.rounds or (last and (moved < config.convergence or creeping)):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
-        # After a step that failed or was braked, as much may be left as before.
+        # After a step that failed or was damped, as much may be left as before.
         whole = used.any() and len(summary.chi2_history) > 0 and summary.chi2_history[0] < summary.chi2_initial
         farthest = float(np.hypot(*(T_i_j - before)[used, :2].T).max()) if whole else gate
         gate = max(min(gate * config.shrink, _GATE_PER_SHIFT * farthest), config.last_gate)
 
 
 def _shared(i: Ints, j: Ints, used: Bools, config: RefinementConfig) -> Floats:
-    """Return the variance (e,) of a match of each pair by that of a point's distance: matches of one pair err alike, and those
-    of all pairs of one cloud use the same points."""
+    """Return the variance (e,) of a match of each pair by that of a point's distance: errors of one pair's matches are
+    correlated, and all pairs of one cloud use the same points."""
     clouds = int(max(i.max(initial=-1), j.max(initial=-1))) + 1
     degree = np.bincount(i[used], minlength=clouds) + np.bincount(j[used], minlength=clouds)
     return config.correlation * np.maximum(0.25 * (degree[i] + degree[j]), 1.0)
@@ -258,16 +258,16 @@ def measured_again(
 
 _BETTER = 0.002
 """Share by which the mean squared distance of matches has to fall from round to round at the last gate. Where it does not,
-clouds creep along what they do not see: for many rounds where recordings overlap in corridors, and away from the truth
+clouds creep in unobserved directions: for many rounds where recordings overlap in corridors, and away from the truth
 (docs/performance.md)."""
 _GATE_PER_SHIFT = 3.0
-"""Gate of a round by the farthest that the one before moved a cloud in the frame of its partner: less than that is left."""
+"""Ratio of the gate of a round to the largest motion of a cloud in the frame of its partner in the round before."""
 
 
 def _surfaces_moved(factors: PairFactors, used: Bools, change: Floats) -> float:
     """Return how far changes (e, 3) of relative poses move matched points off their lines, root mean square, m.
 
-    Along what the scans do not see, poses may creep on from round to round; no match changes by that.
+    In directions that the scans do not measure, poses may creep from round to round; that does not change the matches.
     """
     change, hessian = np.column_stack([change[used, :2], se2.wrap_angle(change[used, 2])]), factors.hessian[used]
     squared = np.einsum("ei,eij,ej->", change, hessian, change, optimize=True)
@@ -275,7 +275,7 @@ def _surfaces_moved(factors: PairFactors, used: Bools, change: Floats) -> float:
 
 
 def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:
-    """Return the graph with at most so many scan edges between clouds of different times, each for several like it.
+    """Return the graph with at most so many scan edges between clouds of different times, each for several similar ones.
 
     The uncertainty of thousands of poses tied together everywhere would need a factor of hundreds of millions of
     entries. Every m-th pair, weighing as m, and a chain of single steps carry as much information, a little less at every
@@ -291,7 +291,7 @@ def _every_nth(edges: ScanEdges, most: int) -> ScanEdges:
     if each <= 1:
         return edges
     weights = edges.own_weights.copy()
-    # A chain of single steps fills nothing up.
+    # A chain of single steps causes no fill.
     steps, kept = near[gap[near] == 1], far[each // 2 :: each]
     weights[steps] *= len(near) / max(len(steps), 1)
     weights[kept] *= len(far) / max(len(kept), 1)

@@ -16,7 +16,7 @@ from ..sensor_log import LaserScans, SensorLog
 PAIRS = 1000
 """Scan pairs matched at most."""
 LEAST_PAIRS = 20
-"""Fewer pairs show nothing."""
+"""Fewer pairs give no result."""
 _LAGS = np.arange(-1.0, 1.001, 0.02)
 """Clock offsets tried, s."""
 
@@ -34,7 +34,7 @@ class Turning:
     other: float
     """The same with the laser turned upside down."""
     misfit: float
-    """The same the way that is right."""
+    """The same with the better of both mountings."""
     delay: float
     """To be added to the laser's stamps, s: where both agree best; the sign is that of the calibration's ``laser_delay``."""
     delay_clear: bool
@@ -115,11 +115,11 @@ def _differences(
 
 
 _LEAST_CLEAR = LEAST_PAIRS // 2
-"""Fewer of the clearer half show nothing: where a laser sees a post or two, single pairs fit upright and upside down."""
+"""Fewer in the clearer half give no result: where a laser sees only a post or two, single pairs fit upright and upside down."""
 _NOISE = 0.02
 """Mean difference of ranges that means nothing, m."""
 _LEAST_SEEN = 0.05
-"""Share of beams that must see something."""
+"""Least share of beams with a reading."""
 _WIDEST = 3.0
 """Factor by which the wheels' turns may be wrong."""
 
@@ -180,7 +180,7 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     rows = np.arange(len(first))
     left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]
     fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, 1e-9)
-    # Scans that see nothing fit every turn equally well, to the bit, and a lone wall fits best where it leaves the view.
+    # Scans without readings fit every turn exactly equally well, and a single wall fits best where it leaves the view.
     clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
     seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
     clear *= seen[one] & seen[other]
@@ -192,7 +192,7 @@ def _seen_from(profile: Floats, angles: Floats, shift: Floats, reach: float) -> 
     x = profile * np.cos(angles) - shift[:, :1]
     y = profile * np.sin(angles) - shift[:, 1:]
     moved = np.arctan2(y, x)
-    # The same turn of the circle as before; what is hidden now keeps the order of the beams.
+    # The same turn of the circle as before; points that are hidden now keep the order of the beams.
     moved = angles + se2.wrap_angle(moved - angles)
     order = np.sign(angles[-1] - angles[0])
     moved = order * np.maximum.accumulate(order * moved, axis=1)

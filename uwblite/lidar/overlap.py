@@ -1,7 +1,7 @@
-"""How much surface two clouds show in common, in the direction in which they show least.
+"""Surface that two clouds have in common, in the direction in which it is least.
 
-In corridors walls match wherever one is laid along the other: of two equal places most points match, but not the few
-surfaces that face along the corridor. So only the direction counts in which least speaks for a place: with the normals n of
+In corridors the walls match at any shift along them: of two similar places most points match, but not the few
+surfaces that face along the corridor. So only the direction with the least matching surface counts: with the normals n of
 points and weights w, a direction u has the sum u^T (sum w n n^T) u, and eigenvalues give the least of all directions.
 """
 
@@ -17,12 +17,12 @@ from .free_space import FreeSpace, seen_beyond
 from .scan_matching import Correspondences, correspondences, pair_points
 
 _NOISE = 0.005
-"""Share of the points added in every direction: where fewer face, as along a bare wall, the noise of normals does."""
+"""Share of the points added in every direction: fewer points that face it, as along a bare wall, are noise of normals."""
 _AGAINST = 2.0
-"""Matches that one miss in view outweighs, by the ratio of likelihoods: in the true place five of six points match, in a wrong
-one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
+"""Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true place five
+of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
 _MARGIN = 0.3
-"""How far behind the farthest seen free space a point counts as in view, m."""
+"""Distance behind the observed free space up to which a point counts as in view, m."""
 
 
 def directional_overlap(
@@ -50,15 +50,15 @@ def net_overlap(
     clouds: Clouds, raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, limit: int,
     gate: float, spacing: float,
 ) -> Floats:
-    """Return the net surface (e,), m, that speaks for clouds i and j (e,) lying at poses (e, 3), counted both ways.
+    """Return the net matching surface (e,), m, of clouds i and j (e,) at relative poses (e, 3), counted both ways.
 
-    Two stretches of a recording that meet share only a part of their surfaces: what share of all points matches says how long
-    they run together, not whether the place is right. Points that the other cloud cannot have seen say nothing; each that
-    matches speaks for the place, each in view without a match against it.
+    Two stretches of a recording that overlap share only a part of their surfaces: the share of all points that match shows how
+    long they overlap, not whether the place is right. Points that the other cloud cannot have seen do not count; each point
+    with a match counts for the place, each in view without a match counts against it.
 
     Parameters
     ----------
-    free : what each cloud saw to be free; None = not asked, all points count as in view.
+    free : observed free space of each cloud; None = all points count as in view.
     limit : most points looked up per cloud. gate : farthest match, m.
     spacing : distance between neighbouring points of a cloud, m.
     """
@@ -67,7 +67,7 @@ def net_overlap(
         missed = (found.row >= 0) & ~found.good
         if free is not None:
             missed &= _in_view(clouds, free, i, T_i_j, found)
-        # Points left out count by those looked up.
+        # The points looked up stand for those left out.
         asked = np.maximum((found.row >= 0).sum(axis=1), 1)
         return np.asarray((found.good - _AGAINST * missed) * (clouds.counts[j] / asked)[:, None])
 

@@ -18,7 +18,7 @@ _CONVERGED = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
-    """Where pairs came to lie."""
+    """Final relative poses of pairs."""
 
     pose: Floats
     """(e, 3) T_i_j."""
@@ -42,7 +42,7 @@ def align_pairs(
 ) -> Aligned:
     """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
 
-    A pair that no longer moves at the last gate is left alone.
+    A pair that no longer moves at the last gate is finished.
 
     Parameters
     ----------

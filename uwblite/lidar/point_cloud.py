@@ -17,7 +17,7 @@ def make_tree(points: Floats) -> cKDTree:
 
 
 def statistical_outlier_filter(points: Floats, neighbours: int, std_ratio: float) -> Bools:
-    """Return which points (n, 2), m, are not unusually far from their nearest neighbours; a smaller cloud uses all it has.
+    """Return which points (n, 2), m, are not unusually far from their nearest neighbours; a small cloud uses all its points.
 
     A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
     that distance over the whole cloud.
@@ -55,7 +55,7 @@ class Lines:
 
 
 _ROUNDING = 1e-12
-"""Share of the scatter of a neighbourhood that differences of sums leave, though there is none."""
+"""Share of the scatter of a neighbourhood below which it is rounding error of differences of sums."""
 
 
 def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbours: int = 2) -> Lines:
@@ -79,7 +79,7 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
     count = both + 1.0
     mx = (np.bincount(i, dx, n) - np.bincount(j, dx, n)) / count
     my = (np.bincount(i, dy, n) - np.bincount(j, dy, n)) / count
-    # Squares take the place of their roots: less memory to go through the cache.
+    # Squares overwrite the values: less memory traffic.
     xy = dx * dy
     dx *= dx
     dy *= dy
@@ -88,7 +88,7 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
     c = (np.bincount(i, dy, n) + np.bincount(j, dy, n)) / count - my * my
     trace, gap = a + c, np.hypot(a - c, 2.0 * b)
     large, small = 0.5 * (trace + gap), 0.5 * (trace - gap)
-    # Of points on one line rounding alone remains, which depends on the order of the pairs.
+    # For points on one line only rounding error remains, which depends on the order of the pairs.
     small = np.where(small > _ROUNDING * trace, small, 0.0)
     valid = (both >= min_neighbours) & (large > 0.0)
     ratio = np.divide(small, large, out=np.ones(n), where=valid)

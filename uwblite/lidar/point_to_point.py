@@ -1,4 +1,4 @@
-"""Iterative closest point as the paper uses it: nearest neighbours within a fixed distance, motion in closed form."""
+"""Iterative closest point as in the paper: nearest neighbours within a fixed distance, motion in closed form."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,7 +33,7 @@ class IcpConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Where the source lies in the target, and its covariance."""
+    """Pose of the source in the target, and its covariance."""
 
     T_target_source: Floats
     """(3,) m, m, rad; the last iterate where not converged."""

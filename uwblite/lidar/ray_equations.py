@@ -1,7 +1,7 @@
-"""What rays on surfaces say of poses and surfaces: their equations, summed over the rays of one keyframe on one surface.
+"""Equations of rays on surfaces for poses and surfaces, summed over the rays of one keyframe on one surface.
 
 All rays of a keyframe on a wall share its normal, and their equations are combinations of four figures of a ray: 1, the place
-along the wall where it should end, the cosine of incidence, and the residual. So ten weighted sums of products stand for any
+along the wall where it should end, the cosine of incidence, and the residual. So ten weighted sums of products replace any
 number of rays, exactly (as the point clusters of BALM: Z. Liu, X. Liu, F. Zhang, IEEE Transactions on Robotics 2023).
 """
 
@@ -17,9 +17,9 @@ from .round_columns import to_circle
 from .surface_rays import ROUGHNESS, MeasuredSurfaces, SurfaceRays, Surfaces, in_map
 
 _LEAST = 0.05
-"""Least cosine of incidence that is reckoned with."""
+"""Least cosine of incidence; smaller ones are replaced by it."""
 _PIECE, _SECTOR = 1.0, np.pi / 4.0
-"""Length of a place on a wall, m, and angle of one on a column, rad, within which residuals may be alike."""
+"""Length of a place on a wall, m, and angle of one on a column, rad, within which residuals may be correlated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +66,7 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySums:
-    """Normal equations of rays: of keyframes (k), surfaces (s), and keyframes and surfaces that see each other (g)."""
+    """Normal equations of rays: of keyframes (k), of surfaces (s), and of pairs of a keyframe and a surface with rays (g)."""
 
     poses: Floats
     """(k, 3, 3)."""
@@ -128,7 +128,7 @@ def _groups(rays: SurfaceRays) -> Ints:
 
 
 def _reach(rays: SurfaceRays) -> Floats:
-    """Return how far from their keyframes rays (m,) end, m."""
+    """Return the distances from their keyframes at which rays (m,) end, m."""
     x, y = rays.points.T
     return np.asarray(np.sqrt(x * x + y * y))
 
@@ -160,7 +160,7 @@ class _AtWalls:
     sideways: Floats
     """(m,) of the ray's direction, along the wall."""
     incidence: Floats
-    """(m,) cosine, of which little is taken for more."""
+    """(m,) cosine of incidence, with a lower bound."""
     residual: Floats
     """(m,) m."""
     information: Floats
@@ -214,8 +214,8 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
 
 
 def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
-    """Return the rms residual (s,) of the rays of each surface, by the noise that was learnt; 1 where the surface has the
-    form it is taken for."""
+    """Return the rms residual (s,) of the rays of each surface, relative to the learnt noise; 1 where the surface has the
+    assumed shape."""
     many = len(found.surfaces.facing)
     count, squares = np.zeros(many), np.zeros(many)
     for rays in found.rays.in_parts(found.surfaces):
@@ -226,7 +226,7 @@ def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
 
 
 _CLIP = 5.0
-"""Standard deviations of a residual beyond which it counts no more."""
+"""Standard deviations of a residual beyond which it does not count."""
 
 
 def _shown(

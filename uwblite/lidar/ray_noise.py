@@ -1,9 +1,9 @@
-"""Noise of single rays: by data sheets, and as their residuals on known surfaces show it.
+"""Noise of single rays: from data sheets, and learnt from their residuals on known surfaces.
 
-Residuals show two things. How large the noise is, by distance: that of most scanners grows less than a data sheet allows. And
-how far residuals of one place are alike, since walls are not straight, columns not round, and neighbouring rays err alike:
-the variance of the sum of n residuals is then n times a factor, the design effect (L. Kish, Survey sampling, 1965), and n rays
-measure as much as n by that factor.
+Residuals show two things. The first is the size of the noise by distance: that of most scanners grows less than a data sheet
+allows. The second is the correlation of residuals in one place, since walls are not straight, columns not round, and errors of
+neighbouring rays are correlated: the variance of the sum of n residuals is then n times a factor, the design effect (L. Kish,
+Survey sampling, 1965), and n rays have the information of n divided by that factor.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ _NEAR, _SHARE = 0.01, 0.01
 _CLASSES = np.array([1.5, 3.0, 6.0, 12.0, 24.0])
 """Bounds of the classes of distance whose noise is learnt apart, m."""
 _FEWEST = 200
-"""Rays that show the noise of a class."""
+"""Least number of rays from which the noise of a class is learnt."""
 _LEAST = 0.1
 """Least noise, as a share of that by data sheets."""
 _CLIP = 3.0
-"""Standard deviations at which residuals are clipped: outliers say nothing of rays that count."""
+"""Standard deviations at which residuals are clipped: outliers give no information about the noise of inliers."""
 _MANY = 5
-"""Places from which on a surface shows how far its residuals are alike."""
+"""Least number of places of a surface from which the correlation of its residuals is learnt."""
 _FITTED = np.array([2, 3])
-"""Unknowns of a wall's line and a column's circle, which take their part of the sums of residuals away."""
+"""Unknowns of a wall's line and a column's circle; fitting these reduces the sums of residuals."""
 ALIKE = 4.0
 """Design effect until one is learnt (as of matches of clouds: RefinementConfig.correlation)."""
 
@@ -37,15 +37,15 @@ def range_sigma(reach: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayNoise:
-    """What residuals of rays show of their noise."""
+    """Noise of rays as learnt from their residuals."""
 
     by_distance: Floats
-    """(c,) noise by that of data sheets, by class of distance."""
+    """(c,) ratio of the noise to that of data sheets, by class of distance."""
     alike: Floats
     """(2,) design effect of rays on walls and on columns, 1 or more."""
 
     def relative(self, reach: Floats) -> Floats:
-        """Return the noise (m,) of rays by that of data sheets."""
+        """Return the ratio (m,) of the noise of rays to that of data sheets."""
         return np.asarray(self.by_distance[_class(reach)])
 
 
@@ -75,7 +75,7 @@ def _class(reach: Floats) -> Ints:
 
 
 def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> Floats:
-    """Return the squared sums of residuals over places, by the sums of squares (2,), of walls and of columns."""
+    """Return the ratios (2,) of the squared sums of residuals over places to their sums of squares, of walls and of columns."""
     first = int(place.min(initial=0))
     many = int(place.max(initial=0)) - first + 1
     number = surface.astype(np.int64) * many + (place - first)

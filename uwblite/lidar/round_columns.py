@@ -1,4 +1,4 @@
-"""Round columns among the rays of many scans: circles fitted to what single scans see of them."""
+"""Round columns among the rays of many scans: circles fitted to the rays of single scans on them."""
 
 from dataclasses import dataclass
 
@@ -13,19 +13,19 @@ from .ray_noise import range_sigma
 _JUMP, _JUMP_SHARE = 0.2, 0.02
 """Difference of neighbouring ranges that ends a run of rays, m, and share of the range on top."""
 _MISSING = 3
-"""Rays that may be lost within a run."""
+"""Rays that may be missing within a run."""
 _FEWEST = 10
-"""Rays that show a curvature."""
+"""Least number of rays that show a curvature."""
 _RADII = 0.04, 0.8
 """Radii of columns, m."""
 _CURVED = 40.0
 """Least chi2 by which a circle fits a run better than a line."""
 _SCATTER = 1.4
-"""Largest rms distance from the circle by that of the noise."""
+"""Largest rms distance from the circle, relative to the noise."""
 _APART, _UNLIKE = 0.12, 0.3
 """Distance of the centres, m, and relative difference of the radii up to which two circles are one column."""
 _VIEWS = 3
-"""Keyframes that must have seen a column."""
+"""Least number of keyframes that see a column."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Circles(Table):
     radius: Floats
     """(c,) m."""
     rays: Floats
-    """(c,) how many show it."""
+    """(c,) number of rays that show it."""
 
 
 def fitted_circles(rays: ScanPoints) -> Circles:
@@ -86,7 +86,7 @@ def _short_runs(rays: ScanPoints) -> tuple[ScanPoints, Ints, Floats]:
 
 
 _WIDEST = 2.5
-"""Distance between the ends of a run by the radius of a column, beyond which noise does not make the one of the other."""
+"""Largest distance between the ends of a run, relative to the largest radius of a column: 2 without noise."""
 
 
 def _solved(a: Floats, b: Floats, c: Floats, right_x: Floats, right_y: Floats) -> Floats:
@@ -134,7 +134,7 @@ def to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Columns and the squares of the map near them: few points of a map lie there, and only these are looked at."""
+    """Columns and the squares of the map near them: few points of a map lie there, and only these are tested."""
 
     columns: Floats
     """(c, 3) x, y, radius."""
@@ -159,7 +159,7 @@ class Surroundings:
 
 
 _SQUARE, _MOST_SQUARES = 0.2, 1e6
-"""Size of a square, m, and as many of them as are taken before they get larger."""
+"""Size of a square, m, and the largest number of squares; a larger map gets larger squares."""
 
 
 def surroundings(columns: Floats, margin: float) -> Surroundings:
@@ -178,15 +178,15 @@ def surroundings(columns: Floats, margin: float) -> Surroundings:
 _WIDE, _WIDE_ROUNDS, _ROUNDS = 0.15, 3, 8
 """Gate of the first steps towards a circle, m; their number, and that of all."""
 _GATE, _SLACK = 4.0, 0.02
-"""Gate of the others, standard deviations of the rays and m."""
+"""Gate of the other steps, standard deviations of the rays and m."""
 _FACING = -0.4
-"""Cosine of incidence beyond which a ray at a column hits its edge, which returns anything."""
+"""Cosine between a ray and the outward normal; closer to 0 it hits the edge of a column, where readings are unreliable."""
 _AROUND, _OWN = 0.3, 0.6
 """Distance from the circle up to which rays are a column's surroundings, m; share of these that must lie on it."""
 _PROBABLE = 1.22
-"""Standard deviations within which at least half of the rays of a column end: 0.67 if it is a perfect circle."""
+"""Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
 _FEW = 20
-"""Rays that a column needs."""
+"""Least number of rays of a column."""
 
 
 def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Floats) -> Floats:

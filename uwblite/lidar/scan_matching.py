@@ -1,7 +1,7 @@
 """Point-to-line matching of many pairs of clouds at once.
 
 Nearest neighbours come from one raster per cloud. A pair's matches are condensed into the quadratic form of its relative
-pose (3 x 3), which is all that the graph needs to know of them.
+pose (3 x 3), which is all that the graph needs.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from .clouds import Clouds
 from .degeneracy import MEASURED, relative_eigen
 
 _AT_ONCE = 16384
-"""Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
+"""Points looked up at once, so that they fit into the processor's cache; it also bounds the memory."""
 _PAIRS_AT_ONCE = 4096
 """Pairs whose points are listed at once; a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
@@ -35,9 +35,9 @@ class PairFactors(Table):
     gradient: Floats
     """(e, 3) sum of w J^T r."""
     matched: Ints
-    """(e,) points with a match."""
+    """(e,) number of points with a match."""
     asked: Ints
-    """(e,) points that were looked up."""
+    """(e,) number of points looked up."""
     squared: Floats
     """(e,) sum of w r^2, m^2."""
     weight: Floats
@@ -99,14 +99,14 @@ def match(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
-    """Points (e, n) of the source clouds of some pairs, and what they meet in the target clouds."""
+    """Points (e, n) of the source clouds of some pairs, and their matches in the target clouds."""
 
     pairs: slice
     """Which of the pairs these are."""
     row: NDArray[np.int32]
     """Rows of the points in the clouds' arrays; -1 where there is none."""
     target: Ints
-    """Rows of their matches; any where there is none."""
+    """Rows of their matches; arbitrary where there is none."""
     good: Bools
     """Whether it is a match."""
     distance: Floats
@@ -160,7 +160,7 @@ def _condensed(clouds: Clouds, found: Correspondences, scale: float, root_weight
     weighted[:, 2] = wy * rx - wx * ry
     weighted[:, 3] = root * r
     summed = weighted @ weighted.transpose(0, 2, 1)
-    # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
+    # The tangent (-ny, nx) replaces the normal; the variance of the normal is a further weight.
     tangent = np.empty((len(row), 3, row.shape[1]))
     np.negative(wy, out=tangent[:, 0])
     tangent[:, 1] = wx
@@ -181,12 +181,12 @@ def _condensed(clouds: Clouds, found: Correspondences, scale: float, root_weight
 def shifts_by_range_error(
     clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float, turn: Floats
 ) -> Floats:
-    """Return by how much an error of all ranges to surfaces that face one way moves what pairs measure.
+    """Return the sensitivity of pairs to a common error of all ranges to surfaces that face one way.
 
     A range too long by c puts points c farther out along their rays. Seen from one place, that moves a wall by less where the
     ray is oblique; from the next place it is another part of the wall that is moved less, and the pair comes out shifted and
-    turned: r changes by n . (R ray_p - ray_q) for each match. The ray is taken from the origin of the base: where exactly the
-    laser stands changes both rays by the same.
+    turned: r changes by n . (R ray_p - ray_q) for each match. The ray is taken from the origin of the base: the exact place of
+    the laser changes both rays equally.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def shifts_by_range_error(
 
 
 _NEAREST = 0.05
-"""Least distance of a point whose ray has a direction, m."""
+"""Distance of a point below which the direction of its ray is not defined, m."""
 
 
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:

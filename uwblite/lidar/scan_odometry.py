@@ -1,4 +1,4 @@
-"""Motion from scan to scan, without wheels: what replaces them where they give no reading.
+"""Motion from scan to scan, without wheels: it replaces the odometry where that has no reading.
 
 Scans a moment apart are aligned point to line from a guess; where few points then match, a correlative search around it
 finds the place.
@@ -40,7 +40,7 @@ def scan_steps(
 ) -> tuple[Floats, Floats]:
     """Measure the motion of the base between pairs of scans.
 
-    What the scans do not show (the length of a bare corridor) keeps the guess.
+    Unobservable directions (along a bare corridor) keep the guess.
 
     Parameters
     ----------
@@ -102,17 +102,17 @@ _WELL_SEEN, _LEAST_IN_SIGHT = 0.9, 0.5
 
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
-    """Return what share (e,) of two scans matches at a motion (e, 3) in the direction in which fewest points do, 0..1.
+    """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1.
 
-    Along a corridor a scan matches the next one best where the robot stood, ray by ray: only the few surfaces that face
-    along it show the motion.
+    Along a corridor most rays of a scan match the next one best at zero motion: only the few surfaces that face
+    along the corridor show the motion.
     """
     built, raster, i, j, _ = _pairs(scans, mounting, first, second)
     return directional_overlap(built, raster, i, j, motion, _POINTS, _LAST_GATE)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
-    """Return what share (e,) of either of two scans stands in the free space of the other, for motions (e, 3), 0..1."""
+    """Return the share (e,) of either of two scans that stands in the free space of the other, for motions (e, 3), 0..1."""
     built, _, i, j, _ = _pairs(scans, mounting, first, second)
     nearest, pairs = nearest_by_bearing(built), zip(i.tolist(), j.tolist(), motion, strict=True)
     return np.array([pair_violations(built, nearest, a, b, step[None])[0] for a, b, step in pairs])
@@ -121,7 +121,7 @@ def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, seco
 def _pairs(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints
 ) -> tuple[Clouds, CloudRasters, Ints, Ints, PairPoints]:
-    """Return the clouds of pairs of scans, their rasters, which clouds each pair (e,) is of, and the points to be matched."""
+    """Return the clouds of pairs of scans, their rasters, the two clouds of each pair (e,), and the points to be matched."""
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)

@@ -1,8 +1,8 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
-Neighbouring clouds are aligned from the odometry's guess, all at once. A pair that then shares few points got a bad guess
-(slip, a fast turn between sparse scans, wheels that count backwards as forwards): it is searched for in the local sub-map
-of the keyframes before. Where that finds nothing, or two places alike, the step is left to the odometry.
+Neighbouring clouds are aligned from the odometry's guess, all at once. A pair that then shares few points had a bad guess
+(slip, a fast turn between sparse scans, wheels that count backwards as forwards): its pose is searched for in the local sub-map
+of the keyframes before. Where that finds nothing, or two equally good places, the step is left to the odometry.
 """
 
 from dataclasses import dataclass
@@ -53,20 +53,20 @@ class ScanOdometry:
     steps: RelativePoseEdges
     """Those that were measured."""
     wheels: OdometryEdges
-    """With the noise that the measured steps show."""
+    """With the noise learnt from the measured steps."""
     miss: float
-    """By how much the wheels typically misplace points of the next cloud, 3 sigma, m."""
+    """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
-    """Steps that were searched for."""
+    """Number of steps that were searched for."""
 
 
 _ELSEWHERE = 0.12
-"""m or rad; what a step of sound wheels is never wrong by."""
+"""m or rad; an error that a step of faultless odometry never has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """Steps between neighbouring keyframes as descent from a guess leaves them."""
+    """Steps between neighbouring keyframes after descent from a guess."""
 
     i: Ints
     """(e,) keyframes at which they begin, increasing."""
@@ -75,12 +75,12 @@ class Steps:
     pose: Floats
     """(e, 3) where descent ended."""
     share: Floats
-    """(e,) of the points looked up that match there."""
+    """(e,) share of the points looked up that match there."""
     enough: Bools
-    """(e,) whether the clouds have points enough to measure anything."""
+    """(e,) whether the clouds have enough points to measure a step."""
 
     def contradicted(self, config: TrackingConfig) -> Ints:
-        """Return the keyframes (s,) whose step the clouds contradict: they share little there, or fit elsewhere."""
+        """Return the keyframes (s,) whose step the clouds contradict: few points match, or they fit at another pose."""
         off = se2.between(self.guess, self.pose)
         elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
         return self.i[self.enough & ((self.share < config.good_share) | elsewhere)]
@@ -117,7 +117,7 @@ def follow(
     ----------
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes. graph : holds their calibration.
-    steps : the same steps as descent leaves them, see descend. gate : reach of the raster, m.
+    steps : the same steps after descent, see descend. gate : reach of the raster, m.
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
@@ -133,10 +133,10 @@ def follow(
 def reattached(
     clouds: Clouds, raster: CloudRasters, poses: Floats, stamps: Floats, tied: Bools, gate: float, config: TrackingConfig
 ) -> tuple[Floats, Ints]:
-    """Lay keyframes that match none of their neighbours between these, where their clouds fit there.
+    """Place keyframes that match none of their neighbours between these, where their clouds fit there.
 
-    A step may be wrong and yet look right to its two clouds; the next keyframe then fits the one before it, and one that
-    stands alone is astray.
+    A step may be wrong although its two clouds match; the keyframe after it then fits the one before it, and a single
+    keyframe that matches neither is misplaced.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def reattached(
 
 
 _LONGEST_RUN = 3
-"""Keyframes in a row that are laid between sound ones."""
+"""Most consecutive keyframes that are placed between well matched ones."""
 
 
 def _lines_of(clouds: Clouds) -> Ints:
@@ -175,8 +175,8 @@ def _lines_of(clouds: Clouds) -> Ints:
 def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools, int]:
     """Search for doubtful steps (e,), each against the sub-map of those before it.
 
-    Noise of decimetres, leaves or few beams leave few matches in every step. Where as many match as measure a step, and no
-    surface stands in free space, there is nothing to search for.
+    With noise of decimetres, foliage or few beams, every step has few matches. Where these are enough to measure the step, and
+    no surface stands in free space, no search is needed.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
     searching = StepSearch(clouds, config.distance, config.angle)
     chain = np.zeros((len(clouds), 3))
     chain[i] = pose
-    # Sub-maps begin behind the last step that nothing measured.
+    # Sub-maps begin after the last step that was not measured.
     blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
     first = 0
     for row in np.flatnonzero(doubtful).tolist():
@@ -197,7 +197,7 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
             continue
         searched += 1
         found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
-        # Where no search is clear, descent near to the odometry's guess still measures what the surfaces fix.
+        # Where no search is clear, descent near the odometry's guess still measures the directions that the surfaces determine.
         lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
         if found.clear:
             chain[k] = pose[row] = found.pose
@@ -207,13 +207,13 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
 
 
 _LEAST_SHARE = 0.4
-"""Share of points that match from which descent from the odometry's guess measures a step."""
+"""Share of matching points from which on descent from the odometry's guess measures a step."""
 _MOST_THROUGH = 0.04
-"""Share of points in free space up to which it does; one point in twenty-five may be a foot or a leaf."""
+"""Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
-    """Return by how much the wheels may misplace points of the next cloud (e,), 3 sigma, m."""
+    """Return the error (e,) that the odometry may cause in points of the next cloud, 3 sigma, m."""
     sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
     reach = np.hypot(clouds.points[:, 0], clouds.points[:, 1])
     arm = float(np.quantile(reach, 0.75)) if len(reach) else 0.0

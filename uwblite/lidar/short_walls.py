@@ -1,8 +1,8 @@
 """Short walls: door jambs, piers and the fronts of cupboards, which clouds are too coarse to show as lines.
 
-A point of a cloud is the mean of ten rays, and lines through few of them say little. So the rays that end on no stretch of
+A point of a cloud is the mean of ten rays, and lines through few points are inaccurate. So the rays that end on no stretch of
 their own cloud (lidar/stretches.py) are cut scan by scan where neighbours are apart, and where two lines explain them better
-than one, until each piece is as straight as the noise of its rays lets it look. Pieces that several keyframes show in one
+than one, until each piece is straight within the noise of its rays. Pieces that several keyframes show in one
 place, facing the same way, are one wall.
 """
 
@@ -20,12 +20,12 @@ from .surface_rays import ROUGHNESS, SurfaceRays, as_rays
 from .walls import Walls
 
 _GAP, _SIGMAS, _MISSED = 0.35, 5.0, 2
-"""Neighbouring rays are apart where they end so far, m, from each other, or where their lengths differ by so many standard
-deviations, or where more rays than that between them returned nothing."""
+"""Neighbouring rays are apart where their ends have this distance, m, or where their lengths differ by so many standard
+deviations, or where more rays than this between them have no reading."""
 _FEWEST = 6
-"""Rays of a piece."""
+"""Least number of rays of a piece."""
 _HALF = 3
-"""Rays on either side of a place where two lines meet."""
+"""Least number of rays on either side of a place where two lines meet."""
 _SPLITS = 7
 """Most rounds in which bent pieces are split."""
 _EXCESS = 1.35
@@ -35,10 +35,10 @@ _LEAST_NOISE = 0.1
 _INCIDENCE, _SHORTEST, _VAGUE = 0.3, 0.1, 0.2
 """Least cosine of incidence and length, m, of a piece, and largest standard deviation of its direction, rad."""
 _REACH, _OFF, _LEAN, _MOST_LEAN = 0.2, 0.05, np.deg2rad(6.0), np.deg2rad(25.0)
-"""Pieces are of one wall where their centres are so near, m, each on the other's line within some cm, and where they lean
-no further than that and two standard deviations."""
+"""Pieces are of one wall where their centres are nearer than this, m, each within this distance of the other's line, m, and
+where their directions differ by less than this, rad, plus two standard deviations, and never by more than this, rad."""
 _KEYFRAMES, _SCATTER = 4, 0.03
-"""Keyframes that must show a wall, and how far its pieces may scatter across it, rms, m."""
+"""Least number of keyframes that show a wall, and largest scatter of its pieces across it, rms, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ def pieces_of(rays: ScanPoints, free: Bools) -> tuple[Pieces, SurfaceRays]:
     good = (incidence > _INCIDENCE) & (deviation < _VAGUE) & (length > _SHORTEST)
     first, last = first[good], last[good]
     found = Pieces(rays.keyframe[rows[first]], centre[good], normal[good], deviation[good])
-    # The outermost rays may be of two surfaces.
+    # The outermost rays may hit two surfaces.
     inner = last - first - 2
     piece = np.repeat(np.arange(len(first)), inner)
     on = rows[np.arange(len(piece)) + (first + 1 - np.cumsum(inner) + inner)[piece]]

@@ -1,10 +1,10 @@
-"""Steps that descent from the odometry's guess leaves in doubt, searched for in the local sub-map of the keyframes before.
+"""Search in the local sub-map of the keyframes before, for steps that descent from the odometry's guess leaves uncertain.
 
-The neighbouring cloud alone shows too little after a fast turn or a gap; the last few together show what was in view
-before. Every pose that the window allows is scored (see raster_search), matching descends from the best few and from the
-guesses, and free space decides between them: of two scans in their true places hardly any surface of the one stands where
-the other saw free space. A step for which two distinct places score alike is ambiguous and counts as not found. Places along
-a bare wall are one place: the match leaves that direction free, and fixes the others.
+After a fast turn or a gap, the neighbouring cloud alone overlaps too little; the last few clouds together show the previous
+view. Every pose in the window is scored (see raster_search), matching descends from the best few and from the
+guesses, and free space decides between them: for two scans at their true poses hardly any surface of the one stands in the
+free space of the other. A step with two distinct places of similar score is ambiguous and counts as not found. Places along
+a bare wall count as one place: the match leaves that direction free, and fixes the others.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ _SPAN = 10.0
 _FARTHEST = 1.2
 """Largest half-width of the search, m."""
 _TURNING = 0.5
-"""Share of the turn by the odometry by which the search is wider in heading."""
+"""Share of the odometry's turn that is added to the half-width of the search in heading."""
 _STARTS = 4
 """Places of the search from which matching descends."""
 _POINTS = 120
@@ -44,9 +44,9 @@ _MATCH_VARIANCE = 0.03**2 * 8.0
 _SAME = 3.0
 """Standard deviations up to which a match cannot separate two places."""
 _MARGIN = 0.08
-"""By how much the score of a place must exceed that of every distinct one."""
+"""Least difference between the scores of the best place and of every distinct one."""
 _CONTRADICTED = 0.12
-"""Share in free space that a true place does not have."""
+"""Share in free space that is too large for a true place."""
 _LEAST = 0.45
 """Least score of a step: share of points that match, less the share that stands in free space."""
 
@@ -107,7 +107,7 @@ class StepSearch:
         score = tried.share - through
         best = int(np.argmax(score))
         measurably = _measurably(best, tried)
-        # Along a bare wall the odometry alone says how far.
+        # Along a bare wall only the odometry measures the distance.
         alike = np.flatnonzero(~measurably & (score >= score[best] - _MARGIN))
         best = int(alike[np.argmin(np.hypot(*(tried.pose[alike] - motion)[:, :2].T))])
         distinct = _apart(tried.pose[best], tried.pose) & measurably
@@ -133,7 +133,7 @@ def _measurably(best: int, tried: Aligned) -> Bools:
     z, sqrt_information = measured(tried.factors.rows(one), tried.pose[one], np.full(1, _MATCH_VARIANCE))
     off = se2.between(z[0], tried.pose) @ sqrt_information[0].T
     differs = np.sqrt(np.sum(off**2, axis=1)) > _SAME
-    differs[best] = False  # though an alignment that has not converged would still go far from where it stands
+    differs[best] = False  # though an alignment that has not converged may be a large step from its minimum
     return np.asarray(differs)
 
 

@@ -12,19 +12,19 @@ _GAP = 0.35
 _STEP = 0.04
 """Distance of a point from its neighbour's line that ends a stretch, m."""
 _TURN, _SIGMAS, _MOST_TURN = np.deg2rad(12.0), 3.0, np.deg2rad(45.0)
-"""Angle between near normals that ends a stretch, rad, on top of so many standard deviations of theirs, and any that does."""
+"""Angle between near normals that ends a stretch, rad, plus so many of their standard deviations; and one that always does."""
 _UNLIKE = 0.15
-"""Root mean square angle between normals on a stretch, away from its ends, and its own, rad, beyond their noise; points smeared
-over a step turn by more, there and back, and those of columns."""
+"""Largest root mean square angle between the normals on a stretch, away from its ends, and its own normal, rad, beyond their
+noise; it is larger on columns and on points smeared over a step."""
 _SPLITS = 8
 """Most rounds in which bent stretches are split where they bend most."""
 _SHORTEST, _FEWEST = 0.35, 5
-"""Length, m, and points of a stretch that shows a direction."""
+"""Least length, m, and number of points of a stretch that shows a direction."""
 _STRAIGHT = 0.02
-"""Root mean square distance of the points of a stretch from its line, m: the noise of what is seen from afar. Walls that bend
-are told by many stretches."""
+"""Largest root mean square distance of the points of a stretch from its line, m: the noise of distant surfaces. Bent walls
+are detected from many stretches."""
 TRIM = 0.1
-"""Ends of a stretch that do not count, m: lines through corners lean."""
+"""Length at each end of a stretch that does not count, m: lines through corners are tilted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ def _split(begins: Bools, points: Floats) -> None:
         if not len(corners):
             break
         begins[rows[corners]] = begins[rows[corners] + 1] = True
-        # What was straight, or could not be split, stays so.
+        # A stretch that was straight, or could not be split, is not tested again.
         rows = rows[np.isin(number, number[corners])]
 
 

@@ -30,13 +30,13 @@ class SubmapConfig:
     voxel: float = setting(0.08, advanced=True)
     """Cell over which points are averaged, m."""
     neighbours: ClassVar[int] = 8
-    """Statistical filter: nearest neighbours looked at."""
+    """Statistical filter: number of nearest neighbours."""
     std_ratio: float = setting(3.0, advanced=True)
-    """Statistical filter: a point whose neighbours lie farther than the mean by so many standard deviations goes."""
+    """Statistical filter: a point is removed whose neighbours lie farther than the mean by so many standard deviations."""
     radius: ClassVar[float] = 0.25
     """Radius filter: m."""
     min_neighbours: int = setting(2, advanced=True)
-    """Radius filter: a point with fewer neighbours within the radius goes."""
+    """Radius filter: a point with fewer neighbours within the radius is removed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class Submaps:
         return len(self.first)
 
     def bent(self, before: Floats, after: Floats) -> float:
-        """Return how far keyframes are, in the frames of their sub-maps, from where they were, rms, m; by all poses (k, 3)."""
+        """Return how far keyframes have moved in the frames of their sub-maps, rms, m; from all present poses (k, 3)."""
         of = np.repeat(self.reference, self.last - self.first)
         one, other = (se2.between(poses[of], poses[self.first[0] : self.last[-1]]) for poses in (before, after))
         return rms_length((one - other)[:, :2])
@@ -136,7 +136,7 @@ def _merge(
     owner: Ints, points: Floats, normals: Floats, scatter: NDArray[np.floating], size: float
 ) -> tuple[Ints, Floats, Floats, Floats]:
     """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
-    # Four facings, not two: noise must not turn a normal from one side's facing into the other's, whatever way the wall runs.
+    # Four facings, not two: for no direction of the wall may noise turn a normal from one side's facing into the other's.
     facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
     key = cell_number(owner, points, size) * 4 + facing
     one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))

@@ -1,11 +1,11 @@
-"""Errors of ranges that stay with surfaces, and what they do to poses.
+"""Range errors that are constant for each surface, and their effect on poses.
 
 A lidar's ranges have errors of one or two centimetres that depend on colour, material and temperature (Kneip et al.,
 Characterization of the compact Hokuyo URG-04LX, ICRA 2009) and do not change. A wall moved by that much does no harm; but the
-error lies along the ray, so that it bends the wall towards its oblique parts, and the bend travels with the robot. Along a
+error lies along the ray, so that it bends the wall towards its oblique parts, and the bend moves with the robot. Along a
 corridor whose two walls differ by 3 cm, each step of 0.25 m comes out turned by a quarter of a milliradian, always to the same
 side: no residual shows it, and no number of pairs averages it out. Where the robot sees the wall again from elsewhere, or
-knows its heading otherwise, scan edges contradict each other by it, and the error is estimated (graph/marginals.py).
+has another measurement of its heading, scan edges contradict each other by it, and the error is estimated (graph/marginals.py).
 """
 
 from dataclasses import replace
@@ -26,16 +26,16 @@ _DEVICE = 0.010
 _SURFACE = 0.014
 """Constant error of one surface for each of the sizes below, m: together 20 mm, of the 10 to 40 mm of Kneip et al."""
 _SIZES = (32.0, 8.0)
-"""Correlation length of errors of surfaces, m: a wall as long as a corridor, a piece of furniture. How far one colour
-reaches is not known: equal parts, of which the recording may show otherwise (graph/variance_components.py)."""
+"""Correlation length of errors of surfaces, m: a wall as long as a corridor, a piece of furniture. The extent of one colour is
+unknown: both have equal prior variances, which the recording may change (graph/variance_components.py)."""
 _MOST = 64
-"""Places of one size; more of them would cost more than all else, and larger ones state larger errors."""
+"""Most places of one size; more would dominate the computing time. Larger places give larger stated errors."""
 
 
 def with_range_errors(
     edges: ScanEdges, graph: Graph, clouds: Clouds, raster: CloudRasters, config: RefinementConfig
 ) -> ScanEdges:
-    """Return the edges with what errors of ranges to surfaces would do to them."""
+    """Return the edges with their sensitivity to errors of ranges to surfaces."""
     points, gate = pair_points(clouds, edges.j, config.points), config.last_gate
     turn = graph.poses[edges.i, 2]
     shifts = shifts_by_range_error(clouds, raster, edges.i, edges.relative(graph), points, gate, gate / 3.0, turn)
@@ -43,7 +43,7 @@ def with_range_errors(
 
 
 def common_range_errors(graph: Graph) -> list[CommonErrors]:
-    """Return the errors that scan edges have in common: of the device, and of surfaces by place and by the way they face."""
+    """Return the errors that scan edges have in common: of the device, and of surfaces by place and facing."""
     return [_common(e, graph) for e in graph.edges if isinstance(e, ScanEdges) and e.by_surface is not None]
 
 

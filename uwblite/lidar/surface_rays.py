@@ -1,10 +1,10 @@
-"""Single rays that end on known surfaces, straight walls and round columns, and what they say of poses and surfaces.
+"""Single rays that end on known surfaces, straight walls and round columns, as measurements of poses and surfaces.
 
     wall      residual n . (p - c r) - n . m          m a point of the wall, n its normal
     column    residual |p - c r - m| - radius         along the ray, times the cosine of incidence
 
-p is where the ray ended, r its direction, both in the map, and c the range offset of the surface: the error of a lidar that
-stays with colour and material. Derivatives are taken where the ray should have ended: noise along an oblique ray stands in
+p is the end of the ray, r its direction, both in the map, and c the range offset of the surface: the lidar error that depends
+on colour and material. Derivatives are taken where the ray should have ended: noise along an oblique ray is both in
 its residual and in its lever arm, and the product of both would turn every scan, along a wall always to the same side.
 """
 
@@ -30,9 +30,9 @@ _GATE = 4.0
 ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
 INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
-"""Least cosine of incidence on walls, and on columns, whose edges return anything."""
+"""Least cosine of incidence on walls, and on columns, whose edges give unreliable readings."""
 _SLACK = 0.03
-"""What a column's place and radius are off at first, m."""
+"""Initial error of a column's place and radius, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +97,7 @@ class SurfaceRays(Table):
     sigma: NDArray[np.floating]
     """(m,) m, along the ray, by data sheets."""
     bundle: NDArray[np.signedinteger]
-    """(m,) number of the few neighbouring rays of one scan that count as one where they end on one surface."""
+    """(m,) number of the group of neighbouring rays of one scan that count as one where they end on one surface."""
 
     def by_keyframe(self, surfaces: Surfaces) -> "SurfaceRays":
         """Return the rays in order: those on walls before those on columns, by keyframe, and by surface."""
@@ -105,7 +105,7 @@ class SurfaceRays(Table):
         return self.rows(np.argsort(key * len(surfaces.round) + self.surface, kind="stable"))
 
     def in_parts(self, surfaces: Surfaces) -> Iterator["SurfaceRays"]:
-        """Yield rays in this order some at a time, all on walls or all on columns: what is made of them stays in the cache."""
+        """Yield rays in this order some at a time, all on walls or all on columns, so that arrays stay in the cache."""
         walls, last = int(np.count_nonzero(~surfaces.round[self.surface])), len(self.keyframe)
         for first, end in ((0, walls), (walls, last)):
             for begin in range(first, end, _RAYS_AT_ONCE):
@@ -123,7 +123,7 @@ class SurfaceRays(Table):
         return SurfaceRays(keyframe, surface, points, directions, sigma, self.bundle)
 
     def bundled(self) -> "SurfaceRays":
-        """Return neighbouring rays of one scan on one surface as their mean, which weighs as they together do; the rays of a
+        """Return the mean of neighbouring rays of one scan on one surface, with the weight of all of them; the rays of a
         scan are in order."""
         first = np.flatnonzero(np.diff(np.stack([self.bundle, self.surface]), axis=1, prepend=-1).any(axis=0))
         if not len(first):
@@ -138,9 +138,9 @@ class SurfaceRays(Table):
 _BUNDLE = 4
 """Neighbouring rays that count as one."""
 _MOST_RAYS = 1 << 14
-"""Rays of a scan."""
+"""Most rays of a scan."""
 _RAYS_AT_ONCE, _POINTS_AT_ONCE = 1 << 14, 1 << 16
-"""Rays, and points of clouds, that are looked at together."""
+"""Rays, and points of clouds, that are processed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +152,7 @@ class MeasuredSurfaces:
     noise: RayNoise
 
     def shown(self) -> "MeasuredSurfaces":
-        """Return the surfaces that rays show."""
+        """Return only the surfaces that have rays."""
         used = np.unique(self.rays.surface)
         rays = replace(self.rays, surface=np.searchsorted(used, self.rays.surface).astype(np.int32))
         return replace(self, surfaces=self.surfaces.rows(used), rays=rays)
@@ -182,7 +182,7 @@ def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: S
 
 
 def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
-    """Return which rays (m,) end on these stretches (m,), where their noise is taken away along the ray."""
+    """Return which rays (m,) end on these stretches (m,), tested where ray and line intersect, without noise along the ray."""
     normal, off = found.normal[stretch], rays.points - found.centre[stretch]
     residual, incidence = dots(off, normal), -dots(rays.directions, normal)
     oblique = np.maximum(incidence, INCIDENCE)
@@ -214,14 +214,14 @@ def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> I
 
 
 def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:
-    """Return of what each of the clouds' points (p,) is: 0 a wall, 1 one of the columns (c, 3), -1 neither."""
+    """Return the kind of each of the clouds' points (p,): 0 on a wall, 1 on one of the columns (c, 3), -1 on neither."""
     kind = np.where(walls.of_stretch >= 0, 0, -1).astype(np.int8)[found.of_point]
     kind[_around(clouds, poses, columns)] = 1
     return kind
 
 
 def without_columns(kind: NDArray[np.int8], clouds: Clouds, poses: Floats, columns: Floats) -> NDArray[np.int8]:
-    """Return the kinds (p,) of the clouds' points, see points_on, where columns (c, 3) have turned out to be none."""
+    """Return the kinds (p,) of the clouds' points, see points_on, after columns (c, 3) were found to be false."""
     kind = kind.copy()
     kind[_around(clouds, poses, columns)] = -1
     return kind

@@ -1,7 +1,7 @@
 """Visibility between clouds: free space of one, and surfaces of others that stand in it.
 
-Of two clouds in the right place to each other, hardly any surface of the one stands in the other's free space;
-people, glass and doors leave a few per cent. Of clouds in a wrong place, half of the surfaces do.
+If the relative pose of two clouds is right, hardly any surface of the one stands in the other's free space;
+people, glass and doors cause a few per cent. If it is wrong, half of the surfaces do.
 """
 
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ _BEARINGS = 120
 _MARGIN = 0.3
 """How far inside the free space a point must stand to count, m."""
 _VIEWS = 8
-"""Keyframes of a sub-map whose free space is looked at."""
+"""Keyframes of a sub-map whose free space is used."""
 _REVISIT = 2.0
-"""Keyframes nearer than this are at one place, m."""
+"""Keyframes nearer to each other than this are at one place, m."""
 _APART = 10.0
 """Travelled distance between two visits, m."""
 _REVISITS = 400
-"""Revisits looked at, at most."""
+"""Most revisits that are compared."""
 _COMMON = 10
 """Points of the other that a visit must be able to see to be compared."""
 _NEIGHBOURS = 64
@@ -44,7 +44,7 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
-    """Return what each sub-map saw to be free, from some of its keyframes.
+    """Return the observed free space of each sub-map, from some of its keyframes.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
 
 
 def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
-    """Return sub-maps without what moved: points through which most of their own keyframes looked to which they were in view.
+    """Return sub-maps without dynamic points: those in the free space of most of their own keyframes with a view of them.
 
     People who walk beside the robot leave trails in a sub-map that no other sub-map shows.
     """
@@ -72,7 +72,7 @@ def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
 
 
 def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
-    """Return the larger share of either sub-map's points that would stand in what the other saw to be free, 0..1.
+    """Return the larger share of either sub-map's points that would stand in observed free space of the other, 0..1.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def pair_violations(clouds: Clouds, nearest: Floats, i: int, j: int, poses: Floa
 
 
 def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
-    """Return the share of a sub-map in the next one's free space where nothing but people, glass and drift can be the cause.
+    """Return the share of a sub-map in the next one's free space, which only people, glass and drift can cause.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
 
 
 def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
-    """Return how much of what was seen on one visit stands in what another visit to the same place saw to be free.
+    """Return the share of points of one visit that stand in the free space of another visit to the same place.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
     -------
     share : of the points that the other visit could see, 0..1.
     visits : different keyframes on the smaller side of the comparisons, earlier or later. One keyframe that is compared with
-        many has seen the person who stood there in all of them.
+        many contributes one person in its view to all comparisons.
     """
     i, j = _revisits(poses, path, recording)
     nearest = nearest_by_bearing(clouds)

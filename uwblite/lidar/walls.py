@@ -12,14 +12,14 @@ from .clouds import Clouds
 from .stretches import Stretches, extent, principal_axes
 
 _EVERY = 0.5
-"""Distance of the places at which stretches are compared, m."""
+"""Distance between the places at which stretches are compared, m."""
 _REACH, _OFF, _LEAN = 0.4, 0.06, np.cos(np.deg2rad(6.0))
-"""Two stretches are of one wall where places on them are within a reach, m, of each other, lie on each other's line within
-some cm, and face the same way: what maps err by after the joint refinement, and less than what stands off a wall."""
+"""Two stretches are of one wall where places on them are nearer than this, m, each within this distance of the other's line, m,
+and face the same way (cosine): more than maps err by after the joint refinement, less than objects stand off walls."""
 _BENT = 0.15
 """Farthest that places of one wall lie off its line, m; a wall farther off is bent: its halves may be walls."""
 _STRETCHES = 3
-"""Stretches that make a wall."""
+"""Least number of stretches of a wall."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
     for rows in _strips(at):
         a, b = _together(at[rows], normal[rows])
         of_place = stretch[rows]
-        # A tie of each place with its first neighbour joins as much as all of its ties do, of which there may be thousands.
+        # Linking each place with its first neighbour joins the same sets as all of its links, of which there may be thousands.
         own = connected(a, b, len(rows))
         first = np.unique(own, return_index=True)[1]
         one.append(of_place)
@@ -108,7 +108,7 @@ def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
 
 
 _PAIRS_AT_ONCE = 1 << 15
-"""Pairs looked at together: what fits into a processor's cache."""
+"""Pairs that are processed together, so that they fit into the processor's cache."""
 
 
 def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, left: Floats) -> Bools:
@@ -124,8 +124,8 @@ def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, le
 def _halved(number: Ints, stretch: Ints, at: Floats, owner: Ints) -> Ints:
     """Return the number (s,) of the set of each stretch, -1 = without places, with bent sets halved along their length.
 
-    Poses that err by some mrad over a long way bend a long wall, which looks straight from each of them. Its parts are
-    straight, and are found to be one once poses have been adjusted to them (joined_walls.py). What clouds see bent stays whole.
+    Heading errors of some mrad over a long distance bend a long wall in the map, which looks straight from each pose. Its parts
+    are straight, and are joined once poses have been adjusted to them (joined_walls.py). Walls bent in one cloud stay whole.
 
     Parameters
     ----------
@@ -160,14 +160,14 @@ def _bent(own: Ints, at: Floats) -> Bools:
 
 
 def _curved(own: Ints, at: Floats, owner: Ints) -> Bools:
-    """Return which sets of places (m, 2), numbered (m,), are off a line for most of the clouds (m,) that see them."""
+    """Return which sets of places (m, 2), numbered (m,), are not straight in most of the clouds (m,) that see them."""
     seen, number = unique_rows(np.stack([own, owner], axis=1))
     off = principal_axes(number, at, len(seen))[2] > _ROUND
     return np.asarray(np.bincount(seen[:, 0], np.where(off, 1.0, -1.0)) > 0.0)
 
 
 _ROUND = 0.02
-"""Root mean square distance from their line of places that one cloud sees on a curve, m."""
+"""Root mean square distance from their line from which on places in one cloud are on a curve, m."""
 
 
 def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
