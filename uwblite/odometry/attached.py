@@ -1,7 +1,7 @@
 """Ranges and rays attached to keyframes.
 
-They arrive between keyframes; the odometry since the keyframe becomes their lever arm, so they need no poses of their own
-and none is thrown away.
+They are measured between keyframes; the odometry since the keyframe becomes their lever arm, so they need no poses of their
+own, and none is discarded.
 """
 
 from dataclasses import dataclass
@@ -63,8 +63,8 @@ class ScanPoints(Table):
 def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframes, mounting: SensorMounting) -> AttachedRanges:
     """Tie each range to the keyframe at or before it; ranges outside the odometry's time keep the nearest end's pose.
 
-    The range of a further tag is as if the base stood so that the first tag is where that one is: what lies between them
-    goes into the lever arm.
+    The offset of a further tag from the first one is added to the lever arm, as if the base were shifted so that the first tag
+    is at the place of the further one.
     """
     keyframe = np.clip(np.searchsorted(keyframes.stamps, log_ranges.stamps, "right") - 1, 0, len(keyframes) - 1)
     base = odometry.at(log_ranges.stamps)

@@ -1,13 +1,13 @@
-"""Noise of wheels and errors that stay with the floor, as poses that a lidar determines show them; these as unknowns.
+"""Noise of wheels, and errors common to patches of floor as unknowns, learnt at poses that a lidar determines.
 
-Carpet, cross slopes and smooth patches make all steps on them wrong by the same: the errors of sums of steps grow faster than
-with the square root of the way. So the residuals of single steps show the noise of steps, and those of sums over ten (3 m) what
-stays. Poses that rays on surfaces determine err themselves, and follow the wheels as far as these are trusted: of an error with
-the variance w, assumed s, a measurement with the variance v leaves a residual with (s / (s + v))^2 (w + v).
+Carpet, cross slopes and smooth patches cause the same error in all steps on them: the errors of sums of steps grow faster than
+with the square root of the distance. So the residuals of single steps show the noise of steps, and those of sums over ten (3 m)
+the common errors. Poses that rays on surfaces determine have errors too, and follow the wheels by their weight: an error with
+variance w, assumed as s, and a measurement with variance v leave a residual with variance (s / (s + v))^2 (w + v).
 
-The same residuals show how far the stated covariances must be larger than single steps let them be (`with_noise_shown`).
+The same residuals show by how much the stated covariances must be larger than single steps suggest (`with_noise_shown`).
 
-A step sideways, in the frame in its middle, is slip: that of wheels that roll is far below what is assumed.
+A step sideways, in the frame in its middle, is slip: for rolling wheels it is far below the assumed noise.
 """
 
 from collections.abc import Iterator
@@ -26,26 +26,26 @@ from ..graph.unknowns import Unknowns
 PATCH = 10
 """Steps over which errors of the floor are correlated: 3 m."""
 _ENOUGH = 60
-"""Residuals, measured better than assumed, that show a noise."""
+"""Least number of residuals, measured better than the assumed noise, from which a noise is learnt."""
 _LEAST, _MOST = 0.25, 3.0
 """Smallest and largest noise relative to that assumed."""
 _STRADDLED = 1.5
-"""How much larger the variance of an error per patch is than sums show that begin anywhere and lie on two patches."""
+"""Ratio of the variance of an error per patch to that from sums that begin anywhere and lie on two patches."""
 _SMALL = 1e-6
-"""Standard deviation of what is known not to be."""
+"""Standard deviation of an error that is known to be absent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Floor:
-    """What patches of floor, of so many steps each, add to what the wheels count."""
+    """Errors that patches of floor, of so many steps each, add to the odometry."""
 
     value: Floats
-    """(p, 2) share of the way, and turn, rad/m."""
+    """(p, 2) relative error of distance, and turn, rad/m."""
     sigma: Floats
     """(2,) prior standard deviations of these about 0."""
 
     def moved(self, step: Floats) -> "Floor":
-        """Return the floor after a step (p, 4), of which two count."""
+        """Return the floor after a step (p, 4), of which two columns are used."""
         return replace(self, value=self.value + step[:, :2])
 
 
@@ -55,7 +55,7 @@ def even(wheels: OdometryEdges) -> Floor:
 
 
 def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[OdometryEdges, Floor]:
-    """Return the wheels with the noise of their steps as the residuals show it, and what patches of floor may add.
+    """Return the wheels with the noise of their steps as learnt from the residuals, and priors of errors of patches of floor.
 
     Parameters
     ----------
@@ -81,9 +81,10 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
 def with_noise_shown(graph: Graph, certainty: Floats | None = None) -> Graph:
     """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
 
-    Errors that stay with the floor add up faster than with the square root of the way, which single steps do not show. Two
+    Errors common to a patch of floor grow faster than with the square root of the distance, which single steps do not show. Two
     kinds of residuals do: sums over ten consecutive steps whose ends the lidar determines better than the wheels, and steps
-    that no scan measured, as far as ranges check them, for ranges check ways of many metres. The assumed noise counts as two.
+    that no scan measured, as far as ranges check them, since ranges check distances of many metres. The assumed noise has the
+    weight of two residuals.
 
     Parameters
     ----------
@@ -126,9 +127,9 @@ def _by_redundancy(wheels: OdometryEdges, graph: Graph, some: Bools) -> tuple[Fl
 
 
 _ASSUMED = 2.0
-"""What the assumed noise counts, in residuals: it is right within a factor of two."""
+"""Weight of the assumed noise, in residuals: it is right within a factor of two."""
 _ADDS_UP = 3.0
-"""How much more the correlated part of errors adds up to over many steps than over ten: the sum of exp(-|k| / 10) over all k
+"""Ratio of the correlated part of the variance over many steps to that over ten: the sum of exp(-|k| / 10) over all k
 but 0 is 19, and that of (1 - |k| / 10) exp(-|k| / 10) within ten steps 6.4."""
 _MOST_FLOOR = 3.0
 """Largest factor: more is slip, not floor."""
@@ -144,7 +145,7 @@ def _steps_and_sums(wheels: OdometryEdges, graph: Graph, certainty: Floats, some
     pose, residuals = _pose_variance(graph, certainty), wheels.residuals(graph)
     ends, roots = (np.concatenate([np.zeros((1, 3)), np.cumsum(v, axis=0)]) for v in (residuals, root))
     count = np.concatenate([[0], np.cumsum(some)])
-    # Windows across the seam of two recordings are none.
+    # Windows that cross the boundary of two recordings are excluded.
     ten = np.flatnonzero((wheels.j[PATCH - 1 :] - wheels.i[: 1 - PATCH] == PATCH) & (count[PATCH:] - count[:-PATCH] == PATCH))
     one = np.flatnonzero(some)
     of_one = (pose[wheels.i[one]] + pose[wheels.j[one]]) * root[one] ** 2
@@ -165,7 +166,7 @@ def _pose_variance(graph: Graph, certainty: Floats) -> Floats:
 
 
 def _shown(residual: Floats, added: Floats) -> _Shown:
-    """Return the variance of errors by residuals to which poses add a variance; only those count that poses check well."""
+    """Return the variance of errors by residuals to which poses add a variance; only those that poses check well are used."""
     good = added < 1.0
     if not good.any():
         return 1.0, 0
@@ -175,8 +176,8 @@ def _shown(residual: Floats, added: Floats) -> _Shown:
 
 
 def equations(wheels: OdometryEdges, floor: Floor, graph: Graph, unknowns: Unknowns) -> Blocks:
-    """Return what the floor adds to the normal equations of a graph that has the wheels among its edges, as blocks of four
-    unknowns, of which two count."""
+    """Return the terms that the floor adds to the normal equations of a graph with the wheels among its edges, as blocks of
+    four unknowns, of which two are used."""
     linearized = wheels.linearize(graph)
     weight = kernel_weights(wheels, linearized.residuals)
     patch, root = np.arange(len(wheels)) // PATCH, np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)

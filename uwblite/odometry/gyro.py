@@ -11,7 +11,7 @@ from ..sensor_log import Gyro, Odometry, Remark, SensorLog
 from .wheels import OdometryNoiseConfig
 
 GAP = 0.25
-"""s between two gyro readings from which on the wheels' own turn is taken."""
+"""s between two gyro readings from which on the turn of the wheels is used instead."""
 STANDING = (0.002, 0.002)
 """m and rad of the wheels in one second below which the robot stands: ticks and noise of the wheels."""
 LEAST_STANDING = 3
@@ -19,23 +19,23 @@ LEAST_STANDING = 3
 WINDOW = 5.0
 """s over which the turns of gyro and wheels are compared where the robot never stands."""
 LEFT_OF_BIAS = 0.003
-"""Standard deviation of the bias that is left, rad/s: a MEMS gyro drifts so within minutes, and with its temperature."""
+"""Standard deviation of the remaining bias, rad/s: a MEMS gyro drifts by this within minutes, and with its temperature."""
 SCALE = 0.02
 """Standard deviation of a gyro's scale, 1; data sheets of cheap ones say 1 to 3 %."""
 LEAST_TURNS = 0.1
 """rad by which wheels and gyro must turn in a window, root mean square, for their turns to be compared."""
 ALIKE, UNLIKE = 0.8, 0.3
-"""Correlation of the turns of gyro and wheels from which one factor leads from one to the other; below which both are not
-of one robot. Slipping wheels do not come down to it."""
+"""Correlation of the turns of gyro and wheels from which on one factor relates them, and below which they do not belong to
+one robot. Slipping wheels do not reach it."""
 READINGS = {
     1.0: "",
     -1.0: "it turns against the wheels, and is turned over (a sensor upside down, or one that counts clockwise)",
     np.pi / 180.0: "it counts degrees",
     -np.pi / 180.0: "it counts degrees, and turns against the wheels",
 }
-"""What makes radians counter-clockwise of a heading -> why."""
+"""Factor that converts a heading to radians counter-clockwise -> the reason."""
 SLIP = 3.0
-"""Factor by which the turns of wheels may be wrong: those of tracks and four driven wheels are, by half."""
+"""Factor by which the turns of wheels may be wrong: those of tracks and four driven wheels are wrong by half."""
 PER_TURN, PER_METRE = 0.005, 0.001
 """Random error of heading per radian and per metre, rad: a gyro does not slip and measures no distance."""
 
@@ -45,7 +45,7 @@ def settings(
 ) -> tuple[CalibrationConfig, OdometryNoiseConfig]:
     """Return the priors and the noise of the odometry, with those of a gyro's heading where the recording has one.
 
-    What the user switched off (0) stays off, and what was set smaller stays.
+    Values that the user switched off (0) stay off, and values that were set smaller stay.
     """
     if log.gyro is None:
         return calibration, noise
@@ -57,14 +57,14 @@ def settings(
 
 
 def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with the gyro's heading in its odometry, less the gyro's bias; and a remark.
+    """Return the recording with the gyro's heading, corrected by its bias, in its odometry; and a remark.
 
-    A heading that is turned over or in degrees is recognised by the wheels and set right; one that has nothing in common
-    with their turns is not taken.
+    A heading with the wrong sign or in degrees is recognised by the wheels and corrected; one that is not correlated with their
+    turns is not used.
 
-    Each step of the wheels keeps its length; its direction turns by half of what both headings differ in (the chord of
+    Each step of the wheels keeps its length; its direction turns by half of the difference of both headings (the chord of
     an arc). The bias is the gyro's turn rate while the wheels stand, else the median difference to that of the wheels;
-    what is left of it is estimated with the map (``heading_rate``).
+    the remaining bias is estimated with the map (``heading_rate``).
     """
     gyro, odometry = log.gyro, log.odometry
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:
@@ -100,7 +100,7 @@ def _covered(gyro: Gyro, stamps: Floats) -> Bools:
 
 
 def bias_of(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
-    """Return the gyro's bias, rad/s, and whether it is from rests."""
+    """Return the gyro's bias, rad/s, and whether it was measured while the robot stood."""
     turned, by_wheels, way = _changes(gyro, odometry, 1.0)
     rests = (way < STANDING[0]) & (np.abs(by_wheels) < STANDING[1])
     if rests.sum() >= 2 * LEAST_STANDING:
@@ -110,7 +110,7 @@ def bias_of(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
 
 
 def reading_of(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
-    """Return by what the gyro's heading is to be multiplied, and why; 0 where it is not that of this robot."""
+    """Return the factor for the gyro's heading, and the reason; 0 where it is not the heading of this robot."""
     turned, by_wheels, _ = _changes(gyro, odometry, WINDOW)
     if len(turned) < 4:
         return 1.0, ""
@@ -128,9 +128,9 @@ def reading_of(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
 
 
 def _changes(gyro: Gyro, odometry: Odometry, span: float) -> tuple[Floats, Floats, Floats]:
-    """Return by what gyro and wheels turned in windows of `span` s, rad, and how far the wheels came, m, (w,) each."""
+    """Return the turns of gyro and wheels in windows of `span` s, rad, and the distance of the wheels, m, (w,) each."""
     begin, end = max(gyro.stamps[0], odometry.stamps[0]), min(gyro.stamps[-1], odometry.stamps[-1])
-    # Not every window from first to last: one false stamp may lie years away.
+    # Only windows with stamps: one false stamp may lie years away.
     at = begin + np.unique((odometry.stamps - begin) // (0.5 * span)) * (0.5 * span)
     at = at[(at >= begin) & (at < end - span)]
 

@@ -66,9 +66,9 @@ class Keyframes:
     twist: Floats
     """(k, 3) velocity of the base at each keyframe, own frame, m/s, m/s, rad/s."""
     slack: Floats
-    """(k-1, 3) standard deviation of the steps among them that were not measured, m, m, rad."""
+    """(k-1, 3) additional standard deviation of steps that were not measured, m, m, rad; else 0."""
     alone: Bools
-    """(k,) its cloud is of a single scan: a further one would be laid to it by an odometry that is not reliable there."""
+    """(k,) its cloud is of a single scan: the odometry that would place a further one is not reliable there."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -83,7 +83,7 @@ def select(
     ----------
     odometry : n >= 1 samples.
     breaks : steps that were not measured; a keyframe stands on either side of each.
-    scans : keyframes are then moments of scans, for at no other moment does the lidar measure a pose: what the
+    scans : keyframes are then at times of scans, for at no other time does the lidar measure a pose: what the
         odometry measures between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.
 
     Returns
@@ -136,7 +136,7 @@ def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
 def _slack(stamps: Floats, odometry: Floats, breaks: OdometryBreaks | None) -> Floats:
     """Return the standard deviation (k-1, 3) that breaks of an odometry with stamps (n,) add to the steps between keyframes.
 
-    A step has the slack of every break with which it has time in common.
+    A step gets the uncertainty of every break that overlaps it in time.
     """
     variance = np.zeros((max(len(stamps) - 1, 0), 3))
     if breaks is None or not len(variance) or len(odometry) < 2:
@@ -188,9 +188,9 @@ def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints
 
 
 def _advance(ways: Floats, preferred: Bools) -> Ints:
-    """Return moments as far apart as possible with at most 1 of each way (w, m) between neighbours, if there are such.
+    """Return moments as far apart as possible with at most 1 of each measure (w, m) between neighbours, if there are such.
 
-    Preferred moments come before others; only where the next one is farther than _GAP do others serve.
+    Preferred moments are chosen first; others only where the next preferred one is farther than _GAP.
     """
     chosen = [0]
     last = ways.shape[1] - 1
@@ -214,23 +214,23 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
 
 _AT_REST = 0.05
 """Keyframe distances or angles up to which the first scan is one of the first pose: the wheels' error is small there.
-After a longer one the cloud would stand in the frame of all poses with an error that none of them knows of."""
+After a longer distance the cloud would have an error relative to its pose that the graph does not model."""
 _GAP = 10.0
-"""Keyframe distances, angles or durations without any scan after which keyframes go on without."""
+"""Keyframe distances, angles or durations without any scan after which keyframes are set without scans."""
 _STANDING = 0.1
 """Keyframe distances or angles per second below which a robot stands, 1/s."""
 
 
 def _reached(ways: Floats, here: int, most: float) -> int:
-    """Return the last moment that is at most so far from this one by all ways."""
+    """Return the last moment that is at most so far from this one by all measures."""
     return min(int(np.searchsorted(way, way[here] + most, "right")) for way in ways) - 1
 
 
 _WINDOW = (0.0, 0.1)
 """Time before and after a stamp over which the velocity is a mean, s: two readings of a base at 20 Hz."""
 _BESIDE_SCANS = (0.1, 0.3)
-"""The same at keyframes, s. What lies nearer places the second scan of a cloud: its noise, in the cloud and in the velocity,
-would look like an offset of the lidar's clock."""
+"""The same at keyframes, s. Odometry within a shorter time also places the second scan of a cloud: its noise, both in the cloud
+and in the velocity, would look like an offset of the lidar's clock."""
 
 
 def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] = _WINDOW) -> Floats:
@@ -246,8 +246,8 @@ def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] 
 def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, stamps: Floats | None = None) -> Floats:
     """Return T_map_base (n, 3) at the stamps (default: every odometry stamp) between optimised keyframes (k, 3).
 
-    The raw odometry since the keyframe is followed, and what it misses by the next keyframe is spread as errors of wheels
-    arise: of the position by the distance travelled, of the heading by the turn, and little by time.
+    The raw odometry since the keyframe is used, and its misclosure at the next keyframe is distributed as errors of wheels
+    arise: in position with the distance travelled, in heading with the turn, and little with time.
     """
     query = odometry.stamps if stamps is None else stamps
     base = odometry.poses if stamps is None else odometry.at(stamps)
@@ -264,7 +264,7 @@ def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, st
 
 
 def _error_ways(odometry: Odometry, stamps: Floats) -> Floats:
-    """Return how much (m, 3) errors of wheels have grown by since the beginning, in x, y and heading, in arbitrary units."""
+    """Return the growth (m, 3) of odometry errors since the beginning, in x, y and heading, in arbitrary units."""
     _, path, turned = _travelled(odometry, stamps, _sample(odometry, stamps))
     position = path + _STANDING_ERROR * stamps
     return np.column_stack([position, position, turned + _BY_PATH * path + _STANDING_ERROR * stamps])

@@ -1,7 +1,7 @@
-"""How much more or less the lidar turns than the wheels, step by step: the scale of turns that one bad turn cannot bend.
+"""Ratio of the turns by lidar and by wheels, step by step: a scale of turns that is robust to a single wrong turn.
 
-In least squares over all poses a single turn that the wheels missed, or a stretch on which lidar and wheels are stamped
-apart, weighs as its square, and the scale of all turns takes part of it. The median over steps does not.
+In least squares over all poses, a single turn that the wheels missed, or a stretch with a clock offset between lidar and
+wheels, has a squared influence and changes the scale of all turns. The median over steps is not affected.
 """
 
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from ..graph.pose_edges import OdometryEdges, ScanEdges
 _TURNING = 0.1
 """rad; steps that turn by less, on average of lidar and wheels, do not show a ratio."""
 _ENOUGH = 40
-"""Turning steps that show a scale."""
+"""Least number of turning steps that show a scale."""
 _STRETCHES = 4
 """Parts of a recording, equal in turning steps, whose scales are compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnScale:
-    """Relative error of the turns that one recording's wheels count, by the lidar from step to step."""
+    """Relative error of the turns of one recording's wheels, measured by the lidar from step to step."""
 
     value: float
     """Turn by the lidar / turn by the wheels - 1, 1: what ``heading_scale`` should be."""
@@ -40,7 +40,7 @@ class TurnScale:
 
     @property
     def varies(self) -> bool:
-        """Whether the stretches have different scales: it is no constant of these wheels."""
+        """Whether the stretches have different scales, so that it is not a constant of these wheels."""
         return bool(np.ptp(self.stretches) > max(_SIGMAS * self.stretch_sigma, _DIFFERENT))
 
 
@@ -66,7 +66,7 @@ def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[i
     row, lidar = _neighbours(wheels, steps)
     drift = np.append(graph.calibration.values, 0.0)[wheels.calibration[row, 2:4]]
     turned = wheels.motion[row, 2] + drift[:, 0] * wheels.length[row] + drift[:, 1] * wheels.duration[row]
-    # Wheels that count nothing at all stand still or broke down: that is no scale.
+    # Wheels that count nothing at all stand still or are broken: this is no scale error.
     clear = (np.abs(turned) + np.abs(lidar) > 2.0 * _TURNING) & np.any(wheels.motion[row] != 0.0, axis=1)
     of_recording = wheels.calibration[row, 1]
     found = {}
@@ -109,7 +109,7 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     direction = np.arctan2(lidar, wheels)
     centre = 0.25 * np.pi
     for _ in range(2):
-        # Left and right turns are one direction: it is known up to half a turn.
+        # Left and right turns give one direction, known up to half a turn.
         direction = centre + se2.wrap_angle(2.0 * (direction - centre)) / 2.0
         centre = weighted_median(direction, weight)
     parts = np.array_split(np.arange(len(weight)), _STRETCHES)
@@ -125,7 +125,7 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
 
 
 def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
-    """Return how many independent steps weighted ones (s,) are worth whose errors are partly correlated within a turn.
+    """Return the effective number of independent steps of weighted ones (s,) whose errors are partly correlated within a turn.
 
     Tyres slip, and floors give way, for as long as a turn lasts. The correlation of neighbouring steps of one turn is taken
     from how often their errors have the same sign: of normal values with correlation r it is 1/2 + arcsin(r) / pi.

@@ -64,7 +64,7 @@ def sideways_priors(odometry: Odometry, priors: CalibrationConfig) -> Calibratio
 
 
 _OMNI = 0.1
-"""Share of sideways motion from which on wheels drive sideways; rounding and slow clocks make some of any."""
+"""Share of sideways motion from which on wheels drive sideways; rounding and slow clocks cause a small share in any."""
 
 
 def drift_time(keyframes: Keyframes) -> Floats:
@@ -73,7 +73,7 @@ def drift_time(keyframes: Keyframes) -> Floats:
 
 
 def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
-    """Scale the wheels' noise along, across and in heading so that it explains how far they lie from measured steps.
+    """Scale the wheels' noise along, across and in heading so that it explains their differences from measured steps.
 
     Parameters
     ----------
@@ -96,14 +96,14 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
 
 
 _ENOUGH_STEPS = 20
-"""Measured steps from which the noise of the wheels may be learnt."""
+"""Least number of measured steps from which the noise of the wheels is learnt."""
 
 
 def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
-    """Give wheels that count nothing over a step the noise of the way that the lidar certainly measures there.
+    """Give wheels that count nothing over a step the noise of the distance that the lidar clearly measures there.
 
-    An odometry that stands still while the robot drives on would else claim a standing robot's half millimetre: a step that
-    even a robust kernel does not let go of.
+    An odometry that stands still while the robot drives would otherwise have a standing robot's noise of half a millimetre:
+    even a robust kernel would not reject such a step.
 
     Parameters
     ----------
@@ -124,11 +124,11 @@ def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: 
 
 
 def _way(motion: Floats) -> Floats:
-    """Return how much motions (e, 3) travel and turn, m + rad."""
+    """Return the distance plus the turn of motions (e, 3), m + rad."""
     return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + np.abs(motion[:, 2]))
 
 
 _CERTAIN = 5.0
-"""Standard deviations of their difference from which a measured step contradicts the wheels for certain."""
+"""Standard deviations of their difference from which on a measured step clearly contradicts the wheels."""
 _MOVING = 0.05
-"""m + rad; over shorter steps wheels count nothing, and do not show how noise grows with the way."""
+"""m + rad; over shorter steps wheels may count nothing, and do not show how noise grows with the distance."""
