@@ -1,1 +1,1 @@
-"""What a finished estimate is worth: its summary, and the warnings and doubts that it gives rise to."""
+"""Assessment of a finished estimate: its summary, warnings and doubts."""

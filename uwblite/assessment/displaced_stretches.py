@@ -1,7 +1,7 @@
-"""Stretches of the trajectory that the lidar has put elsewhere: the ranges to several anchors say so all at once.
+"""Stretches of the trajectory that the lidar has displaced, detected by the ranges to several anchors together.
 
-Where a lidar sees bare walls only and the wheels lose some of the way, scans and odometry agree on a wrong place, and the
-robust kernel takes the ranges of that stretch for outliers. They disagree with the map, and agree with a path beside it.
+Where a lidar sees bare walls only and the wheels miss some of the distance, scans and odometry agree on a wrong place, and the
+robust kernel treats the ranges of that stretch as outliers. They disagree with the map, and agree with a path beside it.
 """
 
 from collections.abc import Sequence
@@ -13,11 +13,12 @@ from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 
 _WAY, _STEP = 5.0, 1.0
-"""m; length of the stretches that are looked at, and way from one to the next."""
+"""m; length of the stretches that are tested, and distance from one to the next."""
 _FEWEST, _ANCHORS = 12, 3
-"""Ranges of a stretch that decide something, and anchors that these must be to: any ranges to two fit some path."""
+"""Least number of ranges of a stretch that is tested, and of their anchors: any ranges to two fit some path."""
 _OFF, _NEAR = 0.5, 0.3
-"""m; ranges that disagree with the map, and those that agree with the path beside it, which is as far away as that at least."""
+"""m; residuals of ranges that disagree with the map, and of those that agree with the path beside it. The first is also the
+least distance of this path."""
 _MOST = 0.7
 """Share of a stretch's ranges that must disagree with the map, and of all that must agree with the path beside it."""
 _ROUNDS = 20
@@ -73,9 +74,9 @@ def _stretches(tags: Floats, off: Bools) -> list[tuple[int, int]]:
 
 
 def _path_beside(tags: Floats, places: Floats, residuals: Floats, numbers: Ints) -> Floats | None:
-    """Return how far beside the map (2,), m, the path is with which the ranges of a stretch agree; None where none is clear.
+    """Return the offset (2,), m, from the map of the path with which the ranges of a stretch agree; None where none is clear.
 
-    Ranges that are all late by the same have come through something.
+    Ranges that are all late by the same amount have passed through an obstacle.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Does anything drift that an estimate takes as constant? Where ranges alone hold the trajectory, it bends instead.
+"""Tests for drift of values that an estimate takes as constant; where ranges alone constrain the trajectory, it bends instead.
 
-A radio that warms up, wheels that wear or lose air, a radio whose clock is seconds off: nearly all of it is explained by
-bent paths and anchors elsewhere, and no residual is conspicuous. What little is left is compared with the one pattern that
-each of them would leave: a score test (graph/added_unknown.py) gives the size that suits the data best. A wheel that slips for
-seconds hides likewise: each step of it is small, and the calibration of the turns takes up what is left.
+A radio that warms up, wheels that wear or lose air, a radio whose clock is seconds off: bent paths and displaced anchors
+explain nearly all of such an effect, and no residual is conspicuous. The small remainder is compared with the pattern that each
+of these faults would leave: a score test (graph/added_unknown.py) gives the best-fitting size. A wheel that slips for
+seconds is hidden in the same way: the error of each step is small, and the calibration of the turns absorbs the rest.
 """
 
 from dataclasses import replace
@@ -19,24 +19,24 @@ from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
 
 _SIGMAS = 2.5
-"""Standard deviations that a drift must exceed, besides its limit."""
+"""Standard deviations that a drift must exceed, in addition to its limit."""
 _LONGER, _SCALE, _LATE = 0.4, 0.07, 0.5
-"""Limits: m by which all ranges grow over a recording, the change of the wheels' scale, and s by which ranges are late. Sound
-recordings, 30 of simulated and three of real places, have up to 0.24 m, 0.05 and 0.39 s, with 1.7, 2.8 and 1.6 sigma."""
+"""Limits: m by which all ranges grow over a recording, the change of the wheels' scale, and s by which ranges are late.
+Faultless recordings, 30 of simulated and three of real places, have up to 0.24 m, 0.05 and 0.39 s (1.7, 2.8 and 1.6 sigma)."""
 _TURN, _TURN_SIGMAS = 0.3, 4.0
-"""rad by which turns are wrong over a short way, and standard deviations. Sound recordings, 30 of simulated and three of real
-places, have up to 3.6 sigma with 0.22 rad, the most of some forty ways in each."""
+"""rad by which turns are wrong over a short stretch, and standard deviations. Faultless recordings, 30 of simulated and three
+of real places, have up to 3.6 sigma with 0.22 rad, the largest of about forty stretches in each."""
 _MISPLACED = 0.25
-"""m, rms, by which a path is bent whose map is doubted: half of what makes a map wrong."""
+"""m, rms, by which a path is bent whose map is doubted: half of the error that makes a map wrong."""
 _WAY, _MOST = 8, 128
-"""Steps of such a way, 2.4 m, and ways that are tested: those on which the turns fit worst."""
+"""Steps of such a stretch, 2.4 m, and number of stretches that are tested: those on which the turns fit worst."""
 _STEP = 1e-4
-"""Share of a unit by which derivatives are taken."""
+"""Share of a unit that is the step of numeric derivatives."""
 
 
 def check_drifts(estimate: Estimate, task: Task) -> None:
-    """Doubt a map of recordings without lidar in which ranges or wheels drift, or the radio's clock is seconds off; with one,
-    a map of which wheels that drift have misplaced much."""
+    """Doubt a map of recordings without lidar in which ranges or wheels drift, or the radio's clock is seconds off; with a
+    lidar, a map of which drifting wheels have displaced much."""
     graph, ranges, wheels, rec = estimate.graph, estimate.ranges, estimate.odometry, task.recordings
     if ranges is None or not len(wheels) or not estimate.placed.any():
         return
@@ -85,7 +85,7 @@ def _growth(graph: Graph, wheels: OdometryEdges, since: Floats) -> Floats:
 def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordings, task: Task) -> None:
     """Doubt a map whose wheels change their scale, where a map without that change has another shape.
 
-    A lidar that sees walls holds the map whatever the wheels count. In a large hall it sees none for most of the time.
+    A lidar that sees walls determines the map whatever the wheels count. In a large hall it sees none for most of the time.
     """
     fewer = with_fewer_pairs(graph)
     growth = np.stack([_growth(fewer, wheels, _age(recording, rec)) for recording in rec.each])
@@ -101,7 +101,7 @@ def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordin
 
 
 def _bent(places: Floats, moved: Floats) -> float:
-    """Return the rms of moves (k, 2) of places (k, 2), m, without those of the whole: a shift, a turn."""
+    """Return the rms of moves (k, 2) of places (k, 2), m, without the shift and the turn of the whole."""
     about = places - places.mean(axis=0)
     whole = np.column_stack([np.tile(np.eye(2), (len(about), 1)), (about @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()])
     left = moved.ravel() - whole @ np.linalg.lstsq(whole, moved.ravel(), rcond=None)[0]
@@ -109,9 +109,9 @@ def _bent(places: Floats, moved: Floats) -> float:
 
 
 def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task) -> None:
-    """Doubt a map in which the odometry turns wrongly over a short way, by the ranges."""
+    """Doubt a map in which, by the ranges, the odometry turns wrongly over a short stretch."""
     steps = np.arange(0, len(wheels) - _WAY + 1, _WAY // 2)[:, None] + np.arange(_WAY)
-    # The numerators of the test, where the graph is at its optimum: a way that fits well needs no other turn.
+    # The numerators of the test, with the graph at its optimum: a stretch that fits well needs no other turn.
     score = np.einsum("eij,ei,e->ej", wheels.sqrt_information, wheels.residuals(graph), edge_weights(wheels, graph))[:, 2]
     steps = steps[np.argsort(-np.abs(score[steps].sum(axis=1)), kind="stable")[:_MOST]]
     shifts = np.zeros((len(steps), len(wheels), 3))

@@ -1,7 +1,7 @@
-"""Do both halves of a recording give the same calibration of the wheels? A change hides where ranges alone hold the trajectory.
+"""Comparison of the wheels' calibration from both halves of a recording: ranges alone hardly show a change of it.
 
-A heading that stands still from some moment on, or a tyre that was changed, can be explained by wrong values of the
-wheels' calibration, constant over the whole recording, and bent anchors, with hardly larger residuals. So both halves are
+A heading that stands still from some time on, or a tyre that was changed, can be explained by wrong values of the
+wheels' calibration, constant over the whole recording, and displaced anchors, with hardly larger residuals. So both halves are
 estimated once more, each with a calibration of its own, from the joint estimate. Where a lidar measures the motion from
 scan to scan, such a change is seen directly (screening/wheel_motion.py).
 
@@ -25,11 +25,11 @@ from ..pipeline.radio_stages import bootstrapped, dead_reckoning
 from ..pipeline.recordings import Recording, gather
 
 _CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
-"""Differences between halves that no sound base has: of lengths, of turns, and of turns per metre, rad/m."""
+"""Differences between halves that no faultless base has: of lengths, of turns, and of turns per metre, rad/m."""
 _SIGMAS = 4.0
 """Standard deviations of the difference that it must exceed."""
 _LEAST_STEPS, _LEAST_RANGES = 30, 40
-"""Steps and ranges of a half without which it decides nothing."""
+"""Least number of steps and of ranges of a half that is tested."""
 _FEW = 8
 """Ranges to an anchor with which a half can estimate it."""
 
@@ -40,7 +40,7 @@ def check_halves(estimate: Estimate, task: Task) -> None:
         if recording.has_scans or estimate.ranges is None:
             continue
         if not any(doubt.kind == "range-scatter" for doubt in task.stages.doubts):
-            # Ranges that are no distances give no anchors by either half, however long one tries.
+            # Ranges that are no distances give no anchors by either half; a bootstrap would be useless.
             _check_sign_of_turns(recording, task)
         rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
         halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
@@ -91,7 +91,7 @@ def _loose(priors: PriorEdges, place: int) -> PriorEdges:
 
 
 _LOOSER = 20.0
-"""Factor on the prior standard deviation of that unit: what changed on the way is of any size."""
+"""Factor on the prior standard deviation of that unit: a change during the recording may have any size."""
 
 
 def _check_sign_of_turns(recording: Recording, task: Task) -> None:
@@ -115,15 +115,15 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> None:
 _TRIANGLE = 3
 """Anchors that have a handedness."""
 _FAR, _CLEARLY = 1.0, 4.0
-"""How far anchors are apart at least, m, and how many times as far as their mirror images."""
+"""Least distance between both halves' anchors, m, and its least ratio to that of their mirror images."""
 _RANGES_ALONE = 1500
 """Ranges with which a half is bootstrapped, at most."""
 _WIDE = 0.1
-"""Width of a path by its length that shows to which side it turns."""
+"""Least ratio of width to length of a path that shows to which side it turns."""
 
 
 def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -> dict[str, Floats]:
-    """Return the anchors (2,) by a part of a recording alone, in a frame of their own; none where it shows them badly."""
+    """Return the anchors (2,) by a part of a recording alone, in a frame of their own; none where it determines them badly."""
     log = recording.log.crop(start, end)
     if log.ranges is None or len(log.ranges.stamps) < _LEAST_RANGES or len(log.odometry.stamps) < _LEAST_STEPS:
         return {}

@@ -26,17 +26,17 @@ from .untied_parts import check_untied_parts
 from .untied_recordings import check_untied_recordings
 
 _UNUSUAL = 3.0
-"""Prior standard deviations beyond which an estimate is worth a warning."""
+"""Prior standard deviations beyond which an estimate gets a warning."""
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _LOST_WAY = 0.03
-"""Share of their way that wheels have lost by the ranges, where they lost some, from which on a map is too short."""
+"""Share of the distance that, by the ranges, the wheels missed, from which on a map is too short."""
 _UNRELATED = 0.2
-"""Factor of the odometry's turns below which these have nothing in common with those of the map: slip takes half of them."""
+"""Factor of the odometry's turns below which they are unrelated to those of the map: slip removes up to half of them."""
 _WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
 """Relative error of the odometry's turns beyond which their sign is no longer sure: where they are too small, and where too
 large. Wheels that slip count too much, never too little: skid steering as if its track were wider, by two thirds at most."""
 _POOR_FIT = 4.0
-"""chi2 per degree of freedom beyond which errors are twice what the noise allows: the model does not hold."""
+"""chi2 per degree of freedom beyond which errors are twice the assumed noise: the model is not valid."""
 
 
 def judge(
@@ -74,7 +74,7 @@ def judge(
 
 
 def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
-    """Doubt a map whose own uncertainties say that its shape is not known well.
+    """Doubt a map whose own uncertainties are so large that its shape is not known well.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     """Warn of anchors that are not ok; doubt a map with which most ranges, or without lidar half of the anchors, disagree.
 
-    A name of two anchors counts as a distrusted one. Mirror ambiguity is a doubt where no anchor in reach has one place alone.
+    A name with two anchors counts as distrusted. Mirror ambiguity is a doubt where every anchor in reach has it.
     """
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
@@ -132,17 +132,17 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
 
 
 _PLACED = ("ok", "mirror-ambiguous", "distrusted")
-"""What anchors with a place are called."""
+"""Statuses of anchors with a place."""
 _LEAST_AGREEING = 0.3
-"""Least share of ranges that agree with a map that is right: where a radio reports every other range as 0, it is 0.4."""
+"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> None:
     """Doubt a map in which half of the anchors changed at one time, unless they changed places only.
 
-    Wheels that were swapped, a radio or its clock that changed, or a lidar that leads the trajectory astray look the same. An
+    Swapped wheels, a changed radio or clock, or a lidar that displaces the trajectory have the same effect. An
     anchor has changed where it was moved, and where its ranges agree with the map on one side of that time only. With a lidar,
-    one anchor alone may have been moved, and between recordings all of them.
+    a single anchor may have been moved, and between recordings all of them.
     """
     lidar = task.recordings.have_scans
     if not table or not anchors or (lidar and len(task.recordings.each) > 1):
@@ -171,18 +171,18 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
 
 
 def _one_sided(agrees: Floats, early: Bools, late: Bools) -> bool:
-    """Return whether the early or the late ones alone of ranges (m,) agree with the map, 1 or 0; a few show nothing."""
+    """Return whether only the early or only the late ones of ranges (m,) agree with the map, 1 or 0; too few ranges give 0."""
     if min(early.sum(), late.sum()) < _FEW_ON_A_SIDE:
         return False
     return bool(abs(agrees[early].mean() - agrees[late].mean()) > _ONE_SIDED)
 
 
 _FEW_ON_A_SIDE, _ONE_SIDED = 10, 0.6
-"""Ranges, and the difference of the shares that agree: behind furniture they fall by half."""
+"""Least number of ranges, and of the difference of the shares that agree: behind furniture the share falls by half."""
 _ONE_TIME = 30.0
-"""Moves within so much of each other are of one time, s."""
+"""Moves within so much of each other count as simultaneous, s."""
 SAME_PLACE = 1.5
-"""m; an anchor found so near to where another one was took its place, or only its name."""
+"""m; an anchor nearer than this to the former place of another one took its place, or only its name."""
 
 
 def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: Sequence[tuple[str, int]]) -> bool:
@@ -195,7 +195,7 @@ def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: S
 
 
 def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
-    """Warn of what was not recorded."""
+    """Warn of sensors without data."""
     logs = [recording.log for recording in task.recordings.each]
     if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
         task.stages.warn("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
@@ -207,7 +207,7 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
 
 
 def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task) -> None:
-    """Warn of a map without loop closures; doubt one that more of them contradict than support."""
+    """Warn of a map without loop closures; doubt one that more closures contradict than support."""
     candidates = estimate.closures.candidates
     accepted = sum(c.accepted for c in candidates)
     placed = any(a.status != "unplaced" for a in anchors)
@@ -222,12 +222,12 @@ def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: 
 
 
 def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task) -> None:
-    """Warn of each calibration value far outside what is usual.
+    """Warn of each calibration value far outside its usual size.
 
-    Ranges that are too long where the wheels were seen to count nothing are a doubt: scans along a bare wall show some of
-    such stretches only, and a map that lacks the others is too short. So is a value that another unit explains, where no lidar
-    says whether that is one of the wheels or of the radio; and turns that count next to nothing, which slip does not explain:
-    scans in a wrong order match a map that turns otherwise.
+    Ranges that are too long where the wheels counted nothing are a doubt: scans along a bare wall show only some of
+    such stretches, and a map that lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar
+    shows whether the unit is that of the wheels or of the radio. So is a scale of turns near 0, which slip does not explain:
+    scans in a wrong order match a map with other turns.
 
     Parameters
     ----------
@@ -261,9 +261,9 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
     """Doubt a map whose ranges or scans fit only where the odometry's turns are scaled grossly.
 
     Ranges alone do not distinguish a map from its mirror image: a trajectory mirrored together with its anchors has the same
-    ranges. Only the sign of the odometry's turns does, and a laser, or given anchors. Where turns must be scaled by a
-    factor far from 1, by minus that factor the mirror image fits as well, and nothing decides the sign. A laser that
-    sees the turns go the other way may itself be upside down.
+    ranges. Only the sign of the odometry's turns, a laser, or given anchors do. Where turns must be scaled by a
+    factor far from 1, the mirror image fits as well with the negative factor, and the sign is undetermined. A laser that
+    measures the opposite turns may itself be upside down.
     """
     graph = estimate.graph
     given = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")

@@ -1,4 +1,4 @@
-"""Do the ranges to one anchor agree with the map throughout, and what rests on them where they do not?"""
+"""Test whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not."""
 
 from collections.abc import Sequence
 
@@ -57,7 +57,7 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
 
 
 def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Doubt another unit of the wheels where it rests on ranges alone, and these contradict each other."""
+    """Doubt another unit of the wheels where only ranges support it, and these contradict each other."""
     kinds = {notice.kind for notice in task.stages.warnings}
     if task.recordings.have_scans or "odometry-unit" not in kinds:
         return
@@ -76,8 +76,8 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     """Turn the doubt that wheels and lidar contradict each other into a warning where ranges decide for the lidar.
 
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
-    question, would not agree with a path that the lidar has bent: then the wheels are at fault alone. Anchors that seem to have
-    been moved could have been taken along by such a path.
+    question, would not agree with a path that the lidar has bent: then only the wheels are wrong. Anchors that seem to have
+    been moved are not used: a bent path could have displaced them.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ _ENOUGH, _NEAR = 3, 0.3
 """Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
 half a metre off is not so near to three distances."""
 _MOST_NEAR, _MANY_NEAR = 0.85, 0.6
-"""Share of all their ranges, and of those in each stretch, few as they may be, that must be as near. Right maps have 0.9 to
+"""Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
 0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
 
 

@@ -1,7 +1,7 @@
-"""Tests of each kind of measurement against the joint estimate: what noise cannot explain is a doubt.
+"""Tests of each kind of measurement against the joint estimate: residuals that noise cannot explain are a doubt.
 
 Every test compares the residuals of the estimate with the sensor's own noise, over stretches of time, and
-is made for no particular fault.
+is not specific to one fault.
 """
 
 import numpy as np
@@ -20,34 +20,34 @@ from ..radio.line_of_sight import LEAST_POINTS, blocked
 from ..radio.range_noise import short_term_sigma
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
-"""Typical scatter of ranges about the map, m, and in units of their scatter from one to the next, that multipath and blocked
-sight do not exceed."""
+"""Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
+next."""
 _FREE, _EARLY = 0.1, 0.05
-"""Share of the ranges in free sight that stands for all, and share that gross errors make early."""
+"""Least share of ranges in line of sight to represent all, and share that gross errors make too short."""
 NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
 _SUDDEN = 5.0
-"""Standard deviations that a step of sound wheels hardly ever exceeds."""
+"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
 _JUMP, _CARRIED = 20.0, 0.5
-"""Standard deviations that a step of wheels on the floor never exceeds, and the size, m or rad, from which it is no slip."""
+"""Standard deviations that a step of wheels on the floor never exceeds, and the size, m or rad, too large for slip."""
 _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
 _REDUNDANT = 2
-"""Scan edges that have to fix a step: one alone has nothing to agree with."""
+"""Least number of scan edges that fix a step: a single one is not checked by others."""
 _MOVING = 0.05
-"""m or rad; over a smaller step a lidar that sees the robot itself would agree, too."""
+"""m or rad; over a smaller step even a lidar that sees the robot itself would agree."""
 _CONTRADICTED = ("free-space-violation", "contradicting-closures", "no-closure")
 """Doubts about a map whose scan edges may be wrong together."""
 _WAYS = 0.15
-"""Relative disagreement of lidar and wheels on ways from one scan to the next, which single scans show to some per cent."""
+"""Relative difference of distances between scans by lidar and by wheels; single scans measure it to a few per cent."""
 _SCALE = 0.12
-"""Relative disagreement of two sensors on lengths beyond which one of them is at fault."""
+"""Relative difference of lengths by two sensors beyond which one of them is wrong."""
 
 
 def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> None:
-    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, speak against."""
+    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, contradict."""
     check_range_scatter(estimate, residuals, grid, task)
     check_odometry_steps(estimate, task)
     check_odometry_jumps(estimate, task)
@@ -60,8 +60,8 @@ def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid |
 def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> None:
     """Compare how ranges scatter about the map with how they scatter from one to the next.
 
-    Behind shelves of metal, ranges are late by half a metre, but none is early. Where a lidar shows what stands between, those
-    in free sight count then: clocks, ids and a wrong trajectory make ranges early as well.
+    Behind metal shelves, ranges are too long by half a metre, but none is too short. Where a lidar shows the obstacles, only
+    ranges in line of sight count then: wrong clocks, ids and trajectories also make ranges too short.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
     """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be.
 
     They are a doubt of the map, unless the lidar fixes the poses there by itself: from other visits, or from clear and
-    redundant matches of the neighbouring clouds in a map that nothing else contradicts. Then the odometry is at fault alone.
+    redundant matches of the neighbouring clouds in a map without other contradictions. Then only the odometry is wrong.
     """
     wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
     if len(wheels) < _WINDOW:
@@ -123,7 +123,7 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
 def check_slips(estimate: Estimate, task: Task) -> None:
     """Find single steps of the odometry that are far off by the ranges, where no lidar measures them instead.
 
-    A robust kernel lets one step take up what many were wrong by, and the map looks as if the robot had been carried.
+    A robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
     wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
     if not len(wheels) or not estimate.placed.any():
@@ -151,7 +151,7 @@ def _measured_by_lidar(graph: Graph) -> Ints:
 
 
 def _stretch(off: Bools) -> tuple[int, int] | None:
-    """Return the first and last step of where most steps in a row are off (e,); None where there is no such stretch."""
+    """Return the first and last step of a stretch in which most steps are off (e,); None where there is none."""
     share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid")
     if share.max() < _MOST:
         return None
@@ -172,7 +172,7 @@ def _confirmed(graph: Graph, path: Floats) -> Bools:
 def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
     """Doubt a map in which the robot jumps from one keyframe to the next and neither odometry nor scans measured it.
 
-    Closures alone say so then, and in corridors that repeat themselves they may all be wrong alike.
+    Then only closures support the jump, and in repetitive corridors they may all have the same error.
     """
     wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
     if estimate.placed.any():
@@ -199,7 +199,7 @@ _FAR = 1.0
 def check_untied_breaks(estimate: Estimate, task: Task) -> None:
     """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall.
 
-    Ranges tie the parts before and after, unless those of half of the anchors contradict the map in one of them.
+    Ranges connect the parts before and after, unless those of half of the anchors contradict the map in one of them.
     """
     wheels, stamps = estimate.odometry, task.recordings.stamps
     if not task.recordings.have_scans:
@@ -225,7 +225,7 @@ def check_untied_breaks(estimate: Estimate, task: Task) -> None:
 def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> Ints:
     """Return those first keyframes (b,) of parts of a map at which one begins or ends that half of the anchors contradict.
 
-    An anchor does whose ranges in it, a few at least, are typically off by more than obstacles and radios explain.
+    An anchor contradicts a part if its ranges there, at least a few, are usually off by more than obstacles or radios explain.
     """
     firsts, alive = np.unique(firsts), ranges.alive
     off = np.abs(ranges.residuals(graph)[:, 0] * ranges.sigma)
@@ -239,8 +239,8 @@ def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> I
 
 
 _FEW_RANGES, _CONTRADICTS, _CONTRADICTING = 3, 1.0, 2
-"""Ranges to an anchor that say something of a part, m by which they contradict it, and the fewest anchors that do: behind
-furniture ranges are late by half a metre, and one anchor may have been moved."""
+"""Least number of ranges to an anchor in a part, m by which they contradict it, and the least number of such anchors: behind
+furniture ranges are too long by half a metre, and one anchor may have been moved."""
 
 
 def _fixed_by_neighbours(graph: Graph) -> Bools:

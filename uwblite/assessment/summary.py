@@ -24,13 +24,13 @@ from .range_agreement import many_short
 from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
-"""Doubts that do not speak against all anchors."""
+"""Doubts that do not concern all anchors."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _IMPLAUSIBLE_BIAS = 1.6
-"""Constant error of an anchor's ranges, m, twice that of the worst radios: rather its place is what is wrong."""
+"""Constant error of an anchor's ranges, m, twice that of the worst radios: its place is more probably wrong."""
 _OTHER_BIAS = 1.0
-"""m, and three standard deviations, by which constant errors of anchors do not differ: rather a place is wrong."""
+"""m, plus three standard deviations: constant errors of anchors that differ by more mean that a place is wrong."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -43,7 +43,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     if ranges is not None and estimate.placed.any():
         own = (residuals[ranges.anchor == k] for k in np.flatnonzero(estimate.placed))
         typical = float(np.median([spread_about_median(r) for r in own]))
-    # By the scatter of ranges to a typical anchor; by its own scatter, no anchor would ever disagree.
+    # Relative to the scatter of a typical anchor's ranges; relative to its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
     anchors = _with_times(_without_strange_biases(anchors), ranges, recordings)
@@ -100,7 +100,7 @@ def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, F
 def _range_table(
     ranges: RangeEdges, graph: Graph, residuals: Floats, weights: Floats, agrees: Bools, recordings: Recordings
 ) -> dict[str, Floats]:
-    """Return what is known of every range; see MapResult.range_table."""
+    """Return the table of all ranges; see MapResult.range_table."""
     x, y = ranges.tag_positions(graph.poses).T
     return {
         "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
@@ -120,7 +120,7 @@ def _anchor(
         nowhere = np.full(2, np.nan)
         return AnchorEstimate(name, nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
     own = residuals[ranges.anchor == k]
-    # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other.
+    # A share by distance, not by kernel weight: effective sigmas are large where ranges are correlated.
     used = float(np.mean(np.abs(own) < limit))
     # The bias in the first recording with ranges to it, by the first tag; the others are in the calibration.
     bias_at = int(ranges.calibration[ranges.anchor == k, 1].min())
@@ -157,12 +157,12 @@ def _without_strange_biases(anchors: tuple[AnchorEstimate, ...]) -> tuple[Anchor
 
 
 def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
-    """Return why an anchor is distrusted, '' where it is not.
+    """Return the reason why an anchor is distrusted, '' where it is not.
 
     Parameters
     ----------
     used : share of its ranges that agree with the map. sigma : standard deviation of its place, m. longest : its longest
-        range, m: it stands nearer than that, and a place known worse than so is none. bias : constant error of its ranges, m.
+        range, m: it stands nearer than that, and with a larger uncertainty the place is unknown. bias : constant error, m.
         scatter : robust standard deviation of its ranges about the map, m.
     """
     if used < _AGREE:
@@ -216,8 +216,8 @@ def _without_leaps(
 ) -> tuple[AnchorEstimate, ...]:
     """Return the anchors, two places of one distrusted where nobody carries it from one to the other in the time between.
 
-    Without a lidar, ranges alone hold the path, and one of the two may be a mirror image, or the move may be false; where one
-    is known to be ambiguous, so is the move. Where names were exchanged, they leap, too, but to the place of another anchor.
+    Without a lidar, ranges alone constrain the path, and one of the two may be a mirror image, or the move may be false; where
+    one is known to be ambiguous, so is the move. Exchanged names also change at once, but to the place of another anchor.
     """
     names = [name_and_number(a.id)[0] for a in anchors]
     bases = np.array(names)
@@ -244,7 +244,7 @@ def _without_leaps(
 
 
 _LEAP, _CARRYING = 6.0, 1.0
-"""m that both places may be off by together, and m/s at which an anchor is taken down, carried and put up again."""
+"""m, error of both places together, and m/s, speed at which an anchor is taken down, carried and put up again."""
 
 
 def _count(name: str, recordings: Recordings) -> int:

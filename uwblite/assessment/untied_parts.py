@@ -1,8 +1,8 @@
-"""Parts of a recording that only the odometry connects with the rest: neither scans, closures nor anchors do.
+"""Parts of a recording that only the odometry connects with the rest, without scans, closures or anchors.
 
-Where the lidar is silent while the robot drives, or where all anchors give way to others at once, the odometry alone lays
-the later part of the map onto the earlier one. Whatever went wrong with it meanwhile (wheels that stood still, a log that
-goes on in another building) leaves no residual. Where all sensors fall silent for good, the odometry alone makes the rest.
+Where the lidar gives no scans while the robot drives, or where all anchors are replaced by others at once, only the odometry
+connects the later part of the map with the earlier one. Its errors meanwhile (wheels that stood still, a log that
+continues in another building) leave no residual. Where all other sensors end, the odometry alone determines the rest.
 """
 
 import numpy as np
@@ -15,18 +15,18 @@ from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording
 
 _SILENT, _DRIVEN = 10.0, 3.0
-"""Time without any scan, s, and way meanwhile, m, after which the odometry may be anywhere where it failed."""
+"""Time without any scan, s, and distance meanwhile, m, after which an odometry that failed may have any error."""
 _PART = 6
-"""Keyframes of the smallest part that is worth a doubt."""
+"""Least number of keyframes of a part for a doubt."""
 _ANCHORS, _MEASURED = 2, 3
-"""Anchors that hold two parts to each other, and ranges to one of them in each part; keyframes at an end of a recording from
-which on it is held."""
+"""Least number of anchors that connect two parts, and of ranges to each of them in each part; also of constrained keyframes at
+an end of a recording."""
 _AT_ONCE = 10.0
-"""s; anchors that all fall silent, and others that all appear, within so much were not left behind one after the other."""
+"""s; anchors that all end, and others that all appear, within this time were not passed one after the other."""
 
 
 def check_untied_parts(estimate: Estimate, task: Task) -> None:
-    """Doubt a map whose parts only the odometry connects, where another sensor fell silent in between."""
+    """Doubt a map whose parts only the odometry connects, where another sensor had no data in between."""
     ranges = estimate.ranges
     alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
     check_loose_ends(estimate, alive, task)
@@ -50,10 +50,10 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
 
 
 def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> None:
-    """Doubt a map with a beginning or an end that no scan, closure or range holds, where usual wheels drift too far.
+    """Doubt a map with a beginning or an end that no scan, closure or range constrains, where usual wheels drift too far.
 
-    What goes wrong with the wheels there leaves no residual, and sigmas speak of sound wheels alone. The middle of a recording
-    is held from both sides.
+    Errors of the wheels there leave no residual, and sigmas assume faultless wheels. The middle of a recording
+    is constrained from both sides.
     """
     held = _held(estimate.graph, ranges)
     for recording in task.recordings.each if len(held) else ():
@@ -79,17 +79,17 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
 
 
 def _held(graph: Graph, ranges: RangeEdges | None) -> Ints:
-    """Return the keyframes that scans, closures and ranges hold, in order."""
+    """Return the keyframes that scans, closures and ranges constrain, in order."""
     ends = [] if ranges is None else [ranges.pose]
     ends += [np.append(e.i, e.j) for e in graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *ends]))
 
 
 def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
-    """Return the error (k,) of usual wheels at each place (k, 2) of a way from its first on, m.
+    """Return the error (k,) of usual wheels at each place (k, 2) of a path, from its first on, m.
 
-    A turn too many at one place moves each later one to the side by its distance from there; of a heading that drifts evenly
-    all along the way these moves add up with their signs: a path around and back has a smaller error than a straight one.
+    A wrong turn at one place moves each later one to the side by its distance from there; for a heading that drifts evenly
+    along the path these moves add up with their signs: a path around and back has a smaller error than a straight one.
 
     Parameters
     ----------
@@ -104,10 +104,10 @@ def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> 
 
 
 _PER_METRE, _PER_SECOND = 0.02, 0.001
-"""rad/m, rad/s; drift of heading by which wheels and gyros differ from one floor, load and temperature to another. Of a robot
-that drives straight on at 0.2 m/s, 7 m are then astray; of one that is out of all sensors' sight for 10 s, some centimetres."""
+"""rad/m, rad/s; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives
+straight on at 0.2 m/s exceeds the limit below after 7 m; one without other sensors for 10 s is off by some centimetres."""
 _ASTRAY = 0.5
-"""m; error of a place from which on the map is wrong there."""
+"""m; error of a place from which on the map counts as wrong there."""
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
@@ -121,7 +121,7 @@ def _without_scans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[float, float]]:
-    """Return when, from and to, s, several anchors fall silent for good and several others appear."""
+    """Return the times, from and to, s, at which several anchors end for good and several others appear."""
     if ranges is None or not len(ranges):
         return []
     own = ranges.rows(np.flatnonzero(recording.has(ranges.pose)))
@@ -146,7 +146,7 @@ def _suddenly(stamps: Floats, anchor: Ints, k: int) -> bool:
 
 
 def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> bool:
-    """Return whether scans, closures or enough anchors tie keyframes before the first to those from the last on."""
+    """Return whether scans, closures or enough anchors connect keyframes before the first with those from the last on."""
     for edges in graph.edges:
         if isinstance(edges, ScanEdges | RelativePoseEdges):
             low, high = np.minimum(edges.i, edges.j), np.maximum(edges.i, edges.j)
