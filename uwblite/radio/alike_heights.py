@@ -1,14 +1,14 @@
-"""Anchors of one building hang about equally high: what some of them show of their height holds for the others.
+"""A common prior of anchor heights: anchors of one building are mounted at similar heights.
 
-From a straight path, as along a corridor, the ranges to an anchor show how far it is from the path's line, but not which part
-of that is height and which is distance across. An assumed height of 0 then moves every anchor away from the path, always
-outwards. Anchors near corners show their height. So the squared heights q of one robot's tag get the prior
+From a straight path, as along a corridor, the ranges to an anchor determine its distance from the path's line, but not which
+part of that is height and which is horizontal distance. An assumed height of 0 then moves every anchor away from the path,
+always outwards. The height of anchors near corners is observable. So the squared heights q of one robot's tag get the prior
 
     q_k = m + d_k,    m ~ N(0, (4 sigma)^2),    d_k ~ N(0, tau^2)
 
-in the place of independent ones, N(0, sigma^2). How alike they are, tau, has the mean of widths from hardly different to
-independent, weighted by their marginal likelihood (as in radio/prior_selection.py). Every height then has a prior of its own
-about the common mean, as wide as both are uncertain.
+instead of independent ones, N(0, sigma^2). Their spread tau is the mean of widths from nearly equal to
+independent heights, weighted by marginal likelihood (as in radio/prior_selection.py). Every height then has a prior of its own
+about the common mean, whose width contains the uncertainty of the mean and the spread.
 """
 
 from dataclasses import replace
@@ -27,9 +27,9 @@ _LEAST = 0.3
 _WIDTHS = 6
 """Spreads tried, evenly spaced in their logarithm."""
 _TOGETHER = 4.0
-"""Width of the prior of the mean, in those of single squares: all anchors of a hall may hang twice as high as usual ones."""
+"""Ratio of the prior width of the mean to that of a single square: all anchors of a hall may be twice as high as usual."""
 _FEWEST = 3
-"""Anchors from which on a mean stands for others."""
+"""Least number of anchors for a common mean."""
 
 
 def with_alike_heights(graph: Graph) -> Graph:
@@ -71,7 +71,7 @@ def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, f
         prior = wide**2 + spread**2 * np.eye(len(values))
         whole = measured + np.linalg.inv(prior)
         likely = 0.5 * (pulled @ np.linalg.solve(whole, pulled) - np.linalg.slogdet(whole)[1] - np.linalg.slogdet(prior)[1])
-        # What ranges and spread say of the mean, each anchor by how well it shows its height.
+        # Information about the mean from ranges and spread; each anchor is weighted by how well its height is determined.
         shown = np.linalg.inv(np.eye(len(values)) + spread**2 * measured)
         worth = (shown @ measured).sum() + wide**-2.0
         mean = float((shown @ pulled).sum() / worth)
@@ -79,7 +79,7 @@ def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, f
     likely, mean, variance, spread = np.array(found).T
     weight = np.exp(likely - likely.max())
     weight /= weight.sum()
-    # A square below 0 is none.
+    # A square cannot be below 0.
     middle = max(float(weight @ mean), 0.0)
     return middle, float(np.sqrt(weight @ (variance + (mean - middle) ** 2) + np.exp(2.0 * weight @ np.log(spread))))
 

@@ -1,25 +1,26 @@
-"""Covariances with correlated range errors: of anchors where the lidar holds the poses, of all that ranges alone hold.
+"""Covariances with correlated range errors: of anchors where the lidar determines the poses, of all where ranges alone do.
 
-A weight that counts many correlated errors as one treats each of them as a large error of its own. That suits the estimate, but
-the inverse H^-1 = (J^T W J)^-1 is not its covariance: too large in directions that few ranges determine, too small where
-correlated errors all have one sign. With the covariance R of the errors it is
+A weight that counts many correlated errors as one treats each of them as a large independent error. That is right for the
+estimate, but the inverse H^-1 = (J^T W J)^-1 is not its covariance: it is too large in directions that few ranges determine,
+and too small where correlated errors all have one sign. With the covariance R of the errors, the covariance of the estimate is
 
     H^-1 J^T W R W J H^-1
 
 (P. J. Huber, The behavior of maximum likelihood estimates under nonstandard conditions, 1967). One part of the errors is new
-in every range, the other changes with direction and distance alone, and the anchor's place absorbs much of it. How large both
-are, the residuals say: R is such that it would leave in them the scatter that they have (as in restricted maximum likelihood).
-So an anchor behind obstacles, whose ranges scatter by decimetres, is stated to be decimetres off though it fits: its ranges are
-all late, by an exponentially distributed way whose mean is as large as its scatter.
+in every range, the other changes only with direction and distance, and the anchor's place absorbs much of it. Their size is
+learnt from the residuals: R is scaled so that it would leave the observed scatter (as in restricted maximum likelihood).
+So an anchor behind obstacles, whose ranges scatter by decimetres, gets a sigma of decimetres although it fits: its ranges are
+all too long, by an exponentially distributed delay whose mean is as large as its scatter.
 
-What the errors of the poses add is the marginal covariance of the whole graph less H^-1. That is positive but for how far the
-two are linearised at different places; along a line of sight, where the curvature is all but nothing, that decides.
+The errors of the poses add the marginal covariance of the whole graph minus H^-1. This is positive, except that the two are
+linearised at different places; along a line of sight, where the curvature is almost zero, that difference matters.
 
 Without a lidar the poses follow such errors as the anchors do. Then H is that of the whole graph, and R counts in the place of
 W^-1 for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. The path also follows the common error of the ranges to all
-anchors: behind more walls all of them are later, never earlier, and there are more walls on a longer way. So half of the errors
-that last are of one anchor, by direction and distance, and half are of all, by distance. They are as large as the residuals of
-all anchors together say: a path that is bent towards ranges late through the same walls hides half of their errors.
+anchors: behind more walls all of them are longer, never shorter, and there are more walls over a longer distance. So half of
+the lasting errors belong to one anchor, by direction and distance, and half are common to all, by distance. Their size is
+learnt from the residuals of all anchors together: a path that is bent towards ranges delayed by the same walls hides half of
+their errors.
 """
 
 from dataclasses import replace
@@ -35,16 +36,17 @@ from ..graph.range_edges import RangeEdges
 from .range_noise import RangeNoiseConfig, distance_sums, steady_sums
 
 _STEADY = 0.7
-"""Share of the variance that changes with direction and distance alone: a half is assumed to be slow while nothing is learnt,
-and antennas, received power and the robot's own body make more of it than noise does."""
+"""Share of the variance that changes only with direction and distance: one half is assumed as slow before it is learnt, and
+antennas, received power and the robot's own body contribute more to it than noise does."""
 _ENOUGH = 30
-"""Ranges to an anchor from which on its errors are learnt, and its covariance with them; as many count the assumed error."""
+"""Least number of ranges from which an anchor's errors, and its covariance with them, are learnt; also the weight, in ranges,
+of the assumed error."""
 _SAMPLE = 200
-"""Ranges that stand for all where it is asked how much of an error shows in residuals."""
+"""Ranges of a sample from which the share of an error that remains in residuals is computed."""
 _NO_WEIGHT = 1e-12
-"""Weight of a range that counts for nothing."""
+"""Weight below which a range does not count."""
 _OUTLYING = 3.0
-"""Robust standard deviations as which residuals count at most."""
+"""Robust standard deviations to which residuals are clipped."""
 
 
 def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
@@ -67,7 +69,7 @@ def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Float
     for anchor, place in enumerate(around.unknowns.number["anchors"]):
         own = np.flatnonzero((edges.anchor == anchor) & (weights > 0.0))
         if place[0] < 0 or len(own) < _ENOUGH or np.trace(own_covariances[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1)):
-            continue  # given, hardly measured, or in a direction less known than it is far: nothing is linear there
+            continue  # given, hardly measured, or with an uncertainty above its distance: there the linearisation is invalid
         columns = np.unique(slopes[own].indices)
         inverse, factors = around.columns(columns)[columns], slopes[own][:, columns].toarray()
         variance = edges.sigma[own] ** 2 / weights[own]
@@ -105,7 +107,7 @@ def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, co
     whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
     among = whole[np.ix_(poses, poses)]
     pairs, sigmas = anchors.reshape(-1, 2), np.sqrt(np.maximum(np.diagonal(whole)[calibration], 0.0))
-    # What no edge touches stays infinite.
+    # Variances of unknowns without edges stay infinite.
     return replace(
         plain,
         poses=_grown(plain, among, moving),
@@ -171,7 +173,7 @@ def _scatter(
 ) -> float:
     """Return the standard deviation of ranges, m, that leaves residuals as large as they are.
 
-    A residual is (I - J H^-1 J^T W) times the errors of all ranges, and what other measurements move it by.
+    A residual is (I - J H^-1 J^T W) times the errors of all ranges, plus the effect of other measurements.
     """
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.flatnonzero(weights > 0.0)

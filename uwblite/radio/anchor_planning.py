@@ -21,20 +21,20 @@ from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
 """m; of a range in line of sight, and of one through walls, whose delay is not known."""
 _PRIOR = 3.0
-"""m; how well the position is known without ranges: it bounds the error where no anchor is in reach."""
+"""m; standard deviation of the position without ranges: it bounds the error where no anchor is in reach."""
 _CELL = 0.2
-"""m; the map is looked at in cells at least this large."""
+"""m; least size of the cells in which the map is evaluated."""
 _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
 """Cells at which the error is evaluated, and places offered to anchors: the time goes with their product."""
 _APART = 1.0
 """m; least distance between anchors."""
 _SWEEPS = 10
-"""Rounds of exchanges at most; two or three do."""
+"""Most rounds of exchanges; two or three are usually enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorPlan:
-    """Places for further anchors and what they give."""
+    """Places for further anchors and the expected errors with them."""
 
     places: Floats
     """(n, 2) m, map frame, the most useful first."""
@@ -163,7 +163,7 @@ def _wall_cells(blocked: Bools, free: Bools) -> Ints:
 def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
     """Return for which sources (a, 2) which targets (m, 2) the line of sight is free (a, m).
 
-    The first cell on the way is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
+    The first cell on the line is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
     """
     line_of_sight = np.zeros((len(sources), len(targets)), dtype=np.bool_)
     for k, source in enumerate(sources):

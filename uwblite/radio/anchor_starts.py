@@ -1,4 +1,4 @@
-"""Starting positions for the anchors of a graph that comes from elsewhere with ranges and no positions."""
+"""Starting positions for the anchors of an imported graph with ranges and no positions."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def search_anchors(graph: Graph) -> Graph | None:
     """Return the graph with anchors put where their ranges alone cost less from these poses, None where none does.
 
     An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there; the
-    search of trilateration sees over the hills between.
+    global search of trilateration avoids this.
     """
     anchors = graph.anchors.copy()
     for anchor in np.flatnonzero(~graph.fixed_anchors).tolist():

@@ -16,10 +16,10 @@ def bootstrap_graph(
 ) -> BootstrapResult:  # fmt: skip
     """Estimate poses and anchor positions without any guess of the anchors.
 
-    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path;
-    one that begins like an attempt before would go on like it, and ends there. In the order of their misfit, each goes on as
-    long as the ranges agree; the first that comes to the end wins. Where none does, the best of them is carried on if it began
-    clearly better than the heading as it is, and wins if it ends so.
+    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A
+    hypothesis that begins like an earlier attempt would continue like it, and is dropped. In the order of their misfit, each is
+    continued as long as the ranges agree; the first that reaches the end is taken. Where none does, the best of them is
+    continued if it began clearly better than the uncorrected heading, and is taken if it also ends better.
 
     Parameters
     ----------

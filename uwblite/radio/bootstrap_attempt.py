@@ -2,8 +2,8 @@
 
 Raw odometry of a long recording is too bent to linearise about, and anchors of unknown position cannot straighten it
 before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
-poses extends at both ends. Each piece is appended by the calibrated odometry, pulled onto the anchors already placed
-(graduated kernel: wide first, then tight), and whenever the interval has become longer by a share, all of it is solved
+poses extends at both ends. Each piece is appended by the calibrated odometry, optimised with the anchors already placed
+(graduated kernel: wide first, then tight), and whenever the interval has grown by a certain share, all of it is solved
 again and anchors not yet placed are searched from the poses so far.
 """
 
@@ -40,17 +40,17 @@ class BootstrapConfig:
     drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
     heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
-    """Relative heading errors of the odometry tried in this order until the ranges agree: a wrong track width in the
-    base's settings is the commonest gross fault, and a factor of two the commonest value."""
+    """Relative heading errors of the odometry, tried in this order until the ranges agree: a wrong track width in the
+    base's settings is the most frequent gross fault, and a factor of two its most frequent value."""
     agreement: ClassVar[float] = 2.0
     """Ranges agree when their median error is below so many standard deviations."""
     enough: ClassVar[float] = 50.0
-    """Travelled distance over which a heading error is tried before it is worth the whole path, m."""
+    """Travelled distance over which a heading error is tried before the whole path is, m."""
     tear: ClassVar[float] = 1.0
-    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was appended mirrored or in the
-    wrong place, however well its ranges agree."""
+    """Largest error of a step between keyframes by slip, m or rad; with a larger one a piece was appended mirrored or in the
+    wrong place, even if its ranges agree well."""
     clear_enough: ClassVar[float] = 0.35
-    """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""
+    """A first stretch is good when its anchors (up to three) have this mean score; 1 = placed without error, 0 = unclear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class Attempt:
 
         Parameters
         ----------
-        torn : go on where the trajectory is torn; no attempt that is torn agrees with the ranges later.
+        torn : continue where the trajectory has a jump; no attempt with a jump agrees with the ranges later.
         """
         if self.high == 0:
             self._begin()
@@ -142,7 +142,7 @@ class Attempt:
         return same and float(np.nanmax(apart)) < self.config.range_sigma
 
     def _place_the_rest(self) -> None:
-        """Put the anchors that stay unclear where they are likeliest."""
+        """Put the anchors that stay unclear at their likeliest places."""
         self.doubtful = np.array([self._unclear(self.hypotheses.get(k, [])) for k in range(len(self.placed))], dtype=bool)
         for anchor, hypotheses in self.hypotheses.items():
             if hypotheses and not self.placed[anchor]:
@@ -157,7 +157,7 @@ class Attempt:
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
 
-        A trajectory that is torn somewhere never agrees; without any anchor the misfit is 0.
+        A trajectory with a jump never agrees; without any anchor the misfit is 0.
         """
         low, high = self.low, self.high or len(self.path)
         part = self._part(low, high)
@@ -166,7 +166,7 @@ class Attempt:
         return max(median, self.config.agreement) if self._is_torn() else median
 
     def _is_torn(self) -> bool:
-        """Return whether a step of the known poses is not the odometry's."""
+        """Return whether a step of the known poses differs grossly from the odometry's."""
         low, high = self.low, self.high or len(self.path)
         steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))[low : high - 1]
         off = se2.between(steps, se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
@@ -208,7 +208,7 @@ class Attempt:
         return dict(zip(anchors, trilaterate_each(stretches, self.search, drift), strict=True))
 
     def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
-        """Place the anchors of which one hypothesis stands out; remember all; return whether any was placed."""
+        """Place the anchors with one clearly best hypothesis; keep all hypotheses; return whether any anchor was placed."""
         any_new = False
         for anchor, hypotheses in found.items():
             if hypotheses:
@@ -224,7 +224,7 @@ class Attempt:
         self.placed[anchor] = True
 
     def _extend(self, piece: float) -> bool:
-        """Lay on one piece at each open end by calibrated odometry; return whether it agreed with the anchors as it was."""
+        """Append one piece at each open end by calibrated odometry; return whether it agreed with the anchors unchanged."""
         motion = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
         agreed = True
         if self.high < len(self.path):

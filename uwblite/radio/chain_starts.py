@@ -1,10 +1,10 @@
 """Initial poses for the trajectories of several robots that only ranges and landmarks connect.
 
-Each chain is taken as rigid, as its odometry has it. Chains are placed one after another, the best tied first: for every
-heading R on a circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at
+Each chain is taken as rigid, with the shape of its odometry. Chains are placed one after another, the best connected first: for
+every heading R on a circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at
 b) means |a - R b - t| = d, which is trilateration of t; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t
-and |t|^2. Gauss-Newton steps in heading and place follow, with Cauchy weights, for odometry drifts and some ranges are
-wrong. Several hypotheses are kept from chain to chain; which is right is for the optimisation of the whole graph to say.
+and |t|^2. Gauss-Newton steps in heading and place follow, with Cauchy weights, because odometry drifts and some ranges are
+wrong. Several hypotheses are kept from chain to chain; the optimisation of the whole graph decides between them.
 """
 
 from dataclasses import replace
@@ -24,13 +24,13 @@ _HEADINGS = 24
 _STEPS = 15
 """Gauss-Newton steps from each."""
 _MOST_RANGES = 300
-"""Ranges looked at for one chain; more say the same again."""
+"""Most ranges used for one chain; more add no information."""
 _BEND = 0.5
-"""m; from this residual on a range counts less: what rigid chains are off after some minutes of odometry."""
+"""m; from this residual on a range gets less weight: the error of rigid chains after some minutes of odometry."""
 _KEPT = 4
 """Hypotheses kept."""
 _LEAST_RANGES = 4
-"""Three unknowns and one range that contradicts."""
+"""Least number of ranges: three unknowns and one range as a check."""
 
 
 def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
@@ -92,7 +92,7 @@ def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floa
 
 
 def _measured_from(graph: Graph, here: Bools) -> Floats:
-    """Return the anchors (a, 2), m, as edges from some of the poses place them; nan where they place none."""
+    """Return the anchors (a, 2), m, as placed by edges from some of the poses; nan where there are none."""
     kinds = (e for e in graph.edges if isinstance(e, RangeEdges | LandmarkEdges))
     found, lost = place_anchors(replace(graph, edges=tuple(e.rows(np.flatnonzero(here[e.pose])) for e in kinds)))
     anchors = found.anchors.copy()

@@ -1,11 +1,11 @@
-"""Anchors that were moved during a recording: two places explain what one place cannot.
+"""Anchors that were moved during a recording: two places explain ranges that one place cannot explain.
 
-With the path of the tag known well enough, all ranges to an anchor are explained by one place, or those until some moment
-by one place and those from that or a later moment on by another: an anchor that is carried is at neither meanwhile. What
-competes with a move is a change of the constant error: a robot that drives towards an anchor from afar, with a rack in between
-or a path that is wrong by some decimetres, has ranges that a place metres aside explains as well. So two places must explain
-clearly more ranges than one place with another constant error from then on, and than one high above the tag. Obstacles make
-ranges late, never early: a late range tells less of a move than an early one.
+With the path of the tag known well enough, either one place explains all ranges to an anchor, or one place explains those until
+some time and another place those from that or a later time on: an anchor that is carried is at neither meanwhile. The
+alternative to a move is a change of the constant error: a robot that drives towards an anchor from afar, with a rack in between
+or a path that is wrong by some decimetres, has ranges that a place metres away explains as well. So two places must explain
+clearly more ranges than one place with another constant error from then on, and than one place high above the tag. Obstacles
+make ranges longer, never shorter: a range that is too long is weaker evidence of a move than one that is too short.
 """
 
 from collections.abc import Sequence
@@ -17,55 +17,55 @@ from ..arrays import Floats
 from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
 
 _SPLITS = 7
-"""Moments tried first, evenly spread over the ranges."""
+"""Number of times tried first, evenly spread over the ranges."""
 _PROMISING = 0.5
 """Share of the gain that every other one of them must show before the rest is tried; moments are then not yet the best."""
 _LIKELY = 2
-"""Of them those, the best first, from which the search goes on."""
+"""Number of the best of them from which the search is continued."""
 _ROUNDS = 6
-"""Times, at most, that places and moment are found in turn; two or three are usual."""
+"""Most alternations between finding places and finding the time; two or three are usual."""
 _LEAST_MOVE = 0.8
-"""Shorter moves cannot be distinguished from a blocked line of sight, m; what the constant errors of both places differ by
-counts off."""
+"""Shorter moves cannot be distinguished from a blocked line of sight, m; the difference of the constant errors of both places
+is subtracted."""
 _FEWEST = 6.5
-"""Ranges that two places must explain and one place does not; of 600 anchors that stood still in rooms whose errors last, one
-came to more than 6.1."""
+"""Number of ranges that two places must explain and one place does not; of 600 unmoved anchors in rooms with lasting errors,
+one had more than 6.1."""
 _WAY = 0.3
-"""Share of its ranges, at most, that an anchor on a cart is measured at; two places that leave out more explain too little."""
+"""Largest share of ranges made while the anchor is carried; two places that leave out more explain too little."""
 _WORST_BIAS = 1.0
-"""Constant error of ranges to a place, m, beyond that of the worst radios: no anchor stood there."""
+"""Largest constant error of ranges to a place, m, above that of the worst radios; with a larger one no anchor stood there."""
 _STEP = 0.5
 """Change of a constant error that a line of sight blocked from some moment on explains, m."""
 _HEIGHTS, _LEAST_LEVEL = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 0.1
 """Heights that nobody gave, m, and the least level distance below an anchor, m: an anchor passed nearby and seen from afar at
 another time seems to have two places."""
 _LIKE_HEIGHT = 0.5
-"""Part of the least gain that suffices against a place with a height, which has fewer unknowns than two places."""
+"""Share of the least gain that is enough against one place with a height, which has fewer unknowns than two places."""
 _WIDTH = 4.0
 """Ranges farther from a place than so many of their standard deviations are not explained by it."""
 _LATE, _LATE_BY = 0.4, 0.2
 """A range that is late by e metres is unexplained by no more than _LATE + _LATE_BY e. The ratio of likelihoods: the normal
 core, one range in seven late, by 0.5 m on the mean and exponentially distributed, and gross errors, as early ranges are."""
 _CARRIED = 0.5
-"""A range between two places counts for so many that neither explains: less explained, it was made on the way."""
+"""Cost of a range made between both places, in unexplained ranges; a range with a larger cost was made while it was carried."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a move must show, by how well the trajectory is known."""
+    """Conditions for a move, by how well the trajectory is known."""
 
     ranges: int
-    """Ranges before the first moment tried and after the last. A moment at one of these ends is no minimum: it lies beyond, or
-    a path that is bent looks like a move; both places would hold ranges of each other."""
+    """Ranges before the first time tried and after the last. A time at one of these ends is no minimum: the minimum lies
+    beyond, or a bent path looks like a move; both places would have ranges of each other."""
     share: float
     """Part of all ranges that two places must explain and one place does not."""
 
 
 ON_GIVEN_PATH = Evidence(8, 0.05)
-"""Along a trajectory that other measurements hold: as many ranges determine a place."""
+"""Along a trajectory that other measurements determine: so many ranges determine a place."""
 ON_OWN_PATH = Evidence(20, 0.1)
-"""Along one that rests on ranges itself, and may be bent for a dozen of them; with blocked lines of sight for minutes, anchors
-that stood still came to 0.09."""
+"""Along a trajectory that ranges determine, and that may be bent for a dozen of them; with blocked lines of sight for minutes,
+unmoved anchors reached 0.09."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,9 +73,9 @@ class Move:
     """An anchor at two places."""
 
     left: float
-    """First range that is not from the first place any more, s."""
+    """Time of the first range that is no longer from the first place, s."""
     stamp: float
-    """First range from the second place, s; the same, where the anchor was not measured on its way."""
+    """Time of the first range from the second place, s; the same, where no range was measured while the anchor was carried."""
     first: AnchorHypothesis
     second: AnchorHypothesis
 
@@ -175,7 +175,7 @@ def find_move(
     if best.left == least or best.moment == len(ranges) - least:
         return None
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
-    # A place is traded against a constant error; that of a radio does not change because the radio is moved.
+    # Place and constant error are correlated; the constant error of a radio does not change when the radio is moved.
     beyond = move.distance - abs(move.second.bias - move.first.bias)
     if alone - best.unexplained < gain or beyond <= _LEAST_MOVE or best.moment - best.left > _WAY * len(ranges):
         return None
@@ -188,18 +188,18 @@ def find_move(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Split:
-    """The places that suit the ranges before and after some moments, and the moments that suit these places best."""
+    """The places that fit the ranges before and after some times best, and the times that fit these places best."""
 
     before: AnchorHypothesis
     after: AnchorHypothesis
     left: int
-    """First range that is not from the first place any more."""
+    """First range that is no longer from the first place."""
     moment: int
     """First range from the second place."""
     cost: float
-    """What the moments were chosen by: ranges left unexplained by their place, with those on the way."""
+    """Cost by which the times were chosen: ranges that their place does not explain, and those made between the places."""
     unexplained: float
-    """How many ranges the two places leave unexplained; those on the way by the better one of both."""
+    """Number of ranges that the two places leave unexplained; ranges made between them count by the better place."""
 
 
 def _converged(
@@ -225,7 +225,7 @@ def _converged(
 def _splits(
     path: Floats, ranges: Floats, moments: list[tuple[int, int]], width: float, config: TrilaterationConfig, least: int
 ) -> dict[tuple[int, int], _Split]:
-    """Fit places to the ranges before and after several pairs of moments."""
+    """Fit places to the ranges before and after several pairs of times."""
     parts = [part for left, first in moments for part in (slice(0, left), slice(first, None))]
     places = _fitted([(path[part], ranges[part]) for part in parts], width, config)
     each = zip(moments, places[::2], places[1::2], strict=True)
@@ -235,7 +235,7 @@ def _splits(
 def _split(
     path: Floats, ranges: Floats, before: AnchorHypothesis, after: AnchorHypothesis, width: float, least: int
 ) -> _Split:
-    """Choose the moments that suit two places best; the costs of all follow from running sums."""
+    """Choose the times that fit two places best; the costs of all follow from running sums."""
     low, high = least, len(ranges) - least
     by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
     until, since = (np.concatenate([[0.0], np.cumsum(by - _CARRIED)])[low : high + 1] for by in (by_one, by_other))
@@ -259,7 +259,7 @@ def _with_step(path: Floats, ranges: Floats, split: _Split, width: float, config
 
 
 def _with_height(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> float:
-    """Return how many ranges one place leaves unexplained that is higher above the tag than the level distances suppose."""
+    """Return how many ranges one place leaves unexplained that is higher above the tag than the horizontal distances assume."""
     level = [np.sqrt(np.maximum(ranges**2 - height**2, _LEAST_LEVEL**2)) for height in _HEIGHTS]
     places = _fitted([(path, each) for each in level], width, config)
     unexplained = []

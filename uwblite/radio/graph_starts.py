@@ -1,6 +1,6 @@
-"""Starts for the optimisation of a graph that comes from elsewhere: every chain and every anchor has a place.
+"""Starts for the optimisation of an imported graph: every chain and every anchor gets a place.
 
-Which minimum an optimisation finds depends on where it starts. Where no certificate (graph/certificate.py) says that it is the
+Which minimum an optimisation finds depends on its start. Where no certificate (graph/certificate.py) proves that it is the
 global one, further starts may lead to a lower one.
 """
 

@@ -1,16 +1,16 @@
 """Incremental optimisation of a graph whose initial values are only locally right: poses are added in time.
 
-Dead reckoning over kilometres bends so far that no descent from it finds the minimum: with anchors trilaterated on a
-bent path, the basin is lost after a few thousand poses. But the guess of the next hundred poses, laid onto what is
-known already, is always near. So poses are added in pieces. Each time the last few hundred are optimised while older
-ones hold them; the whole is optimised again when it is longer by half, or when the last part does not fit.
+Dead reckoning over kilometres drifts so far that no descent from it finds the minimum: with anchors trilaterated on a
+bent path, the start is outside the basin of convergence after a few thousand poses. But the guess of the next hundred poses,
+appended to the estimate so far, is always near. So poses are added in pieces. Each time the last few hundred are optimised
+with older ones fixed; the whole is optimised again when it is longer by half, or when the last part does not fit.
 
-An anchor joins when the ranges so far place it, and leaves again when later ranges contradict it: the mirror
+An anchor is added when the ranges so far place it, and removed again when later ranges contradict it: the mirror
 image of an anchor passed on one side is often found, and is recognised only after a turn.
 
-A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, chi2 over dof
-scattering by sqrt(2 / dof). What does not fit is tried, in this order, without the anchors that joined last, without
-the anchors most of whose ranges a robust kernel calls outliers, and with more and more of the older poses free.
+A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, each of
+sqrt(2 / dof). A part that does not fit is tried, in this order, without the anchors that were added last, without
+the anchors most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
 """
 
 from collections.abc import Iterator
@@ -41,21 +41,21 @@ _RESOLVE_FACTOR = 1.5
 _SIGNIFICANCE = 5.0
 """Standard deviations by which chi2 may exceed the usual."""
 _PROBATION = 400
-"""Poses after which an anchor that joined is no longer the first to be left out."""
+"""Number of poses after which a new anchor is no longer the first to be removed."""
 _MIN_RANGES = 20
 """Ranges before an anchor is searched."""
 _MAX_POSITION_SIGMA = 0.5
-"""An anchor less certain than this does not join yet, m."""
+"""An anchor less certain than this is not added yet, m."""
 _DRIFT = 0.1
 """Assumed error of the path over the ranges an anchor is searched from, m."""
 _OUTLIER = 4.0
 """Standard deviations beyond which a range is an outlier."""
 _OUTLIER_SHARE = 0.3
-"""An anchor with a larger share of outliers leaves."""
+"""An anchor with a larger share of outliers is removed."""
 _SEARCH = TrilaterationConfig(ambiguity=0.7)
 """How anchors are searched; stricter than usual, since another try comes soon."""
 _STEP = SolverConfig(max_iterations=30, relative_decrease=1e-4)
-"""Of the optimisations on the way."""
+"""Settings of the intermediate optimisations."""
 
 
 def optimize_incrementally(
@@ -109,7 +109,7 @@ class _Part(NamedTuple):
 
 
 class _Incremental:
-    """What is known so far: `graph` with the poses done, and which anchors have joined."""
+    """The estimate so far: `graph` with the poses done, and which anchors were added."""
 
     def __init__(self, graph: Graph, allowed: float = np.inf) -> None:
         self.graph, self.guess = graph, graph.poses
@@ -131,7 +131,7 @@ class _Incremental:
         self.usual = 1.0
 
     def _first_seen(self, given: Bools) -> Ints:
-        """Return when each anchor that is neither ranged nor known appears: then it is carried along with the path."""
+        """Return when each anchor appears that has neither ranges nor a known place: from then on it moves with the path."""
         first = np.full(len(given), len(self.guess))
         for kind in self.kinds:
             for anchors in kind.anchors:
@@ -163,7 +163,7 @@ class _Incremental:
             yield done
 
     def _lay_on(self, done: int, now: int) -> None:
-        """Continue the path by the guess's own motion, and with it the anchors that are carried along."""
+        """Continue the path by the motion of the guess, and move the anchors with it that have no ranges."""
         if not done:
             return
         poses, anchors = self.graph.poses.copy(), self.graph.anchors.copy()
@@ -186,7 +186,7 @@ class _Incremental:
             window *= _WIDENING
 
     def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
-        """Return the part as it fits without some anchors, which then leave; or as it is."""
+        """Return the part without some anchors if it fits then, and remove these; otherwise return it unchanged."""
         fresh = self.joined & self.ranged & (self.joined_at >= now - _PROBATION)
         for accused in (fresh, None):
             if accused is None:
@@ -211,7 +211,7 @@ class _Incremental:
         return self.ranged & (outliers > _OUTLIER_SHARE * np.maximum(measured, 1.0))
 
     def _solve(self, low: int, now: int, without: Bools | None = None, kernel: Kernel | None = None) -> _Part:
-        """Optimise poses low..now - 1 and the anchors that joined since; older ones hold them."""
+        """Optimise poses low..now - 1 and the anchors added since; older ones are fixed."""
         use = self.joined if without is None else self.joined & ~without
         fixed = {name: ~mask for name, mask in self.free.items()}
         part = replace(

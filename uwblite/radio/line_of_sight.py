@@ -1,7 +1,7 @@
-"""Which ranges were measured through something that the lidar saw.
+"""Which ranges were measured through obstacles that the lidar has mapped (NLOS).
 
-What stands between tag and anchor makes ranges longer, never shorter. Where such ranges come in the same directions again
-and again, no residual distinguishes the delay from another place of the anchor; the map does.
+Obstacles between tag and anchor make ranges longer, never shorter. Where such ranges occur in the same directions repeatedly,
+no residual distinguishes the delay from another place of the anchor; the map does.
 """
 
 import numpy as np
@@ -11,11 +11,12 @@ from ..arrays import Bools, Floats, Ints
 _CELL = 0.2
 """Side of a cell of the map, m; a wall is about as thick."""
 LEAST_POINTS = 3
-"""Points of clouds from which a cell is taken as a surface: people who pass leave fewer."""
+"""Least number of points of clouds in a cell with a surface: people who pass cause fewer."""
 _NEAR_TAG = 0.4
-"""The way through the robot itself does not count, m."""
+"""Length at the tag that does not count, m: it lies within the robot."""
 _NEAR_ANCHOR = 1.0
-"""Nor the last metre: an anchor hangs on a wall, and its place is not yet known better than that."""
+"""Length at the anchor that does not count, m: an anchor is mounted on a wall, and its place is not known better than this
+yet."""
 _MOST_CELLS = 100_000_000
 """A larger map (2 x 2 km) gets coarser cells; a bound on the memory."""
 _SAMPLES_AT_ONCE = 1 << 18
@@ -23,7 +24,7 @@ _SAMPLES_AT_ONCE = 1 << 18
 
 
 def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
-    """Return which straight ways (m,) from a tag to an anchor lead through a surface.
+    """Return which straight lines (m,) from a tag to an anchor pass through a surface.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
 def _over_map(start: Floats, ahead: Floats, length: Floats, cell: float, size: Floats) -> tuple[Ints, Ints]:
     """Return the first place (m,) of each way that is looked up and how many are: those half a cell apart over the map.
 
-    An anchor may be taken for kilometres away; the map ends where the lidar saw its last wall.
+    The estimate of an anchor may be kilometres away; the map ends at the farthest wall of the lidar.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         edges = (-cell - start) / ahead, (size + cell - start) / ahead  # a cell around the map: no rounding matters

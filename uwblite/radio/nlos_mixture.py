@@ -1,14 +1,14 @@
-"""What one anchor's range errors are made of: a core, a tail of detours, and nonsense.
+"""Mixture model of one anchor's range errors: a core, a tail of NLOS delays, and gross errors.
 
-A radio ray that meets no obstacle has a small error of either sign; one that goes around or through something comes late,
-never early. So the errors of an anchor are taken as a mixture of a normal core, the same core lengthened by an
-exponentially distributed detour, and a uniform rest of readings that mean nothing (lies, reflections, false detections)::
+A range in line of sight has a small error of either sign; one that goes around or through an obstacle is too long,
+never too short. So the errors of an anchor are modelled as a mixture of a normal core, the same core lengthened by an
+exponentially distributed detour, and a uniform rest of gross errors (reflections, false detections)::
 
     f(e) = (1 - p - u) N(e; c, s) + p EMG(e; c, s, t) + u / W
 
 All parameters come from the errors themselves by expectation maximisation (A. Dempster, N. Laird, D. Rubin 1977). The
 weights that then make least squares the maximum-likelihood estimate of the place of the mode m are s^2 psi(e) / (e - m)
-with psi = -f' / f: late errors pull less than early ones of the same size.
+with psi = -f' / f: positive errors get less weight than negative ones of the same size.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ _ROUNDS = 60
 _SHORTEST = 2.0
 """Least mean detour, in standard deviations of the core; a shorter one is no tail but a part of the core."""
 _CLEAN = 15.0
-"""Ranges to the core that are taken as seen beforehand: a few ranges alone show neither tail nor nonsense."""
+"""Prior number of ranges in the core: a few ranges alone determine neither tail nor gross errors."""
 _NARROWED, _PARTS = 5, 32
-"""Times that the interval with the mode is cut into so many parts: what is left of it is below a ten millionth."""
+"""Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
 _WIDEST = 2.0
-"""Nonsense is spread at least this wide, m."""
+"""Least width of the distribution of gross errors, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +42,9 @@ class RangeMixture:
     detour: float
     """Mean detour, m."""
     wild: float
-    """Share of nonsense, 0..1."""
+    """Share of gross errors, 0..1."""
     width: float
-    """Extent of the nonsense, m."""
+    """Width of the distribution of gross errors, m."""
 
     def core(self, errors: Floats) -> Floats:
         """Return the probability (m,) of each error to be of the core."""

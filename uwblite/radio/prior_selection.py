@@ -1,17 +1,17 @@
-"""How wide the priors of the radios' errors and of the units of length are: by the marginal likelihood of the recording.
+"""Widths of the priors of the radios' errors and of the units of length, chosen by marginal likelihood of the recording.
 
-Most radios are sound: their clocks are right to parts of a million and the maker calibrated the antennas to a few
-centimetres. Some are not: scales 7 % off and biases of a metre and more are on record. A prior wide enough for those
+Most radios are calibrated: their clocks are right to parts of a million and the maker calibrated the antennas to a few
+centimetres. Some are not: scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those
 leaves the others' anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path.
 So the priors' standard deviations are chosen by marginal likelihood, the probability of all measurements with the unknowns
 integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-Units of length: a radio measures times of flight and cannot be wrong by much, a wheel's radius is a setting and can be
-wrong by any factor. Whether the wheels' unit is wrong is decided: the likelier hypothesis holds, with its prior odds, and
-where nothing contradicts it, that all are right. The scale of the radios and their biases can be wrong by little or much:
-widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
-marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
-recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
+Units of length: a radio measures times of flight and cannot be wrong by much; a wheel's radius is a setting and can be
+wrong by any factor. For the wheels' unit there are two hypotheses: the likelier one, by posterior odds, is taken, and
+without contradiction this is that all units are right. The scale of the radios and their biases can be wrong by little or much:
+several widths, from calibrated to uncalibrated radios, are tried, and their mean (of the logarithms), weighted by
+marginal likelihood, is taken. A scale that is clearly off gets the widest prior. So a scale stays at its nominal value as long
+as the recording does not show it, is corrected in part where it is uncertain, and is free where the posterior odds are clear.
 Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. The marginal likelihood (Laplace) at the
 optimum is compared with that of another hypothesis: the wheels' unit is right, and the anchors are high.
 
@@ -32,18 +32,19 @@ from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.joint_covariance import calibration_covariance
 
 _STEPS = 4
-"""Widths tried from sound to unsound, evenly spaced in their logarithm."""
+"""Number of widths tried, from calibrated to uncalibrated radios, evenly spaced in their logarithm."""
 _WRONG_UNIT = 0.1
-"""Odds beforehand that the wheels' unit of length is wrong, against all units being right."""
+"""Prior odds that the wheels' unit of length is wrong, against all units being right."""
 _OFF = 1.0
-"""Odds beforehand that the radio's scale is off, by whatever order of magnitude, against being sound; and that biases are."""
+"""Prior odds that the radio's scale is off, by any order of magnitude, against being right; and the same of biases."""
 _CLEARLY = 3.0
-"""Posterior odds from which on the scale is off and floats; positive evidence (Kass and Raftery, Bayes factors, 1995)."""
+"""Posterior odds from which on the scale counts as off and is free; positive evidence (Kass and Raftery, Bayes factors,
+1995)."""
 _FARTHEST = 0.08
-"""Relative error beyond which no radio's scale is off: it measures times of flight. 0.07 is on record."""
+"""Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
 _SHORT, _TOO_SHORT = -0.01, 0.01
-"""Relative error from which on ranges are shorter than light allows, and the factor on the odds of a radio that says so: too
-long may come from late first paths, too short only from a wrong constant."""
+"""Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a radio:
+ranges too long may come from late first paths, ranges too short only from a wrong constant."""
 _HIGH = 6.0
 """Height above the tag of anchors in a large hall, m."""
 
@@ -51,7 +52,7 @@ _HIGH = 6.0
 def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
 
-    Lengths that a wrong unit stretched are put back, for a start; heights that were put back to 0 are free again.
+    As the start, lengths scaled by a wrong unit are scaled back; heights that were fixed at 0 are free again.
     """
     scales, heights = graph.calibration.of_kinds("odometry_scale"), graph.calibration.of_kinds(HEIGHT)
     stretched = 1.0 + float(np.mean(graph.calibration.values[scales])) if scales.any() else 1.0
@@ -123,7 +124,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
 
 
 def _unit_widths(units: Floats, likely: Floats) -> Floats:
-    """Return the widths (n,) to take of those under one hypothesis about the wheels (h, n), the first of a sound radio.
+    """Return the chosen widths (n,) from those under one hypothesis about the wheels (h, n), the first for a calibrated radio.
 
     Parameters
     ----------
@@ -159,12 +160,12 @@ def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats,
 
 
 def _odds(widths: int) -> Floats:
-    """Return the odds (widths,) beforehand of the widths from sound to unsound."""
+    """Return the prior odds (widths,) of the widths from calibrated to uncalibrated radios."""
     return np.append(1.0, np.full(widths - 1, _OFF / max(widths - 1, 1)))
 
 
 def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> Floats:
-    """Return the posterior mean (n,) of the unknowns were their prior standard deviations others."""
+    """Return the posterior mean (n,) of the unknowns under other prior standard deviations."""
     precision = np.linalg.inv(covariance)
     return np.asarray(np.linalg.solve(precision + np.diag(after**-2.0 - before**-2.0), precision @ mean))
 

@@ -1,4 +1,4 @@
-"""From keyframes to edges: what wheels and radio measured, with the noise that makes them commensurate."""
+"""Range edges from ranges attached to keyframes, and the noise that is learnt for them."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def range_edges(
 
 
 def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: TrilaterationConfig) -> Graph:
-    """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being fixed.
+    """Return the graph with anchors moved to places where clearly more of their ranges agree, with fixed poses.
 
     Parameters
     ----------
@@ -73,24 +73,24 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
 
 
 _LEVEL_SIGMA = 0.15
-"""Error of a path that the lidar holds, m."""
+"""Error of a path that the lidar determines, m."""
 _CLEARLY = 0.1
-"""Share of its ranges that must agree more with another place before an anchor is moved there."""
+"""Least additional share of its ranges that agree with another place, for an anchor to be moved there."""
 
 
 def learn_noise(
     edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig, steady: bool = False, blocked: Bools | None = None
 ) -> tuple[RangeEdges, tuple[RangeNoise, ...]]:
-    """Give every range the standard deviation that its anchor's residuals show, and a weight that counts slow errors once.
+    """Give every range the standard deviation learnt from its anchor's residuals, and a weight that counts slow errors once.
 
-    The weight is no part of sigma: whether a range is an outlier is judged by what one range scatters.
+    The weight is no part of sigma: the outlier test uses the scatter of a single range.
 
     Parameters
     ----------
     graph : estimates the residuals are taken at.
-    steady : count errors that depend on direction and distance alone once as well, see range_noise.steady_sigma: right for
-        anchors at given poses, and against anchors that lie for long. Poses do not feel such errors, since the anchors'
-        places absorb them; what matters for poses is that all ranges together hold the trajectory.
+    steady : also count errors once that depend only on direction and distance, see range_noise.steady_sigma: right for
+        anchors at given poses, and against sustained outliers. Such errors do not affect poses, since the anchors'
+        places absorb them; for poses, all ranges together must constrain the trajectory.
     """
     positions, sigma, weights = edges.tag_positions(graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
@@ -119,9 +119,9 @@ def learn_noise(
 
 
 def _delay_sigma(positions: Floats, delay: float, trust: Floats, noise: RangeNoise, steady: bool) -> Floats:
-    """Return the standard deviation (m,) to give an anchor's ranges through something for their delay.
+    """Return the standard deviation (m,) of an anchor's ranges through obstacles, from their delay.
 
-    For the anchor all of them together are one draw of the delay, since all are late; for a pose those from nearby are.
+    For the anchor, all of them together are one sample of the delay, since all are late; for a pose, those from nearby are.
     """
     if steady:
         return np.full(len(trust), delay * np.sqrt(max(float(trust.sum()), 1.0)))
@@ -129,6 +129,6 @@ def _delay_sigma(positions: Floats, delay: float, trust: Floats, noise: RangeNoi
 
 
 _ENOUGH_CLEAR = 30
-"""Ranges through nothing from which the noise is learnt from them alone."""
+"""Least number of ranges in line of sight from which the noise is learnt from these alone."""
 _LEAST_DELAY = 0.15
-"""What something in the way delays at least, m: a wall of 0.1 to 0.2 m whose permittivity is 4 and more."""
+"""Least delay of a range through an obstacle, m: a wall of 0.1 to 0.2 m whose permittivity is 4 and more."""

@@ -1,10 +1,10 @@
-"""How wrong ranges are, and how correlated the errors of neighbouring ranges are.
+"""Size of range errors, and correlation of the errors of neighbouring ranges.
 
 A radio's error is not white: multipath and antenna angle change slowly with the place, so a robot that stands or
-returns reads the same error again. Thousands of ranges taken as independent would outvote everything else. Here an
+returns measures the same error again. Thousands of ranges taken as independent would outweigh all other measurements. Here an
 anchor's residuals are split into a white part and a slow part that is correlated within a correlation length in space
 (variogram: Matheron 1963); a range with n correlated neighbours then gets the variance white + n slow, so that together
-they weigh as one sample of the slow part.
+they have the weight of one sample of the slow part.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class RangeNoise:
     """White and slow part of one anchor's errors."""
 
     white: float
-    """Standard deviation of what is new in every range, m."""
+    """Standard deviation of the part that is new in every range, m."""
     slow: float
     """Standard deviation of the correlated part, m."""
     length: float
@@ -65,7 +65,7 @@ def assumed(config: RangeNoiseConfig) -> RangeNoise:
 
 
 def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: RangeNoiseConfig) -> float:
-    """Return a first guess of the noise of all ranges, m, without any position: how far each range lies off the line
+    """Return a first guess of the noise of all ranges, m, without any position: the distance of each range from the line
     between its neighbours in time, to the same anchor (median absolute value, so outliers do not count).
 
     Parameters
@@ -95,7 +95,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     positions : (m, 2) tag at the ranges, m.
     residuals : (m,) m.
     weights : (m,) 0..1, robust weights; ranges below 0.5 are outliers and left out.
-    config : assumption that holds where there is too little to learn from.
+    config : assumption that is used where there are too few residuals.
     """
     kept = weights > 0.5
     prior = assumed(config)
@@ -128,7 +128,7 @@ def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats
 
 
 _MOST_PAIRED = 1500
-"""Ranges of an anchor whose pairs are counted, at most; more of them show no other correlation, at the square of the cost."""
+"""Most ranges of an anchor whose pairs are counted; more do not change the correlation, and the cost grows with the square."""
 
 
 def _fit(
@@ -149,13 +149,13 @@ def _fit(
 
 
 def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None = None) -> Floats:
-    """Return the standard deviation (m,) to give each of one anchor's ranges so that all together weigh what they measure.
+    """Return the standard deviation (m,) of each of one anchor's ranges with which all together get the right weight.
 
     Parameters
     ----------
     positions : (m, 2) tag at the ranges, m.
     noise : the anchor's noise.
-    weights : (m,) how far each range counts as a neighbour of others, 0..1; None = all 1.
+    weights : (m,) weight of each range as a neighbour of others, 0..1; None = all 1.
     """
     if noise.slow == 0.0 or len(positions) == 0:
         return np.full(len(positions), max(noise.sigma, 1e-6))
@@ -163,7 +163,7 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
 
 
 def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
-    """Return the standard deviation (m,) to give each of one anchor's ranges for their common error by direction and distance.
+    """Return the standard deviation (m,) of each of one anchor's ranges for their common error by direction and distance.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ _STEADY_LENGTH = 0.5
 
 
 def _polar(offsets: Floats) -> Floats:
-    """Return points (m, 3) that lie as far apart as directions, rad, and logarithms of distance do."""
+    """Return points (m, 3) whose distances are those of directions, rad, and of logarithms of distance."""
     distance = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.1)
     bearing = np.arctan2(offsets[:, 1], offsets[:, 0])
     return np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)

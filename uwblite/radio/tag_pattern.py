@@ -1,9 +1,9 @@
 """Range errors as a function of the anchor's direction in the robot's frame.
 
 The robot's own body shadows its tag (Otim et al., Electronics 8(11):1351, 2019), and an antenna's delay changes with the
-direction by centimetres to decimetres (bitcraze/crazyflie-firmware, issue 680): alike for all anchors, and however often a
-range is measured. Taken for noise, it shifts poses to one side wherever anchors stand on one side. Once clouds hold the
-trajectory, it is estimated with all else, as errors that ranges have in common (graph/marginals.py).
+direction by centimetres to decimetres (bitcraze/crazyflie-firmware, issue 680): equally for all anchors, and in every
+range. Taken as noise, it shifts poses to one side wherever anchors are on one side. Once clouds determine the
+trajectory, it is estimated with all other unknowns, as errors that ranges have in common (graph/marginals.py).
 """
 
 from dataclasses import replace
@@ -17,11 +17,11 @@ from ..graph.marginals import CommonErrors, Marginals
 from ..graph.range_edges import RangeEdges
 
 HARMONICS = 3
-"""Of the direction of an anchor in the robot's frame, of which the pattern of antenna and body is made."""
+"""Number of harmonics of an anchor's direction in the robot's frame, which model the pattern of antenna and body."""
 PATTERN_SIGMA = 0.05
-"""m; of each of the pattern's coefficients, 0.09 m together: 0.06 m of radiation patterns and 0.1 m behind a body."""
+"""m; prior of each of the pattern's coefficients, 0.09 m together: 0.06 m of radiation patterns and 0.1 m behind a body."""
 _TAG_X = 3
-"""Column of the calibration that is another for each tag of each recording."""
+"""Column of the calibration that differs between the tags of each recording."""
 
 
 def pattern_waves(angles: Floats) -> Floats:
@@ -31,7 +31,7 @@ def pattern_waves(angles: Floats) -> Floats:
 
 
 def without_pattern(edges: RangeEdges, graph: Graph, around: Marginals) -> RangeEdges:
-    """Return the ranges, each known to be too long by the pattern of its tag; every recording has its own.
+    """Return the ranges with the pattern of their tags as known delays; every recording has its own.
 
     Parameters
     ----------
@@ -46,5 +46,5 @@ def without_pattern(edges: RangeEdges, graph: Graph, around: Marginals) -> Range
     kind = np.zeros(each * len(tags), dtype=np.int64)
     found = around.estimated(CommonErrors(edges, edge, error.ravel(), shift.reshape(-1, 1), kind))
     late = PATTERN_SIGMA * np.sum(waves * found[error], axis=1)
-    # The residuals show what is left of it where some was taken off before.
+    # The residuals show the remaining pattern where a part was subtracted before.
     return replace(edges, late=late + edges.ranges - edges.corrected)

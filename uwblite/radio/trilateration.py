@@ -1,8 +1,8 @@
 """Initial positions of anchors from ranges along a path alone.
 
-An anchor's circle intersections are searched, not linearised: every cell of a coarse raster is scored by how many
-ranges agree with it up to one common bias (their median), so up to almost half of the ranges may lie. The best
-cells are refined one by one. A straight path leaves two mirrored positions of equal worth; both come back.
+The intersection of the circles is searched, not linearised: every cell of a coarse raster is scored by how many
+ranges agree with it up to one common bias (their median), so up to almost half of the ranges may be outliers. The best
+cells are refined one by one. A straight path leaves two mirrored positions that fit equally well; both are returned.
 """
 
 from collections.abc import Iterator, Sequence
@@ -58,7 +58,7 @@ def usable(ranges: Floats, config: TrilaterationConfig) -> Bools:
 
 
 def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift: float = 0.0) -> list[AnchorHypothesis]:
-    """Find where an anchor may stand.
+    """Find the possible places of an anchor.
 
     Parameters
     ----------
@@ -91,13 +91,13 @@ def trilaterate_each(
 
 
 _AT_ONCE = 8
-"""Stretches searched together; more of them no longer fit into a processor's cache."""
+"""Stretches searched together; more do not fit into the processor's cache."""
 
 
 def _of_one_size(
     stretches: Sequence[tuple[Floats, Floats]], config: TrilaterationConfig, drift: float
 ) -> Iterator[list[AnchorHypothesis]]:
-    """Yield the hypotheses of stretches of ranges of which equally many are looked at."""
+    """Yield the hypotheses of stretches of which equally many ranges are used."""
     picks = [np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64)) for _, ranges in stretches]
     picked = [(path[pick], ranges[pick]) for (path, ranges), pick in zip(stretches, picks, strict=True)]
     searched = [_raster_search(path, ranges, config) for path, ranges in picked]
@@ -138,13 +138,13 @@ def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | floa
 
 
 def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, Floats, float]:
-    """Return the best raster cells (s, 2), the bias (s,) that suits each, and the cell size, m."""
+    """Return the best raster cells (s, 2), the best bias (s,) of each, and the cell size, m."""
     reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma
     low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
     step = float(np.max(high - low)) / config.raster
     axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    # Single precision is enough to choose cells by, and takes half the time.
+    # Single precision is enough to choose cells, and takes half the time.
     across, along = (((axis[:, None] - place) ** 2).astype(np.float32) for axis, place in zip(axes, path.T, strict=True))
     error = ranges.astype(np.float32) - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
     bias = np.clip(row_medians(error), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
@@ -167,13 +167,13 @@ _MOST_STARTS = 10
 
 
 def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
-    """Return where descent starts (s, 3): each cell with no bias, and with the one that suits it where that is not small."""
+    """Return the starts (s, 3) of descent: each cell with no bias, and with its best bias where that is not small."""
     plain, biased = np.column_stack([cells, np.zeros(len(cells))]), np.column_stack([cells, bias])
     return np.concatenate([plain, biased[np.abs(bias) > _SMALL_BIAS * step]])
 
 
 _SMALL_BIAS = 0.5
-"""Cells; descent takes up a smaller bias by itself."""
+"""Cells; descent finds a smaller bias by itself."""
 
 
 def _refine(
