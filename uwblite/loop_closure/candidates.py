@@ -1,7 +1,7 @@
-"""Which pairs of sub-maps are worth matching: those that may overlap by the graph's covariance.
+"""Candidates for loop closures: pairs of sub-maps that may overlap by the graph's covariance.
 
-Where the graph's own covariance of two sub-maps is small, they are candidates when they ought to share surfaces; where
-it is large, when they might.
+Where the graph's own covariance of two sub-maps is small, they are candidates if they should share surfaces; where
+it is large, if they may share surfaces.
 """
 
 from collections.abc import Set
@@ -40,7 +40,7 @@ class Candidates(Table):
         return replace(self, target=target, source=source)
 
     def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
-        """Return (target, source, searched) of each, to remember what was tried."""
+        """Return (target, source, searched) of each, as a record of the pairs tried."""
         doubtful = self.spread > config.direct
         return {(int(a), int(b), bool(d)) for a, b, d in zip(self.target, self.source, doubtful, strict=True)}
 

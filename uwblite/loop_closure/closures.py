@@ -1,4 +1,4 @@
-"""Loop closures found so far, and the settings that all who seek them share."""
+"""Loop closures found so far, and the common settings of all searches for them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,8 +1,8 @@
-"""Loops closed where the way round is uncertain by many metres: long stretches of the path against each other.
+"""Loop closure where the pose after a loop is uncertain by many metres: long stretches of the path are matched.
 
-A search narrower than the uncertainty may miss the true place, and one as wide finds many places at which one sub-map of a
-corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
-(net_overlap). The surest pairs come first: a loop that is closed makes the others surer.
+A search narrower than the uncertainty may miss the true place, and a search over all of it finds many places at which one
+sub-map of a corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
+(net_overlap). The most certain pairs come first: each closed loop reduces the uncertainty of the others.
 """
 
 from dataclasses import replace
@@ -18,8 +18,8 @@ from .candidates import Candidates, propose, uncertain
 from .closures import LoopClosureConfig
 
 _LENGTH = 30.0
-"""Travelled distance of a stretch, m: several doors or pillars, and a chain of scans does not bend by more than the final
-matching forgives. Each begins in the middle of the one before."""
+"""Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays within the
+gate of the final matching. Each begins in the middle of the one before."""
 FARTHEST = 60.0
 """Largest half-width of a search, m; a bound on time and memory."""
 _AT_ONCE, _PART = 40, 8
@@ -42,7 +42,7 @@ def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
 def any_uncertain(
     graph: Graph, covariance: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig
 ) -> bool:
-    """Return whether any stretches are too uncertain for a search of sub-maps; see uncertain_pairs, which says which."""
+    """Return whether any stretches are too uncertain for a search of sub-maps; see uncertain_pairs, which lists them."""
     return uncertain(graph, covariance, reference, recording, _wide(config, FARTHEST), config.search_limit)
 
 
@@ -54,7 +54,7 @@ def uncertain_pairs(
     graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
     constrained: bool, config: LoopClosureConfig, farthest: float = FARTHEST,
 ) -> Candidates:
-    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the surest first.
+    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the most certain first.
 
     Parameters
     ----------

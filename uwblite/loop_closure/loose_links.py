@@ -1,7 +1,7 @@
-"""Links of the chain that no scan measures: the clouds next to each, once more against several of the other side.
+"""Steps of the chain that no scan measures: clouds on one side of each are matched again with several on the other side.
 
-A cloud seen in a fast turn, behind people or over a gap in the scans may match neither neighbour; the chain then rests on one
-step of the odometry there, and all that stands before it turns with that step.
+A cloud made in a fast turn, behind people or over a gap in the scans may match neither neighbour; the chain then depends on one
+step of the odometry, and an error of this step turns all poses before it.
 """
 
 from dataclasses import replace
@@ -20,13 +20,13 @@ from .closures import LoopClosureConfig
 from .slid_stretches import NEAR, directions_constrained, tied_parts
 
 _LEAST_CONSTRAINED = 2
-"""Directions that scans fix in a sound link: a bare corridor leaves the way along it to the odometry."""
+"""Least number of directions that scans fix in a measured link: along a bare corridor, only the odometry measures."""
 _ALL = 3
 """Directions of a pose."""
 _VIEWS = 6
-"""Keyframes of one side that make its sub-map; fewer are no part of a map."""
+"""Keyframes of one side that make its sub-map; fewer do not count as a part of a map."""
 _SINGLE = 3
-"""Keyframes of the other side that are each laid onto it: with more, the robot has turned to what neither has in common."""
+"""Keyframes of the other side that are each matched with it: after more, the views no longer overlap."""
 _LEAST_POINTS = 30
 """Clouds with fewer points are not matched."""
 _DISTANCE = 1.2
@@ -48,8 +48,8 @@ def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
 def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
     """Return the steps (b,) that no odometry measured (e,) and scan edges, of all visits, leave free in some direction.
 
-    Along a bare corridor a lidar alone does not see how far the robot went. Clouds that are neither neighbours nor of another
-    visit were laid onto each other where the chain had put them, and say no more than it.
+    Along a bare corridor a lidar alone does not measure the distance. Clouds that are neither neighbours nor of another
+    visit were matched at the poses of the chain, and add no information to it.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Fl
     large = np.flatnonzero(np.bincount(part)[part] >= _VIEWS)
     if not len(large):
         return large
-    # A few keyframes between two breaks are no part of their own: they count to the part before.
+    # A few keyframes between two breaks do not form a part: they belong to the part before.
     of = part[large[np.maximum(np.searchsorted(large, np.arange(len(part)), "right") - 1, 0)]]
     return np.flatnonzero(~measured & (of[wheels.i] != of[wheels.j]))
 
@@ -73,7 +73,7 @@ def _near_or_again(edges: Edges, path: Floats) -> Edges:
 
 
 def spanned(wheels: OdometryEdges, ties: RelativePoseEdges) -> Bools:
-    """Return which steps of the odometry (e,) ties between the two sides of links span."""
+    """Return which steps of the odometry (e,) are spanned by edges between the two sides of links."""
     low, high = np.minimum(ties.i, ties.j), np.maximum(ties.i, ties.j)
     return np.any((wheels.i[:, None] >= low) & (wheels.j[:, None] <= high), axis=1)
 
@@ -84,7 +84,7 @@ def contradicted(wheels: OdometryEdges, graph: Graph) -> Bools:
 
 
 def loosened(wheels: OdometryEdges, steps: Bools, config: LoopClosureConfig) -> OdometryEdges:
-    """Return the odometry with some steps (e,) as uncertain as wheels that slip."""
+    """Return the odometry with the uncertainty of slipping wheels in some steps (e,)."""
     root = wheels.sqrt_information.copy()
     root[steps] = np.diag(1.0 / np.array([config.slip, config.slip, config.slip_angle]))
     return replace(wheels, sqrt_information=root)
@@ -99,7 +99,7 @@ def propose(
     config: LoopClosureConfig,
     merging: SubmapConfig,
 ) -> tuple[Candidates, Submaps]:
-    """Return candidates that tie the two sides of links (l,), and the pieces of the recording that are matched for them.
+    """Return candidates that connect the two sides of links (l,), and the pieces of the recording that are matched for them.
 
     Parameters
     ----------
@@ -114,7 +114,8 @@ def propose(
 
 
 def _pieces(before: Ints, after: Ints, clouds: Clouds, recording: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return what is matched across links from keyframes before (l,) to after (l,): several clouds and a single one.
+    """Return the pieces that are matched across links from keyframes before (l,) to after (l,): several clouds and a single
+    one.
 
     Returns
     -------
@@ -122,7 +123,7 @@ def _pieces(before: Ints, after: Ints, clouds: Clouds, recording: Ints) -> tuple
     """
     start = np.searchsorted(recording, recording[before])
     end = np.searchsorted(recording, recording[before], "right")
-    # A sub-map that reached over another link would be broken itself.
+    # A sub-map across another link would itself contain an unmeasured step.
     sound, until = start.copy(), end.copy()
     sound[1:] = np.maximum(sound[1:], after[:-1])
     until[:-1] = np.minimum(until[:-1], before[1:] + 1)

@@ -1,7 +1,6 @@
-"""Where candidates for loop closures fit best: correlative search, alignment, comparison with each other's free space.
+"""Matching of candidates for loop closures: correlative search, alignment, comparison with each other's free space.
 
-Candidates are matched a few at a time, each batch with the sub-maps it needs: by one process after the other or by
-several, with the same outcome.
+Candidates are matched in batches, each with the sub-maps it needs: by one process or by several, with the same result.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,11 +27,11 @@ from .parallel import in_order
 _AT_ONCE = 32
 """Candidates of a batch."""
 _MANY_PLACES = 20
-"""Places found by a wide search that are matched before one is chosen: along a corridor many fit its walls."""
+"""Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
 _MANY_POINTS = 1000
 """Points of each of two long stretches that are compared at every place."""
 _SAME_PLACE = 0.3
-"""Matches nearer than this, m and rad, are one place."""
+"""Matches nearer to each other than this, m and rad, are one place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,20 +39,20 @@ class ClosureMatches:
     """How candidates (c,) fit."""
 
     best: Aligned
-    """Where each fits best; the guess where no place was found."""
+    """Best match of each; the guess where no place was found."""
     found: Bools
     """(c,) a place was found."""
     second: Floats
-    """(c,) what share of its matches another place reaches."""
+    """(c,) ratio of the matches at the second-best place to those at the best."""
     through: Floats
     """(c,) share of its points that would stand in free space."""
     net: Floats
-    """(c,) m, surface that speaks for the place, see net_overlap; inf where no wide search was made."""
+    """(c,) m, net matching surface, see net_overlap; inf where no wide search was made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Some candidates and all that matching them needs."""
+    """Some candidates and all data for matching them."""
 
     candidates: Candidates
     """Numbers of sub-maps are those of the batch."""
@@ -73,7 +72,7 @@ def fit(
 
     Parameters
     ----------
-    free : what each sub-map saw to be free; None = not asked.
+    free : observed free space of each sub-map; None = not tested.
     """
     total, done, parts = len(candidates.target), 0, []
     for part in in_order(_fit, _batches(candidates, submaps, config, search_config, free), executor):
@@ -164,7 +163,7 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
 
 
 def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
-    """Return one sub-map's cloud ready for the search; its normals point to the side it was seen from."""
+    """Return one sub-map's cloud ready for the search; its normals point to the side of the laser."""
     if k not in prepared:
         points, normals = clouds.cloud(k)
         prepared[k] = make_cloud(points, points + normals)
@@ -172,13 +171,13 @@ def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
 
 
 def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:
-    """Return which matches (c,), with net overlaps (c,), have enough and near points."""
+    """Return which matches (c,), with net overlaps (c,), have enough points and small distances."""
     enough = best.share >= min(config.overlap, config.overlap_after_search)
     return np.asarray(np.where(np.isfinite(net), net >= config.net_overlap, enough) & (best.rms <= config.sigma))
 
 
 def _free_space_violations(batch: _Batch, best: Aligned, promising: Bools) -> Floats:
-    """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free.
+    """Return the larger share of points (c,) of either sub-map that would stand in observed free space of the other.
 
     0 for those that are not promising (c,) and will be rejected anyway.
     """

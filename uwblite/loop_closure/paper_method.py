@@ -1,8 +1,8 @@
-"""Loop closures as the paper finds them: ICP between sub-maps that overlap where the first optimisation puts them.
+"""Loop closures by the paper's method: ICP between sub-maps that overlap after the first optimisation.
 
 One registration per pair, from the graph's guess; a pair is accepted when the fitness score, the mean squared distance
-of the source's points to the target, stays below a threshold. Nothing else is asked: no search, no uniqueness, no
-consistency among closures. ``loop_closure`` does what experience adds to that.
+of the source's points to the target, is below a threshold. There is no search, no test of uniqueness and no test of
+consistency among closures; the other modules of ``loop_closure`` add these.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ from .closures import Closures, LoopClosureConfig, collected
 from .parallel import in_order
 
 _CELL = 0.5
-"""m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""
+"""m, edge of squares; the overlap of two sub-maps is the share of the smaller one's squares in which both have points."""
 _LEAST_SHARED = 0.25
 """Least such share of a candidate."""
 _AT_ONCE = 32
@@ -34,7 +34,7 @@ def find(
     graph: Graph, submaps: Submaps, recording: Ints, config: LoopClosureConfig, icp: IcpConfig,
     progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
 ) -> Closures:
-    """Align every pair of sub-maps that overlap by the graph; keep all, with what became of them.
+    """Align every pair of sub-maps that overlap by the graph; keep all, with their outcomes.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
     worth = np.where((b - a > 1) | (first[a] != first[b]), shared[a, b], 0.0)
     order = np.lexsort((b, a, -worth))
     order = order[worth[order] >= _LEAST_SHARED]
-    # Best pairs first: a pair is kept while either of its sub-maps still has room.
+    # Best pairs first: a pair is kept while either of its sub-maps has fewer partners than the limit.
     used, kept = np.zeros(len(submaps), dtype=np.int64), []
     for row in order.tolist():
         if min(used[a[row]], used[b[row]]) < limit:
@@ -81,7 +81,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
 
 
 def _shared(poses: Floats, submaps: Submaps) -> Floats:
-    """Return (s, s) which share of the squares of the smaller sub-map the larger one has points in, too."""
+    """Return the share (s, s) of the squares of the smaller sub-map in which the larger one has points, too."""
     owner = submaps.clouds.owner
     points = se2.transform_each(poses, owner, submaps.clouds.points)
     cell = np.floor(points / _CELL).astype(np.int64)

@@ -1,6 +1,6 @@
-"""Work spread over processes, or over nothing: the answers come in the order of the tasks either way.
+"""Work spread over processes, or done in this one: the results come in the order of the tasks either way.
 
-Tasks are cut so that they do not depend on how many workers there are; so neither does any result.
+The division into tasks does not depend on the number of workers; so neither does any result.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -17,6 +17,6 @@ def in_order(work: Callable[[Task], Answer], tasks: Iterable[Task], executor: Ex
     Parameters
     ----------
     work : a function of a module, so that it can be sent to another process.
-    executor : any concurrent.futures executor; None = here and now, a task at a time.
+    executor : any concurrent.futures executor; None = in this process, one task at a time.
     """
     yield from map(work, tasks) if executor is None else executor.map(work, list(tasks))

@@ -1,7 +1,7 @@
-"""Stretches of the recording that closures slid along a corridor: the odometry would have to jump there, and back again.
+"""Stretches of the recording that closures shifted along a corridor: the odometry would have to jump there, and back again.
 
-Doors and pillars repeat. Closures that take one for the next agree with each other, and a robust odometry gives way at the
-two ends of the stretch that they move. A wheel slips once; it does not make good for it metres later by the same way.
+Doors and pillars repeat. Closures that confuse one with the next agree with each other, and a robust odometry allows jumps at
+the two ends of the stretch that they move. A wheel may slip once; it does not slip back by the same distance metres later.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 
 _JUMP = 0.5
-"""m; errors of one step of the odometry that are no noise."""
+"""m; errors of one step of the odometry that are larger than noise."""
 _TORN = 10.0
-"""Standard deviations of the same."""
+"""The same in standard deviations."""
 NEAR = 4
-"""Keyframes that a scan edge of the same visit spans, at most."""
+"""Most keyframes that a scan edge of the same visit spans."""
 _CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
 """Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
 _ALL = 3
@@ -24,7 +24,7 @@ _ALL = 3
 _AGREES = 4.0
 """Standard deviations within which a scan edge agrees with the map."""
 _MADE_GOOD = 0.3
-"""Part of a jump that may be left after the one that makes good for it."""
+"""Share of a jump that may remain after the opposite jump."""
 
 
 def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
@@ -66,9 +66,9 @@ def directions_constrained(graph: Graph) -> Ints:
 
 
 def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools) -> Ints:
-    """Return the part (k,) each keyframe belongs to: scan edges of any visits tie those of one in `least` directions or more.
+    """Return the part (k,) of each keyframe: scan edges of any visits connect keyframes in `least` directions or more.
 
-    Steps that such edges of the same visit hold together tie, too, and so do steps of the odometry that are sound (e,).
+    Steps that such edges of the same visit span connect, too, and so do steps of the odometry that are sound (e,).
     """
     constrained = (directions_constrained(graph)[wheels.i] >= least) | sound
     i, j = [wheels.i[constrained]], [wheels.j[constrained]]
@@ -89,7 +89,7 @@ def _fixed(edges: ScanEdges) -> Ints:
     """Return in how many directions, 0 to 3, scan edges (e,) fix a pose."""
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
     units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
-    # With the limits as units, an eigenvalue is over 1 where its direction has a sigma under the limit.
+    # With the limits as units, an eigenvalue is above 1 where its direction has a sigma below the limit.
     return np.asarray(np.sum(np.linalg.eigvalsh(information * np.outer(units, units)) > 1.0, axis=1))
 
 
@@ -106,7 +106,7 @@ def slid(graph: Graph) -> list[tuple[int, int, float]]:
 
 
 def moved_by(closures: RelativePoseEdges, graph: Graph) -> Floats:
-    """Return by how much (e,) a stretch slid that each closure ties to the rest, m; 0 = none did."""
+    """Return for each closure (e,) the shift of the stretch that it connects with the rest, m; 0 = no shifted stretch."""
     by = np.zeros(len(closures))
     for first, last, size in slid(graph):
         inside = [(k >= first) & (k <= last) for k in (closures.i, closures.j)]

@@ -1,10 +1,10 @@
 """Loop closures: which sub-maps show the same place, and the edges that follow for their poses.
 
-Candidates come from where the sub-maps lie by the graph, widened by its own marginal covariance. Where that
+Candidates are sub-maps that may overlap by the graph's poses and their marginal covariance. Where the covariance
 is small, matching starts from the graph's guess; where it is large, a correlative search over the whole uncertainty
 comes first. A match then has to explain enough points, closely enough, agree with the graph's own uncertainty, be the
 only good one, violate no free space, and finally agree with all other closures in the second optimisation.
-Every candidate is kept, with the reason for its fate.
+Every candidate is kept, with the reason for its outcome.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,11 +36,11 @@ def find(
     progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
     executor: Executor | None = None,
 ) -> Closures:
-    """Match candidates and judge each on its own.
+    """Match candidates and verify each on its own.
 
     Parameters
     ----------
-    free : what each sub-map saw to be free, see visibility.observed_free_space; None = free-space violations are not tested.
+    free : see visibility.observed_free_space; None = free-space violations are not tested.
     executor : any concurrent.futures executor; the result does not depend on it.
     """
     if not len(candidates.target):
@@ -61,7 +61,7 @@ def _judge(
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
     seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
-    # Only directions that the match can see are compared: project the error onto them.
+    # Only directions that the match measures are compared: project the error onto them.
     onto = seen @ information
     visible = np.einsum("eij,ej->ei", onto, error)
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
@@ -111,7 +111,7 @@ def _collect(
 
 
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
-    """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those at odds.
+    """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those that disagree.
 
     Returns
     -------
@@ -128,11 +128,11 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
 
 
 _SLID = 3
-"""How often, at most, stretches that slid are sought: without the closures that moved one, another may show."""
+"""Most searches for shifted stretches: without the closures that moved one, another may show."""
 
 
 def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
-    """Solve the graph with closures under a kernel that tightens; drop those at odds."""
+    """Solve the graph with closures under a kernel that tightens; drop those that disagree."""
     if not len(closures.edges):
         return graph, closures
     quick = replace(solver, relative_decrease=1e-5)
