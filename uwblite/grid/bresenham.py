@@ -5,8 +5,8 @@ Along its longer axis a ray of n steps advances one cell at a time; after k step
     floor((2 k d + n) / (2 n))
 
 cells along the other axis, where d <= n is the distance along that axis: the midpoint rule of J. E. Bresenham (Algorithm
-for computer control of a digital plotter, 1965) in closed form. So step k of all rays is a few array operations, and rays
-sorted by length are still under way as a prefix of the array.
+for computer control of a digital plotter, 1965) in closed form. So step k of all rays is a few array operations; with rays
+sorted by length, the unfinished ones are a prefix of the array.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..arrays import Bools, Ints
 
 _SINGLE_UP_TO = 256
-"""Steps up to which single precision decides every rounding rightly: values k d / n keep 1 / (2 n) off a tie that is not
-theirs, more than the rounding errors, and ties are lifted by the nudge."""
+"""Steps up to which every rounding is right in single precision: values k d / n that are no ties are at least 1 / (2 n) from
+a tie, more than the rounding errors, and ties are raised by the nudge."""
 
 
 def mark_rays(

@@ -1,4 +1,4 @@
-"""Where the cells of a map are: the only place that turns metres into cells and back."""
+"""Geometry of the cells of a map: the only module that converts metres to cells and back."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from ..errors import ConfigError
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 _STRIP = 256
-"""Rows of a map that are computed with at a time."""
+"""Rows of a map that are processed at a time."""
 _MARGIN = 2
-"""Cells added on every side of what a map must hold."""
+"""Cells added on every side of the area that a map must contain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,8 @@ class GridGeometry:
         return self.origin + self.resolution * np.array([self.cols, self.rows])
 
     def cell_of(self, points: Floats) -> tuple[Ints, Ints]:
-        """Return row and column (...) of the cells that hold points (..., 2), m; outside the grid they run on."""
+        """Return row and column (...) of the cells that contain points (..., 2), m; the numbering continues outside the
+        grid."""
         cell = np.floor((points - self.origin) / self.resolution).astype(np.int64)
         return cell[..., 1], cell[..., 0]
 
@@ -56,7 +57,7 @@ class GridGeometry:
         return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
 
     def strips(self) -> Iterator[slice]:
-        """Yield the rows in strips, for what takes many bytes per cell."""
+        """Yield the rows in strips, for computations that take many bytes per cell."""
         for start in range(0, self.rows, _STRIP):
             yield slice(start, min(start + _STRIP, self.rows))
 
@@ -96,10 +97,10 @@ class GridGeometry:
 
 
 def central_box(points: Floats) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of a box that holds what belongs together of points (n, 2), and no stray ones.
+    """Return the corners (2,) of a box around the points (n, 2) without outliers.
 
     The box around the central 98 % of each coordinate, wider by its longer side in every direction; never larger than the
-    box around all points. A path fills it; a pose that one wrong reading threw kilometres away lies outside.
+    box around all points. A path fits into it; a pose that one wrong reading displaced by kilometres lies outside.
     """
     low, high = np.quantile(points, _OUTER, axis=0, method="higher"), np.quantile(points, 1.0 - _OUTER, axis=0, method="lower")
     margin = max(float((high - low).max()), _LEAST_MARGIN)
@@ -109,4 +110,4 @@ def central_box(points: Floats) -> tuple[Floats, Floats]:
 _OUTER = 0.01
 """Share of the points left out on each side."""
 _LEAST_MARGIN = 10.0
-"""m; a robot that stands has no extent."""
+"""m; least size of the box: the path of a robot that stands has none."""

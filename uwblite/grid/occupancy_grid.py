@@ -1,13 +1,13 @@
 """The map: a grid of log-odds of being occupied, from rays through a binary Bayes filter (paper: step 3).
 
 A cell starts unknown, log-odds 0. Every scan contributes at most one observation to a cell: *hit* where a ray ended, *miss*
-where rays passed through (a hit of the same scan wins, so that rays grazing a wall do not wear it away). With independent
+where rays passed through (a hit of the same scan has priority, so that rays grazing a wall do not erase it). With independent
 scans Bayes' rule adds log-odds,
 
     l = hits log(p_hit / (1 - p_hit)) + misses log(p_miss / (1 - p_miss)),    |l| <= clamp,
 
-so only two counts per cell need be kept, their order does not matter, and work can be split and added up exactly. A person
-who stood somewhere for a few scans is outvoted by the later scans that see the place free.
+so only two counts per cell need be kept, the order of scans does not matter, and work can be split and added up exactly. A
+person who stood somewhere for a few scans is removed by later scans in which the place is free.
 """
 
 import math
@@ -30,7 +30,7 @@ FREE_BELOW = 0.196
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """States of a cell, numbered as in ROS nav_msgs/OccupancyGrid."""
 LEAST_CELL, LARGEST_CELL = 1e-4, 1e3
-"""Edges of cells, m, beyond which no map is drawn or read."""
+"""Limits of the edge of a cell, m; maps outside them are neither drawn nor read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
     log_odds = np.zeros(counter.hits.shape, dtype=np.float32)
-    # In strips: the products in double precision would be the largest arrays of all.
+    # In strips: the products in double precision would otherwise be the largest arrays.
     for rows in counter.geometry.strips():
         part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
         log_odds[rows] = np.clip(part, -config.clamp, config.clamp)

@@ -1,4 +1,4 @@
-"""Hits and misses: which cells of a grid rays end in and pass through, scan by scan."""
+"""Hits and misses: counts of the cells in which rays end and through which they pass, scan by scan."""
 
 from copy import copy
 from itertools import pairwise
@@ -98,7 +98,7 @@ class RayCounter:
         start = slot * window + begin[0] * width + begin[1]
         step = end - begin
         stops = None if walls is None else self._windows_of(walls, low, height, width)
-        # Stronger observations are written later and win.
+        # Stronger observations are written later and overwrite weaker ones.
         for rays, weight, stop in ((~hit, self._weak, stops), (hit, WEIGHT_UNIT, None)):
             if weight:
                 mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight, stop)
@@ -121,7 +121,7 @@ class RayCounter:
             flat[cell[begin:end]] += 1
 
     def _add_window(self, marks: NDArray[np.uint8], row: int, col: int) -> None:
-        """Add the misses of one scan, its window's first cell at (row, col); what lies outside the grid is dropped."""
+        """Add the misses of one scan, its window's first cell at (row, col); cells outside the grid are dropped."""
         top, left = max(-row, 0), max(-col, 0)
         part = marks[top : max(self.geometry.rows - row, 0), left : max(self.geometry.cols - col, 0)]
         if part.size:

@@ -1,4 +1,4 @@
-"""Laser scans as rays in the map frame, each ray from where the laser was at its own time."""
+"""Laser scans as rays in the map frame, each ray from the pose of the laser at its own time (deskewed)."""
 
 import math
 from dataclasses import dataclass

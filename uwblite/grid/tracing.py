@@ -1,8 +1,8 @@
 """Scans of recordings traced into one map.
 
-A beam that saw nothing is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
-Such beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
-wall that other beams have drawn. That takes a second walk over the scans, once the walls are known.
+A beam without a reading is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
+Such beams never mark cells as occupied; runs of adjacent ones clear space, with less weight, up to a given distance and never
+beyond a wall that other beams have drawn. This needs a second pass over the scans, once the walls are known.
 """
 
 import math
@@ -31,7 +31,7 @@ _TASKS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweeps:
-    """Scans of one recording and where the laser was."""
+    """Scans of one recording and the poses of the laser."""
 
     scans: LaserScans
     first: Floats
@@ -75,7 +75,7 @@ def from_sweeps(
     chosen = sum(len(task.chosen) for task in tasks)
     low, high = _around([task.extent() for task in tasks])
     if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
-        # Without the scans that lie far from all others.
+        # Scans that lie far from all others are left out.
         box = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
         tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
         low, high = _around([task.extent() for task in tasks])
@@ -140,7 +140,7 @@ class _Task:
         return self.first[part], None if self.last is None else self.last[part]
 
     def batches(self, empty: bool) -> Iterator[tuple[int, ScanRays]]:
-        """Yield (scans done, rays): of beams that saw something, or of those that saw nothing."""
+        """Yield (scans done, rays): of beams with a reading, or of those without."""
         for part in self._parts():
             yield part.stop, scan_rays(self.scans, self._reach(part, empty), *self._poses(part), flipped=self.flipped)
 
@@ -170,7 +170,7 @@ class _Task:
 def _trace(
     task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, report: Callable[[int], None]
 ) -> None:
-    """Trace the beams that saw something, or, where walls are given, those that saw nothing."""
+    """Trace the beams with a reading, or, where walls are given, those without."""
     if executor is None:
         for done, rays in task.batches(empty=walls is not None):
             _insert(counter, rays, walls)
