@@ -1,4 +1,4 @@
-"""What would one more unknown be, had the model had it? A score test: without solving the graph again."""
+"""Estimate of one further unknown that the model does not have, without solving the graph again (score test)."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
 
     With J, r and W of the whole graph and s the change of the residuals by one unit of the unknown: its value is -b / a and its
     standard deviation a^-1/2, with a = s^T W s - s^T W J H^-1 J^T W s and b = s^T W r - s^T W J H^-1 J^T W r (C. R. Rao, Large
-    sample tests of statistical hypotheses, 1948). All that the graph can explain by its own unknowns is taken off.
+    sample tests of statistical hypotheses, 1948). The part that the graph explains by its own unknowns is subtracted.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
     Returns
     -------
     (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly. And
-    (k, p, 2) by how much the poses' places would be others with each value, m.
+    (k, p, 2) the changes of the poses' places with each value, m.
     """
     normal = filled(graph, subtrees=True)
     lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
@@ -49,4 +49,4 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
 
 
 _ROUNDING = 1e-9
-"""Share of shifts that is left by rounding alone."""
+"""Share of the shifts below which the remainder is rounding error."""

@@ -1,8 +1,8 @@
-"""Anchors at given poses: the small problem that says where they are once a step has moved the poses.
+"""Anchors at given poses: the small problem that is solved for them after a step has moved the poses.
 
-An anchor with ranges along a line may stand anywhere on a bow: across the line its distance and its height trade off. A
-linear step leaves the bow, the cost of its ranges rises, and damping that holds the anchor holds the poses as well. Solved
-for themselves at the new poses, anchors are back on it (embedded point iterations: Y. Jeong, D. Nister, D. Steedly, R.
+An anchor with ranges along a line may lie anywhere on an arc: its distance across the line and its height are interchangeable.
+A linear step leaves the arc, the cost of its ranges rises, and damping that stops the anchor stops the poses as well. Solved
+alone at the new poses, anchors return to the arc (embedded point iterations: Y. Jeong, D. Nister, D. Steedly, R.
 Szeliski, I. S. Kweon, Pushing the envelope of modern methods for bundle adjustment, CVPR 2010).
 """
 
@@ -20,7 +20,7 @@ def with_anchors_solved(
     graph: Graph, before: Sequence[float], trial: Graph, linearized: list[Linearization],
     solve: Callable[[Graph], Graph],
 ) -> tuple[Graph, list[Linearization]]:  # fmt: skip
-    """Return a trial and its linearisation with the anchors solved for at its poses, where it costs too much by these alone.
+    """Return a trial and its linearisation with the anchors solved for at its poses, where only these make its cost too high.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def anchor_subproblem(graph: Graph, trial: Graph, linearized: Sequence[Lineariza
 
 
 def _touched(values: int, linearized: Sequence[Linearization]) -> Bools:
-    """Return which calibration values (values,) some edges touch."""
+    """Return which calibration values (values,) some edges depend on."""
     found = np.zeros(values, dtype=bool)
     for lin in linearized:
         for name, index, _ in lin.blocks:

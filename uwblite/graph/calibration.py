@@ -1,4 +1,4 @@
-"""Self-calibration: the scalar unknowns that a graph may carry, their kinds, and what is known of them beforehand."""
+"""Self-calibration: the scalar unknowns that a graph may contain, their kinds, and their priors."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
 """Kinds of unknowns of the lidar."""
 BIAS, HEIGHT, RANGE_SCALE = "bias", "height2", "range_scale"
 RADIO = (HEIGHT, "tag_x", "tag_y", "range_delay")
-"""Kinds of unknowns of the radio that the bootstrap does without."""
+"""Kinds of unknowns of the radio that the bootstrap does not use."""
 SHARED = (*LASER, RANGE_SCALE)
 """Kinds that all recordings have in common."""
 
@@ -86,7 +86,7 @@ def unknowns(
     config: CalibrationConfig, anchor_ids: tuple[str, ...], given_height: Bools, recording: int = 0,
     rises: tuple[float, ...] = (0.0,),
 ) -> tuple[Unknown, ...]:  # fmt: skip
-    """List the scalar unknowns that a recording with these anchors brings into a graph.
+    """List the scalar unknowns that a recording with these anchors adds to a graph.
 
     Odometry, tag and clocks, and the systematic errors of ranges to an anchor, are each recording's own: another robot,
     another tag, another day. The scale of the ranges and the mounting of the laser are shared by all.
@@ -166,7 +166,7 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
     def row(name: str, number: int) -> tuple[int, ...]:
         bias, height = (calibration.index(kind, name, tag=number) for kind in (BIAS, HEIGHT))
         x, y = (calibration.index(kind, tag=number) for kind in ("tag_x", "tag_y"))
-        # A tag as high as the first has its squared heights.
+        # A tag as high as the first one shares its squared heights.
         return scale, bias, calibration.index(HEIGHT, name) if height < 0 else height, x, y, delay
 
     table = [[row(name, number) for name in anchor_ids] for number in range(int(np.max(tags, initial=0)) + 1)]
@@ -193,7 +193,7 @@ def optimize_with_heights(
 ) -> tuple[Graph, SolverSummary]:
     """Return the graph at its optimum without a squared height below 0, and how the last search went; see solver.optimize.
 
-    Heights that come out negative are fixed at 0, and all else is solved again: it was at the optimum with them.
+    Heights that come out negative are fixed at 0, and all other unknowns are solved again.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def optimize_with_heights(
 
 
 def with_nonnegative_heights(graph: Graph) -> Graph:
-    """Return the graph with squared heights that came out negative put back to 0 and fixed."""
+    """Return the graph with negative squared heights set to 0 and fixed."""
     values = graph.calibration.values.copy()
     below = graph.calibration.of_kinds(HEIGHT) & (values < 0.0)
     values[below] = 0.0

@@ -5,10 +5,10 @@ headings z of magnitude 1 their sum is x^H M x + const, and with Lambda_k = Re(c
 
     S = M - diag(Lambda on headings, 0 on places)
 
-has the estimate in its null space. Where S is positive semi-definite, no poses and anchors whatever cost less:
+has the estimate in its null space. Where S is positive semi-definite, no other poses and anchors have a lower cost:
 F(x) >= x^H S x + F(estimate). Otherwise let eta be the smallest number with S + eta D >= 0, D = diag(1 on headings, 0 on
 places): no cost is below F(estimate) - eta times the number of headings. -eta is the smallest eigenvalue of the pencil
-(S, D). By Sylvester's law of inertia the signs of the pivots of S + eta D show on which side of it a number lies.
+(S, D). By Sylvester's law of inertia the signs of the pivots of S + eta D show whether a number is above or below it.
 
 Without the tangents this is the Lagrangian dual of the chordal problem (D. Rosen, L. Carlone, A. Bandeira, J. Leonard,
 SE-Sync, IJRR 2019; complex: T. Fan, H. Wang, M. Rubenstein, T. Murphey, CPL-SLAM, T-RO 2020) and, with ranges, that of
@@ -32,7 +32,7 @@ from .tangent_forms import TangentForm, outside
 from .unknowns import free_unknowns
 
 _SHARE, _NOTHING = 1e-6, 1e-3
-"""Share of chi2, and chi2 itself, that a global minimum may be above its bound: what rounding leaves."""
+"""Share of chi2, and chi2 itself, by which a global minimum may be above its bound: rounding error."""
 _ROUNDING = 1e-15
 """Error of a factor's pivots as a share of the largest of them."""
 _POLISHED = SolverConfig(relative_decrease=1e-15, max_iterations=30)
@@ -43,14 +43,14 @@ _HALVINGS = 12
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What is known of the global minimum."""
+    """Bound on the global minimum."""
 
     is_global: bool
     """No poses and anchors cost less, up to rounding."""
     lower_bound: float
     """No poses and anchors have a chi2 below this; 0 where nothing is known."""
     reason: str
-    """Why no more is known; empty where the minimum is global."""
+    """Reason why the minimum is not certified; empty where it is global."""
 
 
 def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
@@ -88,12 +88,12 @@ def certificate_matrix(graph: Graph) -> tuple[sparse.csc_matrix, Floats]:
 
 
 def _reduction(graph: Graph, form: TangentForm, measured: Bools) -> tuple[Ints, sparse.csr_matrix]:
-    """Return which numbers (m - 1,) are free, and what makes all of them from these and the heading of the map.
+    """Return which numbers (m - 1,) are free, and the matrix that gives all of them from these and the heading of the map.
 
-    What is fixed turns with the map. A place that no edge measured (all numbers,) costs nothing and stays where it is.
+    Fixed numbers turn with the map. A place without edges (all numbers,) does not change the cost and keeps its value.
     """
     kinds, floating = free_unknowns(graph), floating_components(graph)
-    # The place of a part that floats costs nothing; one of its poses is as good where it is as elsewhere.
+    # The place of a floating part does not change the cost; one of its poses may stay at its value.
     kinds["poses"][floating[floating >= 0]] = False
     places = np.concatenate([kinds["poses"], kinds["anchors"]]) & measured[: form.places]
     is_free = np.concatenate([places, kinds["poses"], [False]])

@@ -22,7 +22,7 @@ from .unknowns import free_unknowns
 
 def chordal_start(graph: Graph) -> Graph | None:
     """Return the graph with poses from its relative poses alone, None where these close no loop or leave a pose open, or
-    tie so many poses to so many others that the matrix would fill up.
+    connect so many poses with so many others that the matrix would fill up.
 
     What is fixed stays; anchors stay as well.
     """

@@ -1,4 +1,4 @@
-"""Which parts of a graph edges tie together; one that they tie to nothing fixed may stand anywhere as a whole."""
+"""Connected components of a graph; a component without a fixed unknown may move as a whole."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from .unknowns import free_unknowns
 
 
 def floating_components(graph: Graph) -> Ints:
-    """Return for each pose (n,) the first pose of its part, -1 where a fixed unknown or a prior holds the part."""
+    """Return for each pose (n,) the first pose of its part, -1 where a fixed unknown or a prior fixes the part."""
     n, nodes = len(graph.poses), len(graph.poses) + len(graph.anchors)
     first = {"poses": 0, "anchors": n}
     links, tied = [np.zeros((2, 0), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
@@ -40,7 +40,7 @@ def given_anchors(graph: Graph) -> Bools:
 
 
 def tied_chains(graph: Graph, chains: Ints) -> Bools:
-    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are given."""
+    """Return for each pose (n,) whether ranges or landmarks connect its chain with chain 0 or with given landmarks."""
     count = int(chains.max(initial=0)) + 1
     given = np.flatnonzero(given_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
     ends = [(np.zeros(len(given), dtype=np.int64), count + given)]

@@ -6,11 +6,11 @@ Marquardt needs of the part only the Schur complement
 
     S = H_ss - H_si H_ii^-1 H_is,    v = g_s - H_si H_ii^-1 g_i,
 
-which is what its machine sends: a dense matrix and a vector, however long the recording was. Sums of these, and the edges
-between parts, give the step of the shared unknowns, which is sent back; h_i = -H_ii^-1 (g_i + H_is h_s) follows where the
-part is. Every part is then linearised again, round by round. These are the very steps of the whole graph, so that they end in
-its minimum. (K. Ni, D. Steedly, F. Dellaert, Tectonic SAM, ICRA 2007; A. Cunningham, M. Paluri, F. Dellaert, DDF-SAM, IROS
-2010.) A group of parts is again a part: districts condense what their buildings send.
+which its machine sends: a dense matrix and a vector, whatever the length of the recording. Sums of these, and the edges
+between parts, give the step of the shared unknowns, which is sent back; h_i = -H_ii^-1 (g_i + H_is h_s) is computed on the
+machine of the part. Every part is then linearised again, round by round. These steps are exactly those of the whole graph, so
+that they end in its minimum. (K. Ni, D. Steedly, F. Dellaert, Tectonic SAM, ICRA 2007; A. Cunningham, M. Paluri, F. Dellaert,
+DDF-SAM, IROS 2010.) A group of parts is again a part: a district condenses the matrices of its buildings.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,7 +28,7 @@ from .partition import Part
 from .unknowns import Unknowns, moved
 
 _CONVERGED = 1e-9
-"""m and rad; a round that moves nothing by more is the last."""
+"""m and rad; a round in which no change is larger is the last."""
 _FIRST_DAMPING, _FIRST_BRAKE = 1e-10, 1e-5
 """Damping as a share of the diagonal: at first, and at least after a step that failed."""
 _EASED, _BRAKED = 0.1, 10.0
@@ -38,7 +38,7 @@ _MOST_ROUNDS = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condensed:
-    """What a part sends."""
+    """The condensed equations that a part sends."""
 
     numbers: Ints
     """(m,) its shared scalars among all shared ones."""
@@ -58,7 +58,7 @@ class Condensed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where the rounds ended."""
+    """Result of the rounds."""
 
     shared: Graph
     parts: tuple[Part, ...]
@@ -123,7 +123,7 @@ class _Interior:
         self.condensed = Condensed(used[order], corner, vector, normal.diagonal[self._shared])
 
     def moved(self, step: Floats) -> Part:
-        """Return the part moved by a step of all shared unknowns, its interior following."""
+        """Return the part after a step of all shared unknowns, with its interior solved for."""
         of_shared = step[self.condensed.numbers]
         whole = np.empty(self._unknowns.size)
         whole[self._own], whole[self._shared] = -self._alone - self._follow @ of_shared, of_shared
@@ -131,7 +131,7 @@ class _Interior:
 
 
 def _shared_step(normal: NormalEquations, condensed: list[Condensed], damping: float) -> Floats:
-    """Return the step of all shared scalars from what the parts sent and the edges that are no part's."""
+    """Return the step of all shared scalars from the condensed parts and the edges that belong to no part."""
     H, g, diagonal = normal.matrix, normal.gradient, normal.diagonal
     for sent in condensed:
         g[sent.numbers] += sent.vector

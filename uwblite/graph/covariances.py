@@ -1,4 +1,4 @@
-"""Covariances of the unknowns of an optimised graph, and what they say of the shape of its path."""
+"""Covariances of the unknowns of an optimised graph, and the expected error of the shape of its path."""
 
 from dataclasses import dataclass
 
@@ -29,11 +29,11 @@ class Covariances:
 def shape_error(poses: Floats, covariance: Floats) -> float:
     """Return the rms error of places (m) that is expected after alignment by a similarity.
 
-    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans the moves, the turn and the growth of the whole.
+    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans translation, rotation and scale of the whole.
 
     Parameters
     ----------
-    poses : (k, 3), as far apart as to stand for all. covariance : (3 k, 3 k) of them with each other.
+    poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
     """
     places = poses[:, :2] - poses[:, :2].mean(axis=0)
     own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)

@@ -1,23 +1,24 @@
-"""What a step of a descent says about those to come: how much they still bring, and how much damping they need."""
+"""Prediction of later steps of a descent from the last ones: the decrease of the cost to expect, and the damping."""
 
 import numpy as np
 
 _KEPT = 0.5
-"""Share of its promise below which a step went where the cost is no parabola, and predicts none of those to come."""
+"""Share of the predicted decrease below which the cost along a step is not quadratic, so that it predicts no later steps."""
 
 
 def extrapolated(decrease: float, last: float, promised: float) -> float:
-    """Return the sum of the geometric series that the last two decreases begin, where the steps keep what they promise."""
+    """Return the sum of the geometric series that the last two decreases begin, where the steps reach their predicted
+    decrease."""
     if not np.isfinite(last) or decrease < _KEPT * promised:
         return max(decrease, promised)
     return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
 
 
 def relaxed(ratio: float) -> float:
-    """Return the factor of lambda after a step that decreased the cost by this ratio of what it promised."""
+    """Return the factor of lambda after a step that decreased the cost by this ratio of the predicted decrease."""
     return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
 
 
 def as_much_again(decrease: float, last: float, promised: float) -> float:
-    """Return what is still to come where every step halves it, as a robust kernel's reweighting does at best."""
+    """Return the remaining decrease if every step halves it, as a robust kernel's reweighting does at best."""
     return max(decrease, promised)

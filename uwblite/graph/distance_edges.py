@@ -1,4 +1,4 @@
-"""Given distances, between anchors, and between points seen from poses.."""
+"""Given distances between anchors, and between points seen from poses."""
 
 from dataclasses import dataclass
 
@@ -45,7 +45,7 @@ class AnchorDistanceEdges(EdgeTable):
 class PointDistanceEdges(EdgeTable):
     """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.
 
-    The points are landmarks as the two poses saw them: between them the map has to have the measured length.
+    The points are landmarks as seen from the two poses: their distance in the map has to be the measured one.
     """
 
     i: Ints
@@ -71,7 +71,7 @@ class PointDistanceEdges(EdgeTable):
         return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
 
     def lengths(self, graph: Graph) -> Floats:
-        """Return the distances (e,), m, as the graph has them."""
+        """Return the distances (e,), m, at the graph's estimates."""
         return self._arms(graph)[3]
 
     def residuals(self, graph: Graph) -> Floats:

@@ -1,12 +1,12 @@
-"""Normal equations of a graph with further unknowns in small blocks, of which each touches many poses and no other block.
+"""Normal equations of a graph with further unknowns in small blocks, each connected with many poses and no other block.
 
 With the graph's normal equations H x = -g, and of the further measurements G among poses, B between blocks and poses and
 D among blocks, which is block diagonal:
 
     [[H + G, B^T], [B, D]] [x, s] = -[g + g_x, g_s].
 
-Without the blocks, the matrix of the poses alone would tie all that touch one block. With them it is sparse, and minimum degree
-leaves for late what is touched by many.
+If the blocks were eliminated first, the matrix of the poses would connect all poses of one block. With the blocks it is sparse,
+and minimum degree eliminates unknowns with many connections late.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def entries(rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int]) -
 
 
 def side_by_side(one: Blocks, other: Blocks) -> Blocks:
-    """Return the normal equations of the measurements of both, of which each has blocks of its own."""
+    """Return the normal equations of the measurements of both, each with its own blocks."""
     across = sparse.csr_matrix(sparse.vstack([one.across, other.across]))
     own, own_slope = np.concatenate([one.own, other.own]), np.concatenate([one.own_slope, other.own_slope])
     return Blocks(one.among + other.among, across, own, one.slope + other.slope, own_slope)
@@ -67,7 +67,7 @@ def sparse_rows(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
 
 
 _TRACE = 1e-12
-"""Damping, as a share of the diagonal: directions that nothing measures stay where they are."""
+"""Damping, as a share of the diagonal: unmeasured directions keep their values."""
 
 
 def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> "WithBlocks":
@@ -76,11 +76,11 @@ def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -
     Parameters
     ----------
     normal : of the graph, in the sparse layout (NormalEquations with subtrees).
-    order : of an earlier factor of measurements that touch the same.
+    order : of an earlier factor of measurements with the same pattern.
 
     Raises
     ------
-    SolverError : the matrix is singular, which damping hardly lets it be.
+    SolverError : the matrix is singular, in spite of the damping.
     """
     diagonal = normal.diagonal + blocks.among.diagonal()
     damping = sparse.diags(np.where(diagonal > 0.0, _TRACE * diagonal, 1.0))
@@ -90,8 +90,8 @@ def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -
 class WithBlocks:
     """Factor of [[H + G, B^T], [B, D]] that solves for the graph's unknowns: the inverse of H + G - B^T D^-1 B.
 
-    Every subtree of the elimination is contiguous, which the selected inverse needs: else ranges of columns hold unrelated
-    poses, and each hands on the rows of all others.
+    Every subtree of the elimination is contiguous, which the selected inverse needs: otherwise ranges of columns contain
+    unrelated poses, and each passes on the rows of all others.
     """
 
     def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks, order: Ints | None = None) -> None:
@@ -118,7 +118,7 @@ class WithBlocks:
 
     @property
     def L(self) -> sparse.csc_matrix:
-        """Lower triangle; SuperLU makes a copy of its factor where it is read."""
+        """Lower triangle; SuperLU copies its factor when it is read."""
         return self._lu.L
 
     @property

@@ -1,8 +1,8 @@
-"""Symbolic elimination of sparse, symmetric matrices: in which order, by which tree, and how much work, before any number.
+"""Symbolic elimination of sparse, symmetric matrices: order, elimination tree and work, from the pattern alone.
 
-The parent of a column in the elimination tree is the first row below its diagonal that its factor fills. A factor's own
-zeros do not show it: an entry that cancels, or that gets smaller than any number along a ring of a hundred poses, would cut
-the tree. So the tree is found from the pattern, and with it how many entries each column gets (J. Gilbert, E. Ng, B. Peyton,
+The parent of a column in the elimination tree is the first row below its diagonal in the factor. The nonzeros of a computed
+factor do not show it reliably: an entry that cancels, or that underflows along a ring of a hundred poses, would cut
+the tree. So the tree is found from the pattern, and with it the number of entries of each column (J. Gilbert, E. Ng, B. Peyton,
 An efficient algorithm to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
 """
 
@@ -28,7 +28,7 @@ def adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
 
 
 def pairs_of(matrix: sparse.csc_matrix) -> Ints:
-    """Return the pairs (b, 2) of columns that a symmetric matrix ties together."""
+    """Return the pairs (b, 2) of columns with an entry in a symmetric matrix."""
     column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
     below = matrix.indices > column
     return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.int64)
@@ -46,21 +46,21 @@ def narrow_order(pairs: Ints, nodes: int) -> tuple[Ints, Ints]:
 def is_full(reach: Ints) -> bool:
     """Return whether a large matrix, whose rows reach so far (n,) in a narrow order, fills up in any order.
 
-    It ties anything to anything. Counting by minimum degree takes many seconds for such a one, and less than its factorisation
-    for all others.
+    Such a matrix connects arbitrary unknowns. Counting by minimum degree takes many seconds for it, and less time than the
+    factorisation for all others.
     """
     return len(reach) > _SMALL and float(np.mean(reach)) > _WIDE * len(reach)
 
 
 _SMALL, _WIDE = 3000, 0.1
-"""Rows, and the share of them in the band of one. Streets of a town reach over a fiftieth."""
+"""Number of rows, and their share in the band of such a matrix. For the streets of a town it is a fiftieth."""
 
 
 def minimum_degree(pairs: Ints, nodes: int) -> Ints:
     """Return the order (nodes,) of elimination by multiple minimum degree.
 
-    SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, costs next to nothing after
-    that; a complete one takes as long as the fill that is in question.
+    SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, then takes almost no time; a
+    complete one would compute the fill that is only to be counted.
     """
     options = {"SymmetricMode": True, "Equil": False}
     pattern = adjacency(pairs, nodes)
@@ -71,7 +71,7 @@ def minimum_degree(pairs: Ints, nodes: int) -> Ints:
 def elimination_tree(pairs: Ints, order: Ints) -> Ints:
     """Return the parent (n,) of each column of the matrix with its nodes in this order; n = none.
 
-    Which nodes before one are tied together, the spanning tree with the earliest nodes tells as well as the graph.
+    The spanning tree with the earliest nodes has the same connected sets of earlier nodes as the graph.
     """
     n = len(order)
     lower = _lower_triangle(pairs, order)
@@ -91,9 +91,9 @@ def elimination_tree(pairs: Ints, order: Ints) -> Ints:
 def postorder(parent: Ints) -> Ints:
     """Return the order (n,) in which every subtree of an elimination tree is contiguous and ends at its root.
 
-    A depth-first walk from the roots, read backwards, is such an order; it costs no fill and makes neighbours in the order
-    neighbours in the factor. What a factorisation reads is then near in memory: chains that minimum degree halves again and
-    again, all of them together, take twice as long in its own order.
+    A depth-first walk from the roots, read backwards, is such an order; it adds no fill and makes neighbours in the order
+    neighbours in the factor. The memory accesses of a factorisation are then local: in its own order, minimum degree halves all
+    chains at the same time, and the factorisation takes twice as long.
     """
     n = len(parent)
     tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
@@ -110,8 +110,8 @@ def with_subtrees_contiguous(pairs: Ints, nodes: int) -> Ints:
 def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     """Return the scalars (n,) in each node's columns of the factor, its own among them, for the nodes in this order.
 
-    Row i of the factor fills the tree's paths from the nodes that i is tied to up to i. Counted along these paths: each node
-    that i is tied to adds one, where two paths meet one is taken off again, and so is one above i.
+    Row i of the factor has entries along the tree's paths from the neighbours of i up to i. The count along these paths: each
+    neighbour of i adds one, and one is subtracted where two paths meet and above i.
 
     Parameters
     ----------
@@ -139,9 +139,9 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
 
 
 def work(pairs: Ints, order: Ints, width: Ints) -> float:
-    """Return the multiplications of a factorisation with the nodes in this order, each as long as one of a dense matrix.
+    """Return the multiplications of a factorisation with the nodes in this order, in units of one of a dense matrix.
 
-    Columns that the next one continues are multiplied together; of others each waits for memory.
+    Columns with the pattern of the next one are multiplied together; others are slower because of memory access.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def work(pairs: Ints, order: Ints, width: Ints) -> float:
 
 
 _ALONE = 6.0
-"""Time of a multiplication of a column alone, in those of many together: measured with SuperLU."""
+"""Time of a multiplication in a single column relative to one in many columns together: measured with SuperLU."""
 
 
 def work_of(matrix: sparse.csc_matrix) -> float:
@@ -185,9 +185,9 @@ def _first_below(parent: Ints) -> Ints:
 
 
 def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
-    """Return where the paths from nodes `one` up and from later ones, `other`, meet, in a tree in postorder.
+    """Return where the paths up from nodes `one` and from later nodes `other` meet, in a tree in postorder.
 
-    The nodes from one up to the other lie below the place where they meet, and one of them next below it: it is the
+    The nodes from one up to the other lie below the node where the paths meet, and one of them is its child: so it is the
     highest of their parents.
     """
     highest = [parent]

@@ -24,12 +24,12 @@ from .schwarz_cg import expected_work
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
 _WIDEST_BORDER = 48
-"""Scalars that make a border; more of them are left to the sparse matrix."""
+"""Most scalars in a border; more of them stay in the sparse matrix."""
 _LONGEST_LINK = 16
-"""Poses; edges that reach farther make no chain."""
+"""Longest reach of an edge in a chain, poses."""
 _MANY, _TIED = 500, 4
 """From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
-meet, in the rooms of a site or the streets of a town only those nearby."""
+are connected, in the rooms of a site or the streets of a town only those nearby."""
 MOST_WORK = 4e9
 """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
 any poses and any others, however few, fill the whole matrix."""
@@ -99,8 +99,8 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
 def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
     """Return the order in which some poses come last and the others fill little.
 
-    What is left of a chain is a chain: it is halved again and again by blocks as long as its edges reach, so that few
-    of the last poses meet in any one elimination. (Minimum degree runs along the chain and gathers them all.)
+    The remainder of a chain is a chain: it is halved repeatedly by blocks as long as its edges reach, so that each
+    elimination connects few of the last poses. (Minimum degree runs along the chain and connects all of them.)
     """
     late = np.zeros(poses, dtype=bool)
     late[last[last >= 0]] = True

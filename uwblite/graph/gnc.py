@@ -8,8 +8,8 @@ for Robust Spatial Perception, RA-L 2020, equation 14)::
     w = 1                             r^2 <= mu / (mu + 1) c^2
     w = c / r sqrt(mu (mu + 1)) - mu  between
 
-Two things are our own: the search starts from the residuals of the estimate it is given instead of an optimum that
-trusts every edge, and one or two Gauss-Newton steps per mu are enough, since the next mu follows closely.
+Two differences from the source: the search starts from the residuals of the given estimate instead of an optimum with all
+edges as inliers, and one or two Gauss-Newton steps per mu are enough, since mu changes little.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -66,7 +66,7 @@ def optimize_gnc(
         outlier: the root of a chi-square quantile, 3 for ranges, 4 for poses.
     solver : of the last optimisation, with the weights decided.
     progress : called with (done, most) after every step, `most` being an estimate.
-    allowed : work, multiplications; half of it for the steps that decide. What is decided by then is optimised with the rest.
+    allowed : work, multiplications; half of it for the steps that find the weights, the rest for the last optimisation.
 
     Returns
     -------

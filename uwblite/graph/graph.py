@@ -1,9 +1,9 @@
-"""The pose graph: what is unknown (poses, anchors, calibration) and what edges that measure it offer.
+"""The pose graph: the unknowns (poses, anchors, calibration) and the interface of the edges that measure them.
 
 Edges of one kind are one dataclass of arrays. Each kind offers ``residuals(graph)`` and ``linearize(graph)``; both
 are whitened, so that the sum of squares is chi2 in units of the measurements' standard deviations. A new sensor is
 one more dataclass and one more row in the numeric-Jacobian test; the solver does not change. ``pose_edges`` and
-``range_edges`` hold what wheels, lidar and radio measure; knowledge of an unknown itself, a prior, stands here.
+``range_edges`` contain the measurements of wheels, lidar and radio; priors of unknowns are in this module.
 
 Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) in the map frame and ``calibration``
 (c,), a vector of named scalars. A step moves poses along arcs of constant twist and is added to the rest, see
@@ -66,7 +66,7 @@ class EdgeTable:
         return replace(self, **arrays)  # type: ignore[type-var]
 
     def followed_by(self, *others: Self) -> Self:
-        """Return these edges and then others of their kind; what all edges share is as these have it."""
+        """Return these edges followed by others of their kind; the values that all edges share are taken from these."""
         tables = (self, *others)
         arrays = {name: np.concatenate([getattr(t, name) for t in tables]) for name in self._by_edge() if name != "weights"}
         if any(t.weights is not None for t in tables):
@@ -80,7 +80,7 @@ class EdgeTable:
 
 
 class Edges(Protocol):
-    """What every kind of edges offers."""
+    """Common interface of all kinds of edges."""
 
     @property
     def kernel(self) -> Kernel:
@@ -107,12 +107,12 @@ class Edges(Protocol):
 
 
 class UnknownKey(NamedTuple):
-    """What a scalar unknown is: its kind, and the anchor, the recording and the robot's tag that it belongs to."""
+    """Identity of a scalar unknown: its kind, and the anchor, the recording and the robot's tag that it belongs to."""
 
     kind: str
     """One of the kinds of calibration.py."""
     anchor: str | None = None
-    """Id; None = of no single anchor."""
+    """Id; None = belongs to no single anchor."""
     recording: int | None = None
     """0, 1, ...; None = all recordings have it in common."""
     tag: int = 0
@@ -233,7 +233,7 @@ def whiten(sqrt_information: Floats, values: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorEdges(EdgeTable):
-    """Direct knowledge of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""
+    """Priors of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""
 
     block: str
     """'poses', 'anchors' or 'calibration'."""

@@ -1,4 +1,5 @@
-"""Covariances among chosen unknowns of an optimised graph: what is left once all others are eliminated."""
+"""Covariances among chosen unknowns of an optimised graph: the inverse of the matrix that remains once all others are
+eliminated."""
 
 from typing import cast
 
@@ -24,7 +25,7 @@ class JointCovariance:
     """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
 
     def __init__(self, graph: Graph, poses: Ints) -> None:
-        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix."""
+        """Eliminate all other unknowns; the rest of the factor is that of the poses' own information matrix."""
         numbers, first, lower, pivots, place = _end(graph, poses)
         number = numbers["poses"]
         self._graph = graph
@@ -84,7 +85,7 @@ _OPEN = 1e12
 
 
 def _end(graph: Graph, poses: Ints | None) -> tuple[dict[str, Ints], int, Floats, Floats, Ints]:
-    """Return the end of a graph's factor H = L D L^T: what is left once all else is eliminated.
+    """Return the end of a graph's factor H = L D L^T: the part after all other unknowns are eliminated.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def _end(graph: Graph, poses: Ints | None) -> tuple[dict[str, Ints], int, Floats
     place = factor.perm_c[first:].astype(np.int64)
     inside = np.sort(place)
     lower, pivots = factor.L, factor.U.diagonal()[inside]
-    # They hold the factor twice more, and what it was made of.
+    # These contain two further copies of the factor, and the matrix.
     del normal, factor
     return number, first, _dense(lower, inside), pivots, np.searchsorted(inside, place)
 

@@ -12,7 +12,7 @@ from .robust import Kernel
 
 
 def closing(graph: Graph) -> list[Bools | None]:
-    """Return for each kind of edges which of them (e,) close loops; None for what is no relative pose."""
+    """Return for each kind of edges which of them (e,) close loops; None for kinds that are no relative poses."""
     seen = np.zeros(len(graph.poses), dtype=bool)
     found: list[Bools | None] = []
     for e in graph.edges:
@@ -28,7 +28,7 @@ def closing(graph: Graph) -> list[Bools | None]:
 
 
 def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
-    """Return the graph with a robust kernel on every edge but relative poses that close no loop."""
+    """Return the graph with a robust kernel on every edge except relative poses that close no loop."""
 
     def parts() -> Iterator[Edges]:
         for e, loop in zip(graph.edges, closing(graph), strict=True):
@@ -50,11 +50,11 @@ class Misfit:
     off: int
     """How many of them are off by more than _OFF standard deviations."""
     worst: tuple[int, int]
-    """The poses of the one that is off most; -1 where there is none."""
+    """The poses of the closure with the largest error; -1 where there is none."""
 
     @property
     def most(self) -> bool:
-        """Most closures are off: they contradict each other, or state a precision that they have not."""
+        """Most closures are off: they contradict each other, or their stated precision is too high."""
         return 2 * self.off > self.closures
 
 

@@ -21,37 +21,37 @@ from .unknowns import Unknowns, moved
 from .variance_components import variances_of_kinds
 
 _COMMON_AT_ONCE = 32
-"""Common errors solved for together: bounds the memory."""
+"""Common errors that are solved for together; bounds the memory."""
 _MOST_KEPT = 1 << 23
-"""Numbers of their solution that are kept; more are solved for once more."""
+"""Most numbers of their solution that are kept; a larger solution is computed again when needed."""
 _MET_AT_ONCE = 1 << 14
 """Rows of a table of common errors in memory at once."""
 _AT_ONCE = 300
-"""Right-hand sides solved together: bounds the memory."""
+"""Right-hand sides solved together; bounds the memory."""
 _DEPENDENT = 1e-13
-"""Pivot, as a share of its diagonal entry, below which a direction counts as measured by nothing."""
+"""Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonErrors:
-    """Independent errors of unit variance, each of which many edges of one kind have in common."""
+    """Independent errors of unit variance, each common to many edges of one kind."""
 
     edges: Edges
     edge: Ints
     """(m,) edge."""
     error: Ints
-    """(m,) number of the error that it meets."""
+    """(m,) number of the error that affects it."""
     shift: Floats
     """(m, d) change of the edge's whitened residual by that error."""
     kind: Ints
-    """(k,) kind of each error: those of one have one variance, of which 1 is a guess."""
+    """(k,) kind of each error: errors of one kind have one variance, with 1 as the first guess."""
 
 
 class Marginals:
     """The inverse of a graph's normal equations, and the covariances of its unknowns given all its measurements.
 
-    `solve`, `columns` and `relative` are of the inverse alone, `covariances` contains what common errors add. A direction that
-    edges leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    `solve`, `columns` and `relative` use the inverse alone, `covariances` contains the part of common errors. An undetermined
+    direction (a mirror image, a floating part of the graph) has a variance of about 1e12 in units of its curvature.
     """
 
     def __init__(
@@ -71,22 +71,23 @@ class Marginals:
             self._add_common(errors, blocks)
         sigmas = np.sqrt(blocks["calibration"][:, 0, 0])
         self.covariances = Covariances(blocks["poses"], blocks["anchors"], sigmas, chosen, self._among)
-        """With what common errors add."""
+        """Including common errors."""
 
     def corrected(self) -> Graph:
-        """Return the graph, an optimised one, at the optimum that it has when its common errors are estimated with all else.
+        """Return the optimised graph at the optimum with its common errors estimated together with all other unknowns.
 
-        To first order, as errors of a centimetre are; what edges have in common changes no other weight. (Best linear
+        To first order, which is enough for errors of a centimetre; common errors change no other weight. (Best linear
         unbiased prediction: C. R. Henderson, Biometrics 31, 1975.)
         """
         return moved(self._graph, self.unknowns, self._correction)
 
     def estimated(self, common: CommonErrors) -> Floats:
-        """Return the values (k,) of errors that edges of the graph have in common, estimated with all else."""
+        """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns."""
         return self._estimated(common)[1]
 
     def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
-        """Add what estimated common errors u make: H^-1 J^T W S times u to the estimates, times their covariance to these."""
+        """Add the effect of estimated common errors u: H^-1 J^T W S times u to the estimates, times their covariance to
+        these."""
         times, errors, covariance = self._estimated(common)
         self._correction -= times(errors)
         root = np.asarray(np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance))), dtype=np.float64)
@@ -102,7 +103,7 @@ class Marginals:
         """Estimate errors that edges have in common: return H^-1 J^T W S as what multiplies by it, values (k,) and covariance
         (k, k).
 
-        The errors u are unknowns with the prior N(0, G); how large those of each kind are, the residuals say, see
+        The errors u are unknowns with the prior N(0, G); the variance of each kind is learnt from the residuals, see
         variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r.
         """
         slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
@@ -116,7 +117,7 @@ class Marginals:
             if few:
                 kept[:, some] = moves
         variances = variances_of_kinds(seen, products, kind)[kind]
-        # As products of roots of G: a kind that is hardly there has no inverse.
+        # With products of roots of G: a variance near 0 has no inverse.
         root = np.sqrt(variances)
         inside = np.linalg.inv(root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root)))
         covariance = root[:, None] * inside * root
@@ -167,7 +168,7 @@ class Marginals:
         return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
 
     def redundancy(self, edges: Edges) -> Floats:
-        """Return how far each residual (e, d) of some of the graph's edges is checked by all others: 0 not at all, 1 fully.
+        """Return the redundancy of each residual (e, d) of some of the graph's edges: 0 = not checked by others, 1 = fully.
 
         1 - w j H^-1 j^T for each row j of the Jacobian (W. Baarda, A testing procedure for use in geodetic networks, 1968):
         the sum over residuals is what the sum of their squares is expected to be.
@@ -180,7 +181,7 @@ class Marginals:
         covariance = np.zeros(row.shape)
         covariance[free] = selected_inverse(self._factor, row[free], column[free])
         explained = np.einsum("edk,ekl,edl->ed", jacobian, covariance, jacobian)
-        # Along open directions the covariance is round-off.
+        # In undetermined directions the covariance is rounding error.
         return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
@@ -189,7 +190,7 @@ class Marginals:
         return relative_covariances(self._graph, i, j, self.covariances.poses[i], self.covariances.poses[j], self._cross(i, j))
 
     def _cross(self, i: Ints, j: Ints) -> Floats:
-        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
+        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the smaller set."""
         if len(np.unique(i)) < len(np.unique(j)):
             return self._cross(j, i).transpose(0, 2, 1)
         number = self.unknowns.number["poses"]
@@ -251,7 +252,7 @@ def marginals(
 ) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
-    Those of single unknowns, and of the poses `among`, contain what common errors add.
+    Those of single unknowns, and of the poses `among`, contain common errors.
 
     Parameters
     ----------
@@ -262,4 +263,4 @@ def marginals(
 
 
 _COLUMNS_AT_ONCE = 16
-"""Columns of an inverse solved for at once; a bound on the memory, for each is as long as there are unknowns."""
+"""Columns of an inverse solved for at once; a bound on the memory, since each has the length of all unknowns."""

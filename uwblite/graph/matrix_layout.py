@@ -1,6 +1,6 @@
-"""Where the values of a symmetric matrix, kept as blocks of its lower triangle, go before they are factorised.
+"""Layouts of a symmetric matrix, kept as blocks of its lower triangle, for factorisation.
 
-The places are found once; each factorisation then gathers the values with one indexing operation.
+The places of the values are found once; each factorisation then gathers the values with one indexing operation.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Blocks:
         return int(np.max(self.start + self.height * self.width, initial=0))
 
     def inside(self, size: int) -> "Blocks":
-        """Return the blocks within the first rows and columns; no block lies across."""
+        """Return the blocks within the first rows and columns; no block crosses this limit."""
         keep = self.row < size
         row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
         return Blocks(row, column, height, width, start, size)
@@ -107,17 +107,17 @@ class SparseLayout:
         self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
 
     def factor(self, values: Floats) -> SuperLU:
-        """Factorise the matrix with these values; it is used up by the next call."""
+        """Factorise the matrix with these values; the next call overwrites it."""
         return superlu(self.matrix(values), "NATURAL")
 
     def matrix(self, values: Floats) -> sparse.csc_matrix:
-        """Return the matrix with these values; it is used up by the next call."""
+        """Return the matrix with these values; the next call overwrites it."""
         np.take(values, self._source, out=self._matrix.data)
         return self._matrix
 
 
 class IterativeLayout:
-    """Both triangles in compressed columns, and where their pieces are."""
+    """Both triangles in compressed columns, and the places of their pieces."""
 
     def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
         """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
@@ -147,7 +147,7 @@ class BandedLayout:
 
 
 class BorderedLayout:
-    """A large matrix inside, and a border of few rows that are full."""
+    """A large inner matrix, and a border of few full rows."""
 
     def __init__(self, inside: Layout, blocks: Blocks, size: int) -> None:
         """Find where in the border each value goes; the first `size` rows are inside."""

@@ -1,8 +1,8 @@
-"""Normal equations of a graph: where every product of Jacobians lands is analysed once, the values are filled often.
+"""Normal equations of a graph: the place of every product of Jacobians is analysed once, the values are filled often.
 
 A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
 H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration
-values touch many poses and therefore take no part in the ordering: they come last. Scalars are numbered in the order of
+values share edges with many poses and are therefore not ordered: they come last. Scalars are numbered in the order of
 elimination, so that vectors need no permutation.
 """
 
@@ -32,7 +32,7 @@ _Block = tuple[str, Ints, tuple[int, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Places:
-    """Where the products of some edges of one kind land."""
+    """Places of the products of some edges of one kind."""
 
     products: NDArray[np.int32]
     """Place of every product of two Jacobian columns among the values."""
@@ -48,7 +48,7 @@ class NormalEquations:
     def __init__(
         self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False, last: Ints | None = None
     ) -> None:
-        """Number the unknowns and find where every product lands.
+        """Number the unknowns and find the place of every product.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class NormalEquations:
             node[name] = np.where(mask, first + np.cumsum(mask) - 1, -1)
             first += count
         touched = [[(node[name][index], name == "calibration") for name, index, _ in lin.blocks] for lin in linearized]
-        # What is fixed for all edges of a kind, as the calibration often is, has no products.
+        # Unknowns that are fixed for all edges of a kind, such as calibration, have no products.
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
@@ -96,7 +96,7 @@ class NormalEquations:
         self.gradient: Floats = np.zeros(self.unknowns.size)
 
     def suits(self, graph: Graph, linearized: Sequence[Linearization]) -> bool:
-        """Return whether the same is free in another graph, and its linearised edges touch the same."""
+        """Return whether another graph has the same free unknowns, and its linearised edges the same unknowns."""
         free, kinds = self._analysed
         return (
             len(linearized) == len(kinds)
@@ -115,7 +115,7 @@ class NormalEquations:
                 keys.append(np.where((low >= 0) & (low < high), low * m + high, m * m))
         unique, which = np.unique(np.concatenate(keys), return_inverse=True)
         apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
-        # Every range and step meets several calibration values: a table finds these pairs faster than sorting.
+        # Every range and step depends on several calibration values: a table finds these pairs faster than sorting.
         valued[-1] = valued[:, -1] = valued[np.arange(nodes - m), np.arange(m, nodes)] = False
         value, other = np.nonzero(valued)
         place = np.zeros(valued.shape, dtype=np.int32)
@@ -129,7 +129,7 @@ class NormalEquations:
         ]
 
     def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> Blocks:
-        """Lay the blocks out in the array of values."""
+        """Place the blocks in the array of values."""
         swap = corner[pairs[:, 0]] < corner[pairs[:, 1]]
         lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
         height, across = width[lower], width[left]
@@ -230,7 +230,7 @@ class NormalEquations:
 
         Raises
         ------
-        SolverError : a pivot cannot be used. (SuperLU goes on through negative ones: the step then promises no decrease.)
+        SolverError : a pivot cannot be used. (SuperLU accepts negative ones: the step then predicts no decrease.)
         """
         values = self.values.copy()
         values[self._diagonal] += damping
@@ -255,7 +255,7 @@ def filled(
 
     Parameters
     ----------
-    like : of a graph whose edges touch the same, if there are any: they are filled anew.
+    like : normal equations of a graph with the same unknowns and edges, if there are any: they are filled again.
     """
     linearized = linearize(graph)
     normal = NormalEquations(graph, linearized, subtrees, last) if like is None else like

@@ -1,4 +1,4 @@
-"""Optimisations one after another, as noise is learnt or kernels are tightened: what they have in common is analysed once."""
+"""Successive optimisations, as noise is learnt or kernels are tightened: their common pattern is analysed once."""
 
 from .graph import Graph, linearize
 from .normal_equations import NormalEquations

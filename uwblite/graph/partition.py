@@ -1,4 +1,4 @@
-"""Divide a graph into parts that share few unknowns: recordings of one place share anchors and the closures between them."""
+"""Division of a graph into parts that share few unknowns: recordings of one place share anchors and the poses of closures."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any, cast
@@ -16,7 +16,7 @@ class Part:
     """The unknowns and edges of one part."""
 
     graph: Graph
-    """What the part touches, and edges among that."""
+    """The unknowns of the part's edges, and these edges."""
     shared: dict[str, Ints]
     """By block: for each unknown of the part its number in the graph of shared unknowns, -1 = interior."""
     members: dict[str, Ints]

@@ -1,4 +1,4 @@
-"""Landmarks seen from poses as points: a kind of edge that other people's graphs hold (g2o EDGE_SE2_XY)."""
+"""Landmarks seen from poses as points: a kind of edge in imported graphs (g2o EDGE_SE2_XY)."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,7 +13,7 @@ from .robust import SQUARED, Kernel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkEdges(EdgeTable):
-    """Position of a landmark, kept among the anchors, in the frame of a pose: e = X^-1 a - z."""
+    """Position of a landmark, which is stored as an anchor, in the frame of a pose: e = X^-1 a - z."""
 
     pose: Ints
     """(e,) index of the pose that saw it."""

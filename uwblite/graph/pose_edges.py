@@ -80,15 +80,15 @@ class OdometryEdges(EdgeTable):
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
     (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
-    x and y and by 1 + k in heading: it is the odometry's own, before the correction. Without that, noise alone would
-    draw s and k towards smaller motions (errors in variables).
+    x and y and by 1 + k in heading: it is the error of the raw odometry, before the correction. Without that, noise alone would
+    bias s and k towards smaller motions (errors in variables).
 
-    The wheels turn about the point (-p, 0) of the base, and it is the motion of a frame there that they measure. To their way v
-    to the left ``v q + u r`` and to their way u ahead ``v w`` is added, both in the frame in the middle of the step: they move
-    sideways 1 + q times as far as counted, crab by r on the way ahead, and by -w on the way to the side.
+    The wheels turn about the point (-p, 0) of the base, and they measure the motion of a frame there. To their motion v
+    to the left ``v q + u r`` is added and to their motion u ahead ``v w``, both in the frame in the middle of the step: they
+    move sideways 1 + q times as far as counted, deviate by the angle r in forward motion, and by -w in sideways motion.
 
-    The error is that of the middle of the step: a heading error anywhere along the step displaces the end by half the
-    way times it, in the mean, and what is left across is independent of it.
+    The error is that in the middle of the step: a heading error anywhere along the step displaces the end, on average, by half
+    the distance times the error, and the remaining error across is independent of it.
     """
 
     i: Ints
@@ -170,7 +170,7 @@ class OdometryEdges(EdgeTable):
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
             shift = axes[0] * m[0] + axes[1] * m[1]
-            # A scale clamped at its least no longer changes what errors are divided by.
+            # A scale clamped at its least value no longer changes the divisor of errors.
             across, around = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
             by_scale = -axes[0] * nx - axes[1] * ny - shift * across
             by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
@@ -198,7 +198,7 @@ _LEAST_SCALE = 0.1
 class ScanEdges(EdgeTable):
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
 
-    Clouds stand in the base frame through the nominal mounting and the clock they were made with. The true frame of cloud
+    Clouds are in the base frame by the nominal mounting and the clock with which they were made. The true frame of cloud
     i is ``S_i = X_i o exp(twist_i (delay - made_with)) o C`` with the mounting correction C = (x, y, theta); the edge
     measures S_i^-1 S_j.
     """
@@ -208,7 +208,7 @@ class ScanEdges(EdgeTable):
     T_i_j: Floats
     """(e, 3) measured pose of cloud j in cloud i."""
     sqrt_information: Floats
-    """(e, 3, 3) in the chart e = Z^-1 (Si^-1 Sj); singular along what the scans cannot see."""
+    """(e, 3, 3) in the chart e = Z^-1 (Si^-1 Sj); singular in directions that the scans do not measure."""
     twist_i: Floats
     """(e, 3) velocity of the base at cloud i in its own frame, m/s, m/s, rad/s."""
     twist_j: Floats

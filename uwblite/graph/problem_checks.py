@@ -1,4 +1,4 @@
-"""Whether a least-squares problem is one: something free, something measured, all of it finite; and its degrees of freedom."""
+"""Checks of a least-squares problem: free unknowns, measurements, finite values; and its degrees of freedom."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def check(graph: Graph) -> None:
 
 
 def what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
-    """Return which residuals make the cost of a graph one that is not finite."""
+    """Return which residuals make the cost of a graph infinite or nan."""
     for edges, lin in zip(graph.edges, linearized, strict=True):
         bad = np.nonzero(~np.isfinite(lin.residuals).all(axis=1))[0]
         if len(bad):

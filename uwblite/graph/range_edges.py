@@ -11,7 +11,7 @@ from .graph import Block, EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
 _LEAST_SQUARE = 1e-4
-"""m^2; of a range shorter than the anchor's height, a centimetre is left in the plane."""
+"""m^2; a range shorter than the anchor's height keeps a horizontal distance of a centimetre."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,9 +21,9 @@ class RangeEdges(EdgeTable):
     The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
     distance D = |x + R(theta) u - a|, the expected range is ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
 
-    A squared height q below 0 is none, but descent may pass there, or end there and be put back to 0. The root of a
-    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the expected
-    distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; right at the anchor that is below 0.
+    A squared height q below 0 is not possible, but descent may pass there, or end there and be set to 0. The root of a
+    negative number is no distance, so the term that q adds for q > 0 is then subtracted: with P^2 = D^2 + height^2, the
+    expected distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; it is negative at the anchor itself.
     """
 
     pose: Ints
@@ -53,7 +53,7 @@ class RangeEdges(EdgeTable):
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
     late: Floats = field(default_factory=lambda: np.zeros(0))
-    """(e,) m, by how much each range is known to be too long; empty = nothing is known of any."""
+    """(e,) m, known delay of each range; empty = none is known."""
 
     SHARED: ClassVar[tuple[str, ...]] = ("tag",)
 
@@ -64,7 +64,7 @@ class RangeEdges(EdgeTable):
 
     @property
     def corrected(self) -> Floats:
-        """The ranges (e,) without what they are known to be too long by, m."""
+        """The ranges (e,) without their known delays, m."""
         return self.ranges - self.late if len(self.late) else self.ranges
 
     def planar_ranges(self) -> Floats:
@@ -126,4 +126,4 @@ def _slant(reach: Floats, calibration: Floats) -> Floats:
 
 
 _NEAREST = 1e-3
-"""Tag on top of an anchor, m: nearer than this the direction is not defined, and the distance is clamped."""
+"""Least distance of tag and anchor, m: for smaller ones the direction is not defined, and the distance is clamped."""

@@ -1,6 +1,6 @@
 """Robust kernels: rho(s) replaces the squared whitened norm s of a residual, weight(s) = rho'(s) scales its normal equations.
 
-Laws: rho(s) ~ s for small s, weight(0) = 1, weight is the derivative of rho, both fall towards the kernel's limit.
+Properties: rho(s) ~ s for small s, weight(0) = 1, weight is the derivative of rho and does not increase.
 """
 
 from dataclasses import dataclass

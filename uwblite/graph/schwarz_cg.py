@@ -1,8 +1,8 @@
-"""Conjugate gradients for long chains of poses that are tied together everywhere.
+"""Conjugate gradients for long chains of poses with many edges between distant poses.
 
 Where thousands of poses share a few rooms and each is matched with many others, a factorisation fills up: the 14,000
-poses of five hours in one hall need 100 million entries and minutes. Their least squares is well solved by iteration,
-if errors of all lengths are taken out together: short ones piece by piece of the chain, long ones by moving whole
+poses of five hours in one hall need 100 million entries and minutes. Iteration solves their least squares well
+if errors of all wavelengths are reduced together: short ones piece by piece of the chain, long ones by moving whole
 pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996).
 The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level;
 where they are thousands, which would make it as large as the matrix, they are in pieces of their own.
@@ -22,15 +22,16 @@ from ..errors import SINGULAR, SolverError
 _PIECE = 24
 """Poses of a piece."""
 _ENOUGH = 1e-3
-"""Error of a solution as a share of it: the next step of the descent takes it up."""
+"""Relative error of a solution: the next step of the descent corrects it."""
 _MOST = 300
-"""Iterations; what is found by then is still a step downhill."""
+"""Most iterations; the result by then is still a descent step."""
 _MOST_COARSE = 1000
-"""Unknowns that are no poses, up to which each is in the coarse level."""
+"""Number of unknowns other than poses up to which each is in the coarse level."""
 _PER_PRODUCT = 4
-"""Multiplications of a factorisation that take as long as one of a product with a vector, which waits for memory."""
+"""Multiplications of a factorisation in the time of one multiplication of a matrix-vector product, which memory access
+limits."""
 _USUAL = 60
-"""Iterations, in halls, sites and warehouses of 1,000 to 15,000 poses."""
+"""Expected iterations, from halls, sites and warehouses of 1,000 to 15,000 poses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +90,7 @@ def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
     links = sparse.csr_matrix((np.ones(len(pairs)), pairs.T), shape=(poses + 1, poses + 1))
     part = connected_components(links, directed=False)[1][:poses]
     begin = np.unique(part, return_index=True)[1]
-    # One more node, where the walk through every part begins.
+    # One further node is the start of the walk through every part.
     rooted = links + sparse.csr_matrix((np.ones(len(begin)), (np.full(len(begin), poses), begin)), shape=links.shape)
     order = depth_first_order(rooted, poses, directed=False, return_predecessors=False)[1:].astype(np.int64)
     linked = np.asarray((links + links.T)[order[:-1], order[1:]]).ravel() > 0.0
@@ -104,8 +105,8 @@ def _makes_chains(linked: Bools) -> bool:
 def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     """Cut the free poses of a graph into pieces, none of which goes on from one chain to another.
 
-    Two chains in one piece, as the end of a recording and the begin of the next, move apart, which the coarse level would
-    not know: every such piece costs tens of iterations.
+    Two chains in one piece, such as the end of a recording and the start of the next, move independently, which the coarse
+    level cannot represent: every such piece costs tens of iterations.
 
     Parameters
     ----------
@@ -173,12 +174,13 @@ class TwoLevelFactor:
         """
         self._pieces, self._onto = pieces, pieces.basis.T.tocsr()
         self.work = 0.0
-        """Of all iterations so far, in multiplications of a factorisation."""
+        """Work of all iterations so far, in multiplications of a factorisation."""
         try:
             self._local = np.linalg.inv(local.blocks(matrix.data))
         except np.linalg.LinAlgError as problem:
             raise SolverError(f"{SINGULAR} ({problem})") from None
-        # Pairs of clouds that do not count left zeros. Symmetric: its columns serve as rows, which multiply faster.
+        # Pairs of clouds without weight left zeros. The matrix is symmetric: its columns are used as rows, which multiply
+        # faster.
         columns = matrix.copy()
         columns.eliminate_zeros()
         self._matrix = columns.T
@@ -200,7 +202,7 @@ class TwoLevelFactor:
         return solution
 
     def _nearly(self, residual: Floats) -> Floats:
-        """Return what the two levels make of a residual: an approximate solution."""
+        """Return the approximate solution of the two levels for a residual."""
         number = self._pieces.number
         found = np.zeros(len(residual) + 1)
         found[number] = (self._local @ np.append(residual, 0.0)[number][:, :, None])[:, :, 0]

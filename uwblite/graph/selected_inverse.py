@@ -24,11 +24,11 @@ from ..errors import SolverError
 _WIDEST = 64
 """Columns of a range at most."""
 _OVERHEAD = 10000.0
-"""What a range costs beyond its entries, in entries: calls of library functions take time, however small the matrices."""
+"""Fixed cost of a range, in entries: calls of library functions take time even for small matrices."""
 
 
 class SymmetricFactor(Protocol):
-    """A matrix factorised by SuperLU in symmetric mode, and maybe more unknowns after its own."""
+    """A matrix factorised by SuperLU in symmetric mode, possibly with further unknowns after its own."""
 
     @property
     def L(self) -> sparse.csc_matrix: ...
@@ -117,7 +117,7 @@ def _fronts(lower: sparse.csc_matrix) -> list[_Front]:
 def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
     """Return start, end and rows below of ranges of columns, joined while that saves work.
 
-    Rows below are handed on to the range that holds the first of them, so that each finds all it needs there.
+    Rows below are passed on to the range that contains the first of them, so that each range has all it needs there.
     """
     handed: dict[int, Ints] = {}
     done: list[tuple[int, int, Ints]] = []

@@ -4,37 +4,37 @@ The cost is F(x) = sum_e w_e rho(|r_e(x)|^2) with whitened residuals r_e. One it
 
     q(h) = F + 2 g^T h + h^T H h,    g = sum J_e^T w_e rho' r_e,    H = sum J_e^T w_e rho' J_e,
 
-that is, iteratively reweighted least squares: rho' = weight(|r|^2) is taken where the step starts and its own derivative
-is left out, so H stays positive semi-definite whatever the kernel. The step solves
+that is, iteratively reweighted least squares: rho' = weight(|r|^2) is evaluated at the start of the step and its own derivative
+is omitted, so H stays positive semi-definite for every kernel. The step solves
 
     (H + lambda D) h = -g,    D = largest diag(H) so far (1 where an unknown is measured by nothing),
 
 which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
-keeps the matrix positive definite where the measurements leave a direction open (an anchor without ranges, a closure
-whose information is singular): such a direction simply does not move. D never shrinks (J. J. More, The Levenberg-Marquardt
-algorithm, 1978): an anchor that comes into line with the poses with ranges to it loses all curvature across that line, and a
-damping that went with it would brake every other direction before this one. The model promises the decrease
-h^T (lambda D h - g); the ratio of what F really does to that promise decides. A step that decreases F is taken, and
+keeps the matrix positive definite where the measurements leave a direction undetermined (an anchor without ranges, a closure
+whose information is singular): such a direction does not change. D never shrinks (J. J. More, The Levenberg-Marquardt
+algorithm, 1978): an anchor that comes into line with the poses with ranges to it loses all curvature across that line, and with
+a D that shrank with it, lambda would have to grow until it damped all other directions. The model predicts the decrease
+h^T (lambda D h - g); the ratio of the real decrease of F to the predicted one decides. A step that decreases F is taken, and
 lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
 nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
 O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
 Where a step turns poses by much, it is tried in two ways that agree to first order, each pose on its own and link by
-link along the trajectory, and the cheaper one counts: an error of the odometry that bends a path of hundreds of metres is
-taken up in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
+link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a path of hundreds of
+metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
 iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
-Where a step is dropped for the cost of the anchors' edges alone, anchors are solved for at its poses and it is tried with
-these (anchor_subproblem.py).
+Where a step is rejected only because of the cost of the anchors' edges, anchors are solved for at its poses and the step is
+tried with these (anchor_subproblem.py).
 
-Next to the minimum H hardly changes any more: a step that follows one of little effect takes the factor of that one.
+Near the minimum H hardly changes: a step after one of little effect uses the factor of that one.
 
-The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
+The search ends, and reports the reason, when the remaining decrease is a negligible fraction of F, when every component of
 the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up, or the
-work that the caller allows: counted, not timed, so that the same graph ends at the same place.
+work that the caller allows: it is counted, not timed, so that the same graph gives the same result.
 Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
-convergence is linear, far on the safe side where it is quadratic, and it spares the last iteration or two that would
-only confirm. With them, reweighting converges linearly at an unknown rate, and the last decrease itself is the measure.
+convergence is linear, conservative where it is quadratic, and it saves the last one or two iterations, which would
+change nothing. With robust kernels, reweighting converges linearly at an unknown rate, and the last decrease itself is used.
 """
 
 from collections.abc import Callable
@@ -82,7 +82,7 @@ class SolverConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverSummary:
-    """What an optimisation did and why it ended."""
+    """Summary of an optimisation, with the reason for its end."""
 
     converged: bool
     """False only when the iterations or the work allowed were used up, or no step helped."""
@@ -110,7 +110,7 @@ class SolverSummary:
 
     @property
     def chi2_per_dof(self) -> float:
-        """About 1 where the noise model holds; nan without redundancy."""
+        """About 1 where the noise model is right; nan without redundancy."""
         return self.chi2 / dof if (dof := self.dof) > 0 else float("nan")
 
 
@@ -156,7 +156,7 @@ def minimise(
 
 
 class _Descent:
-    """A search under way: the estimate, what is linearised there, and the damping of the next step."""
+    """State of a search: the estimate, the edges linearised there, and the damping of the next step."""
 
     def __init__(
         self, graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig, allowed: float
@@ -184,7 +184,7 @@ class _Descent:
         if self.moved:
             weights = [_or_none(e, lin.residuals) for e, lin in zip(self.graph.edges, self.linearized, strict=True)]
             self.normal.fill(self.linearized, weights)
-            # The normal equations hold it all now; the Jacobians of a recording of hours are large.
+            # The normal equations contain all of it now; the Jacobians of a recording of hours are large.
             self.linearized = []
             diagonal = self.normal.diagonal
             curvature = np.where(diagonal > 0, diagonal, 1.0)
@@ -215,7 +215,7 @@ class _Descent:
         else:
             over = self._refuse(promised, negligible, reused)
         if not over and self.damping > _MOST_DAMPING:
-            # At a minimum no step helps either: then all that the gradient could still bring is lost in rounding.
+            # At a minimum no step helps either: then the remaining decrease is below the rounding error.
             lost = np.max(self.normal.gradient**2 / self.scale) <= _ROUNDING * self.chi2
             return NO_DECREASE if lost else STUCK
         return NO_DECREASE if over else ""
@@ -224,7 +224,7 @@ class _Descent:
         self, trial: Graph, linearized: list[Linearization], costs: list[float], promised: float, negligible: float,
         reused: bool,
     ) -> bool:  # fmt: skip
-        """Go on from the trial, with less damping; return whether next to nothing is left to come."""
+        """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
         decrease = self.chi2 - sum(costs)
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
         self.decreases = [*self.decreases[1 - _PATIENCE :], decrease]
@@ -236,7 +236,8 @@ class _Descent:
         return over
 
     def _refuse(self, promised: float, negligible: float, reused: bool) -> bool:
-        """Stay, with more damping where the step was not by an old factor; return whether it promised next to nothing."""
+        """Reject the step, with more damping unless it used an old factor; return whether its predicted decrease was
+        negligible."""
         self.factor = None
         if 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * self.chi2) and self.damping <= _FREE:
             return True
@@ -252,19 +253,19 @@ USED_UP = "iterations used up"
 ALL_WORK_DONE = "the work allowed is done"
 
 _QUICK = SolverConfig(max_iterations=12, relative_decrease=1e-3)
-"""Search for anchors at given poses: the next step takes up what it leaves."""
+"""Search for anchors at given poses: the next step corrects the remaining error."""
 _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
 _LITTLE = 1e-4
-"""Share of chi2 beyond which a promise that failed is no sign of a minimum, however coarse the search."""
+"""Share of chi2 above which a predicted decrease that was not reached is no sign of a minimum, even in a coarse search."""
 _FREE = 1e-2
-"""lambda up to which small steps mean a minimum and not just a strong brake."""
+"""lambda up to which small steps indicate a minimum and not only strong damping."""
 _PATIENCE = 8
-"""Steps taken that together mean a minimum if they brought next to nothing, however strong the brake."""
+"""Accepted steps that together indicate a minimum if their decrease was negligible, for any damping."""
 _NEAR = 1e-2
-"""A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
+"""A step that decreased chi2 by less than this fraction of it changed H so little that the next one uses its factor."""
 _NEARLY_FREE = 1e-6
-"""lambda up to which that holds."""
+"""lambda up to which that is valid."""
 _ROUNDING = 1e-12
 """Share of chi2 that the rounding of thousands of residuals hides."""
 _LEAST_DAMPING = 1e-14
@@ -274,7 +275,7 @@ _MOST_DAMPING = 1e12
 
 
 def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
-    """Return the factor used, the step and the decrease it promises (not positive: the factorisation failed).
+    """Return the factor used, the step and its predicted decrease (not positive: the factorisation failed).
 
     Parameters
     ----------

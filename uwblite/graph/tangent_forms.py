@@ -56,7 +56,7 @@ class TangentForm:
         SolverError : an angle is half a turn off, or tied to places by singular information.
         """
         n, a = len(graph.poses), len(graph.anchors)
-        # Numbers are small where the origin lies amid the places, and a map may begin anywhere.
+        # The origin is moved to the middle of the places, so that numbers are small for any map frame.
         places = np.concatenate([graph.poses[:, :2], graph.anchors]) - graph.poses[:, :2].mean(axis=0)
         self.x: Complexes = np.concatenate([_complex(places), np.exp(1j * graph.poses[:, 2]), [1.0]])
         """(2 n + a + 1,) places of poses and anchors, headings of poses and of the map."""
@@ -104,7 +104,7 @@ class TangentForm:
                 self._add_pose(L, r, no_turn, frame, ((self._anchor + edges.index, 1.0),))
 
     def _carried(self, pose: Ints, arm: Floats) -> tuple[Ints, Complexes]:
-        """Return the part of a point that a pose carries, given by where it is from the pose in the map frame (e, 2)."""
+        """Return the part of a point that is fixed to a pose, given by its offset from the pose in the map frame (e, 2)."""
         heading = self.places + pose
         return heading, _complex(arm) * np.conj(self.x[heading])
 

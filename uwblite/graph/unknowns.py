@@ -1,4 +1,4 @@
-"""Free scalars of a graph as one vector, and what a step along it does to the estimates."""
+"""Free scalars of a graph as one vector, and the effect of a step on the estimates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
-    """Where each free scalar of a graph stands in the vector of unknowns."""
+    """Positions of the free scalars of a graph in the vector of unknowns."""
 
     number: dict[str, Ints]
     """By block (unknowns, scalars): position in the vector, -1 = fixed."""
@@ -42,11 +42,11 @@ def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
 
 
 def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
-    """Return the graph moved by a step, poses link by link: each relative pose changes as the step says to first order,
+    """Return the graph moved by a step, poses link by link: each relative pose changes by the step to first order,
     and the chain is put together again from these.
 
-    The same as `moved` to first order. Where a step turns poses by much, this keeps rigid what was rigid between neighbours,
-    whatever the turn; `moved` keeps closed what closes a loop.
+    The same as `moved` to first order. Where a step turns poses by much, this keeps the relative poses of neighbours
+    for any turn; `moved` keeps loops closed.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def cheaper_move(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) 
 
 
 _LARGE_TURN = 0.05
-"""rad; the square of a smaller turn of a pose is nothing beside its first order."""
+"""rad; for smaller turns of a pose the second-order term is negligible."""
 
 
 def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
@@ -88,7 +88,7 @@ def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
     begins, clouds may be paired as well, and even with no weight.
     """
     ends = [[index for name, index, _ in lin.blocks if name == "poses"] for lin in linearized]
-    # Some files tell each step backwards, from the later pose to the one before.
+    # Some files store each step backwards, from the later pose to the one before.
     pairs = [(np.minimum(*pair), np.maximum(*pair)) for pair in ends if len(pair) == 2]
     chains = [(a, b) for a, b in pairs if np.all(b == a + 1)]
     linked = np.zeros(max(poses - 1, 0), dtype=bool)

@@ -1,12 +1,12 @@
-"""How large errors are that measurements have in common: by restricted maximum likelihood, with a prior.
+"""Variances of errors that measurements have in common: by restricted maximum likelihood, with a prior.
 
 Measurements with the residuals r = J x + S u + e leave, once the unknowns x are estimated, the part P r of r, where
-P = W - W J (J^T W J)^-1 J^T W. All that it says about the common errors u is in y = S^T P r, of which, with A = S^T P S,
+P = W - W J (J^T W J)^-1 J^T W. All of its information about the common errors u is in y = S^T P r, for which, with A = S^T P S,
 
     y ~ N(0, n A + A G A),    G = diag of the variance g of each error's kind,    n = variance of e relative to W^-1
 
 (H. D. Patterson, R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 1971). The
-logarithms of n and g are found by Fisher scoring. Where y says nothing about a kind, the prior of its variance holds.
+logarithms of n and g are found by Fisher scoring. Where y has no information about a kind, its variance keeps the prior.
 """
 
 import numpy as np
@@ -17,10 +17,10 @@ from ..arrays import Floats, Ints
 _FACTOR = np.log(4.0)
 """Prior standard deviation of the logarithm of a kind's variance: its size is known within a factor of two."""
 _NOISE = np.log(10.0)
-"""The same of the scale of the noise, whose variances are careful guesses."""
+"""The same of the scale of the noise, whose variances are conservative guesses."""
 _UNSEEN = 1e-9
-"""Eigenvalue of A, or share of a largest one above 1, below which a direction was seen by nothing: of an error of the size
-assumed it says that much compared with the noise."""
+"""Eigenvalue of A, or share of a largest one above 1, below which a direction counts as unmeasured: it is the information about
+an error of the assumed size relative to the noise."""
 _ROUNDS, _NEGLIGIBLE, _LONGEST = 50, 1e-3, 1.0
 """Most rounds; change of all logarithms that ends them; longest step in a logarithm."""
 
