@@ -254,7 +254,7 @@ def oracles(args: argparse.Namespace) -> str:
         f"## What the measurements allow\n\nRooms with real errors, 6 min (warehouse 10), and arena and tunnel as simulated, "
         f"12 min; mean of seeds 1 to {args.seeds}, without those whose\noracle has normal equations that are singular to "
         "rounding; m. *Oracle*: least squares from the truth with known associations\n(which ray hit which wall or column, "
-        "what shadowed which range) and the true distribution of all errors, poses, anchors,\nwalls, columns and their radii, "
+        "what blocked which range) and the true distribution of all errors, poses, anchors,\nwalls, columns and their radii, "
         "range offsets and calibration free, the unit of the radio within 0.1 %, as a map\ntakes it (tools/oracle.py); "
         "*bound*: "
         "Cramer-Rao bound of the recording, which is what the oracle's error is on average; *in pieces*: ATE\nand bound of an "
@@ -434,7 +434,7 @@ def halves(config: MappingConfig) -> str:
         )
     return (
         "Kasdorf, no truth: the anchors' biases, m; bar 0.15 on the difference between the halves of the recording. In 4 m of\n"
-        "driving neither half alone parts an anchor's bias from its place, as the stated sigmas say, so they are compared\n"
+        "driving neither half alone separates an anchor's bias from its place, as stated sigmas show, so they are compared\n"
         "at the anchors' places in the whole map; the last two columns are of maps of either half alone.\n\n"
         + table(["anchor", "whole", "first half", "second half", "difference", "first alone", "second alone"], rows)
     )
