@@ -12,14 +12,14 @@ RANKS = ("serious", "warning", "note")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that a user should know about a recording."""
+    """One finding about a recording."""
 
     rank: str
     """One of RANKS."""
     topic: str
     """'log', 'odometry', 'radio', 'lidar' or 'map'."""
     what: str
-    """What was found, with figures and units."""
+    """The finding, with figures and units."""
     advice: str
     """What to do about it; empty where `what` contains it."""
 
@@ -35,15 +35,15 @@ class Findings:
         self._found.append(Finding(rank, topic, what, advice))
 
     def serious(self, topic: str, what: str, advice: str) -> None:
-        """Note what spoils the map or stops it."""
+        """Note a fault that spoils the map or prevents it."""
         self.add("serious", topic, what, advice)
 
     def warning(self, topic: str, what: str, advice: str) -> None:
-        """Note what costs accuracy."""
+        """Note a fault that costs accuracy."""
         self.add("warning", topic, what, advice)
 
     def note(self, topic: str, what: str, advice: str) -> None:
-        """Note what is good to know."""
+        """Note useful information."""
         self.add("note", topic, what, advice)
 
     def ranked(self) -> tuple[Finding, ...]:

@@ -1,8 +1,8 @@
-"""Findings about a recording before anyone maps it: what is wrong, how much, and what to do about it.
+"""Findings about a recording before it is mapped: faults, their size, and what to do about them.
 
 Each finding is ranked: ``serious`` spoils the map or stops it, ``warning`` costs accuracy, ``note`` is good to know.
-The checks ask for no calibration and no map; where the recording itself shows whether there is a fault (heading in
-degrees, a laser upside down, clocks that differ), it is asked.
+The checks need no calibration and no map; where the recording itself shows a fault (heading in
+degrees, a laser upside down, clocks that differ), it is used.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ __all__ = ["Diagnosis", "Finding", "diagnose"]
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the checks found."""
+    """Result of the checks."""
 
     findings: tuple[Finding, ...]
     """Worst first."""
@@ -76,7 +76,8 @@ def _advice_without_ranges(log: SensorLog) -> str:
 
 
 def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: Findings) -> None:
-    """What a map would repair is a warning, what it would doubt or refuse is serious, but for what the map settled."""
+    """Faults that a map repairs are warnings, those that it doubts or refuses are serious, except doubts that the map
+    settled."""
     try:
         repaired = screen(log)
     except DataError as error:
@@ -94,7 +95,7 @@ def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: F
 
 
 def _check_map(doubts: tuple[Notice, ...], refused: str, found: Findings) -> None:
-    """What the check's map doubts, or why there is none, but for what the screening said."""
+    """The doubts of the check's map, or the reason why there is none, without those of the screening."""
     said = {finding.what for finding in found.ranked()}
     for text in [doubt.text for doubt in doubts] + ([refused] if refused else []):
         if text not in said:

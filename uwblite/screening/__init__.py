@@ -1,5 +1,5 @@
 """Contradictions within a recording before it is mapped: units, breaks of the odometry, sensors that stand still.
 
-`screen` is what both `uwblite map` and `uwblite check` call. What can be repaired is repaired and reported; what cannot is
-a doubt, and readings of a unit that is plainly wrong are refused by name.
+Both `uwblite map` and `uwblite check` call `screen`. Faults that can be repaired are repaired and reported; others are
+doubts, and readings in a clearly wrong unit are refused with the name of the unit.
 """

@@ -14,13 +14,14 @@ _FEW_STAMPS = 20
 _COARSE = 0.4
 """s; sensors of moving robots are faster."""
 _SAME_STEP = 1e-4
-"""s; no clock is as even."""
+"""s; no clock is more regular than this."""
 _JUMP = 10.0
 """A clock that was set forward by less cannot be distinguished from a sensor that was silent, s."""
 _SAME_END = 2.0
 """Sensors of one recording end within so much of each other, s."""
 _SOME, _MOST = 0.02, 0.5
-"""Share of scans outside the odometry's time that is worth a word; share of any readings that leaves no map to be trusted."""
+"""Share of scans outside the odometry's time from which on it is reported; share of any readings from which on it is a
+doubt."""
 
 
 def refuse_without_stamps(log: SensorLog) -> None:
@@ -35,7 +36,7 @@ def refuse_without_stamps(log: SensorLog) -> None:
 
 
 def made_up(log: SensorLog) -> list[Remark]:
-    """Say where stamps are a grid too coarse for any sensor's own: somebody counted messages."""
+    """Report stamps on a grid too coarse for a sensor's clock: they were made by counting messages."""
     if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
         return []
     steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
@@ -59,7 +60,7 @@ def set_back(log: SensorLog) -> list[Remark]:
 
 
 def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Undo jumps forward of one clock: a silence without which odometry and sensor end together, and with which they do not.
+    """Undo jumps forward of one clock: gaps without which odometry and sensor end together, and with which they do not.
 
     The odometry's stamps stay: where its own clock jumped, those of the other sensors follow.
     """
@@ -83,7 +84,7 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
 def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
     """Return the stamp before a jump of the clock and its size, s, where stamps (n,) end with the others without it alone.
 
-    A jump takes the place of a usual step: the one in which half of the time passes, between bursts where readings come in
+    A jump replaces a usual step: the one in which half of the time passes, between bursts where readings come in
     bursts.
     """
     if len(stamps) < _FEW_STAMPS or stamps[-1] - end < _JUMP:
@@ -96,7 +97,7 @@ def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
 
 
 def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Leave out scans outside the odometry's time; say how many, and how many ranges. Doubt the recording where it is most.
+    """Leave out scans outside the odometry's time; report how many, and how many ranges. Doubt the recording where most are.
 
     Ranges outside it stay in the recording; a map gives them no weight.
     """

@@ -1,10 +1,10 @@
-"""Moments at which the robot is suddenly elsewhere: it was carried, or the log was cut, and no sensor counted the way.
+"""Times at which the robot is suddenly elsewhere: it was carried, or the log was cut, and no sensor measured the motion.
 
 Neighbouring scans differ little. Where one differs from the next by far more than its neighbours do, and no motion
-near the wheels' brings the two together, the robot is somewhere else; so it is where ranges to several anchors jump and
+near that of the wheels aligns the two, the robot is at another place; so it is where ranges to several anchors jump and
 the scans do not contradict them: along a smooth tunnel every scan matches every other one.
-After a fast turn two scans may show little in common: the surfaces of the one then stand beside or behind what the other
-saw. Of scans from different places, many points stand in the free space of the other.
+After a fast turn two scans may overlap little: the surfaces of the one then stand beside or behind those of the other.
+For scans from different places, many points stand in the free space of the other.
 """
 
 import numpy as np
@@ -15,25 +15,25 @@ from ..sensor_log import SensorLog
 from . import range_motion
 
 _NEIGHBOURS = 8
-"""Scans on either side that say how much scans usually differ."""
+"""Scans on either side from which the usual difference of scans is computed."""
 _LEAST_CHANGE = 0.25
 """Mean difference of readings, m, below which nothing happened."""
 _TIMES_USUAL = 2.0
-"""Factor over what a tenth of the neighbours exceeds."""
+"""Factor relative to the 90 % quantile of the neighbours."""
 _SILENCE = 6.0
-"""Usual periods of the lidar after which two scans are no neighbours."""
+"""Usual periods of the lidar after which two scans do not count as neighbours."""
 _MOST = 40
-"""Candidates looked at, the largest first."""
+"""Most candidates that are tested, the largest first."""
 _SAME_PLACE = 0.55
 """Scans that match by a larger share are of one place."""
 _EVERYWHERE = 0.5
-"""Least share of the points that face the way fewest do by which scans are of one place."""
+"""Least share of matching points, in the direction that fewest points face, for scans of one place."""
 _ONE_CUT = 3.0
-"""The moment of a cut by ranges is known to so much, s."""
+"""Uncertainty of the time of a cut found by ranges, s."""
 _THROUGH = 0.12
-"""Share in free space that a true place does not have; people and doors leave less."""
+"""Share in free space that is too large for a true place; people and doors cause less."""
 _MOST_CHANGE = 1.0
-"""A reading that differs more counts as so much, m."""
+"""Limit to which the difference of a reading is clipped, m."""
 
 
 def found(log: SensorLog, jumps: Floats) -> Floats:
@@ -90,7 +90,7 @@ def _by_lidar(log: SensorLog) -> Floats:
         return np.zeros(0)
     apart, share = _elsewhere(log, jumps, jumps + 1)
     apart &= share > 0.0
-    # The scan itself may be at fault: those on either side of both must not match either.
+    # The scan itself may be wrong: those on either side of both must not match either.
     # The first and the last change are none: about them, where scans are repeated, as large a one is usual.
     apart[apart] &= _elsewhere(log, jumps[apart] - 1, jumps[apart] + 2)[0]
     middle = scans.middles

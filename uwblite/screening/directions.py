@@ -1,4 +1,4 @@
-"""Which way is forward, which way is left: the heading's sign, the laser's side and the direction it looks in."""
+"""Directions: the sign of the heading, whether the laser is upside down, and the direction in which it points."""
 
 from dataclasses import replace
 
@@ -12,19 +12,19 @@ from .units import heading_agreement
 from .wheel_motion import Pairs
 
 _AGREEMENT, _CLEARLY = 0.7, 0.2
-"""Agreement of heading and path below which the sign is looked at, and by how much the other sign must agree better."""
+"""Agreement of heading and path below which the sign is tested, and by how much the other sign must agree better."""
 _TURNS = 300
-"""Scan pairs that decide whether the laser is upside down."""
+"""Least number of scan pairs from which it is decided whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
 """Angle by which a laser points elsewhere than given, difference up to which directions of motion agree, both rad, and share
 of them that must agree. Along bare walls a match stays at the wheels' guess, whichever way the laser looks."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
-"""Pairs of scans with a longer way, m, and a smaller turn, rad, show the direction of driving."""
+"""Pairs of scans with a longer distance, m, and a smaller turn, rad, show the direction of driving."""
 _LEAST_PAIRS = 15
 
 
 def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with a heading that counts the way the path turns; a lidar decides which is right."""
+    """Return the recording with the heading's sign that agrees with the path; a lidar decides which is right."""
     plain, varied = heading_agreement(log.odometry)
     if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
         return log, []
@@ -55,8 +55,8 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     """Return the recording with the laser mounted upright or upside down, as its turns show.
 
     A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in
-    opposite directions. The first two are repaired so; the third would give the mirror image of the place, and nothing in
-    the recording shows which.
+    opposite directions. This repairs the first two; the third would give the mirror image of the place, and nothing in
+    the recording distinguishes them.
     """
     if _fits_laser(log) >= 0.0:
         return log, []
@@ -70,7 +70,7 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
 
 
 def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with the laser looking where the driving shows, where that is far from what was given."""
+    """Return the recording with the direction of the laser that the driving shows, where that is far from the given one."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
     clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
     if clear.sum() < _LEAST_PAIRS:

@@ -3,7 +3,7 @@
 A wheeled base moves continuously. A step between neighbouring readings that is much longer than the usual speed allows
 is no motion. Where leaving out a few readings makes the chain continuous again, they were wrong; elsewhere the chain is
 broken: its two sides are joined by the motion that the speed before and after it predicts, with the uncertainty of that
-prediction, and everything after it is moved along, so that ranges and scans alone decide how the sides lie.
+prediction, and all later poses are moved by it, so that ranges and scans alone determine the relative pose of the sides.
 """
 
 from dataclasses import dataclass, replace
@@ -21,20 +21,20 @@ _LEAST_JUMP = 0.3
 _LEAST_SPIN = 0.5
 """A smaller turn is never a jump, rad."""
 _TIMES_USUAL = 4.0
-"""Factor between the usual speed and one that the robot never has."""
+"""Ratio of a speed that the robot never has to the usual speed."""
 _LEAST_SPEED, _LEAST_TURN_RATE = 0.5, 2.0
-"""Usual speeds below these say nothing of the greatest, m/s and rad/s."""
+"""Usual speeds below these do not show the greatest speed, m/s and rad/s."""
 _GLITCH_SECONDS = 1.0
 """A chain that is continuous again after so long was interrupted by wrong readings, s."""
 _INTERLEAVED = 0.05
-"""Share of steps that jump from which two sources were written into one log."""
+"""Share of jumping steps from which on two sources were written into one log."""
 _NEIGHBOURS = 6
 """Steps on either side of a break by which the motion across it is predicted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Steps between neighbouring odometry readings and what is usual among them."""
+    """Steps between neighbouring odometry readings and their usual size."""
 
     steps: Floats
     """(n-1, 3) T_k_k+1."""
@@ -67,7 +67,7 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
 
     Raises
     ------
-    DataError : the odometry goes to and fro between two places all the time.
+    DataError : the odometry alternates between two places all the time.
     """
     jumps = np.flatnonzero(Motion.of(odometry).jumps())
     if not len(jumps):
@@ -95,7 +95,7 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
 
 
 def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]]:
-    """Join the two sides of each jump by predicted motion, and say how uncertain that is."""
+    """Join the two sides of each jump by predicted motion, and return its uncertainty."""
     motion = Motion.of(odometry)
     jumps = motion.jumps()
     if not jumps.any():

@@ -8,18 +8,18 @@ from ..arrays import Bools, Ints, runs_of
 from ..sensor_log import LaserScans, Remark, SensorLog
 
 _SECTOR = np.deg2rad(30.0)
-"""Turn after which walls are elsewhere in a scan, rad: a robot that follows a wall has it beside it only on the straight."""
+"""Turn after which walls are elsewhere in a scan, rad: a robot that follows a wall has it at one side only without turns."""
 _SECTORS, _WAY = 8, 3.0
-"""Such turns, and travelled distance, m, without which a recording does not show what moves with the robot."""
+"""Least number of such turns, and least travelled distance, m, for a recording to show objects that move with the robot."""
 _NEAR = 0.8
-"""m; what belongs to a robot is nearer to its lidar."""
+"""m; parts of a robot are nearer to its lidar than this."""
 _STEADY, _SHARE, _ENOUGH = 0.04, 0.8, 500
 """Deviation from a beam's median that noise of lidars makes nearby, m, share of the readings within it, and scans that show
 the median."""
 
 
 def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Take readings that stay the same wherever the robot is and however it is turned as no wall."""
+    """Remove readings that stay the same at all places and headings of the robot."""
     scans = log.scans
     if scans is None or not len(scans.stamps) or log.odometry.travelled_at(scans.stamps[-1:])[0] < _WAY:
         return log, []
@@ -40,7 +40,8 @@ def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
 
 
 def _steady(scans: LaserScans, sector: Ints) -> Bools:
-    """Return which beams (b,) see the same nearby in nearly all scans (k,), those of every sector weighing alike."""
+    """Return which beams (b,) have the same near reading in nearly all scans (k,), with equal weight of every sector of
+    headings."""
     some = scans.ranges[:: max(1, len(sector) // _ENOUGH)]
     middle = np.median(np.where(scans.hits(some), some, np.inf), axis=0)
     own = middle < _NEAR

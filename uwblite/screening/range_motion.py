@@ -1,7 +1,7 @@
-"""Do the ranges change by more than the robot moves? By the triangle inequality no anchor's range can.
+"""Test whether ranges change by more than the robot moves, which the triangle inequality excludes for any anchor.
 
-Medians of a few readings of one anchor are compared over a time: their difference is at most the way that the wheels
-count, apart from noise and a blocked line of sight. Where several anchors exceed that together, the wheels missed a motion.
+Medians of a few readings of one anchor are compared over a time: their difference is at most the distance that the wheels
+count, apart from noise and NLOS. Where several anchors exceed that together, the wheels missed a motion.
 """
 
 import numpy as np
@@ -14,23 +14,23 @@ _WINDOW = 3
 _MIDDLE = _WINDOW // 2 + 1
 """The middle one of them."""
 _LONG = 8
-"""Readings over which a jump must last."""
+"""Number of readings for which a jump must last."""
 _SILENCE = 6.0
-"""Usual periods of an anchor after which a jump does not show when the robot moved."""
+"""Usual periods of an anchor after which a jump does not show the time of the motion."""
 _STRETCH = 1.5
 """Factor by which wheels may count too little."""
 _MARGIN = 0.5
 """Change, m, that a blocked line of sight explains."""
 _TIMES_NOISE = 5.0
-"""Standard deviations of one reading that a median never is off."""
+"""Error that a median never has, in standard deviations of one reading."""
 _FEW, _STRETCH_WAY = 20, 2.0
-"""Readings of an anchor, and way of the stretches, m, in which their change is compared with the way."""
+"""Readings of an anchor, and length of the stretches, m, in which their change is compared with the distance."""
 _LEAST_VOTES = 2
 """Anchors that must agree, where so many are in reach."""
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
-    """Return by how much the robot moved more between two times by the ranges than by the wheels, m; 0 = not at all.
+    """Return the motion between two times by the ranges minus that by the wheels, m; 0 = not larger.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def excess(log: SensorLog, start: float, end: float) -> float:
 
 
 def cuts(log: SensorLog, jumps: Floats) -> list[float]:
-    """Return the times, s, at which the ranges to several anchors jump together, and for good, by more than the robot drove.
+    """Return the times, s, at which the ranges to several anchors jump together and permanently by more than the robot drove.
 
     Parameters
     ----------
@@ -83,8 +83,9 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
 def change_by_way(log: SensorLog) -> float:
     """Return by how much the ranges change where the robot drives 2 m, by its wheels, by that way; nan without enough.
 
-    It is the median over the anchors of what one in ten of such stretches exceeds, about 1 (0.88 to 1.13 in simulated rooms)
-    whatever the path: every anchor is driven towards at times. It is nan, too, where ranges change that fast only now and then.
+    It is the median over the anchors of the 90 % quantile over such stretches, about 1 (0.88 to 1.13 in simulated rooms)
+    for any path, since the robot drives towards every anchor at times. It is nan, too, where ranges change that fast only
+    rarely.
     """
     found = []
     for stamps, ranges in _by_anchor(log):
@@ -134,7 +135,7 @@ def _together(spans: list[Floats], jumps: Floats) -> list[float]:
 
 
 def _agreed(over: Floats) -> Floats:
-    """Return what enough of the anchors exceed, of what each exceeds (a, ...)."""
+    """Return the value that enough of the anchors exceed, from the excess (a, ...) of each."""
     needed = min(max(_LEAST_VOTES, len(over) // 2), len(over))
     return np.asarray(np.sort(over, axis=0)[-needed])
 
@@ -156,5 +157,5 @@ def _noise(ranges: Floats) -> float:
 
 
 def _way(log: SensorLog, stamps: Floats) -> float:
-    """Return the way driven between the first and the last stamp, m."""
+    """Return the distance driven between the first and the last stamp, m."""
     return float(np.ptp(log.odometry.travelled_at(stamps))) if len(stamps) else 0.0

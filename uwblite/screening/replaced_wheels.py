@@ -1,4 +1,4 @@
-"""What stands in for wheels that counted nothing: the motion from scan to scan."""
+"""Replacement for wheels that counted nothing: the motion from scan to scan."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
 
 _SCANS_APART = 0.25
-"""Time between the scans whose motion stands in for wheels, s."""
+"""Time between the scans whose motion replaces the wheels, s."""
 _STEP_SIGMA = (0.02, 0.02, 0.01)
 """Standard deviation of such a step, m, m, rad."""
 _UNKNOWN_STEP = (0.3, 0.3, 0.3)
@@ -16,7 +16,7 @@ _UNKNOWN_STEP = (0.3, 0.3, 0.3)
 _SEARCHES = 100
 """Steps of a stretch that are searched for, where they match badly."""
 _FASTEST_STEP = 1.0
-"""No such step is longer, m: a speed of 4 m/s."""
+"""Longest possible step, m: a speed of 4 m/s."""
 
 
 def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odometry, OdometryBreaks]:
@@ -52,7 +52,7 @@ def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b
 
 
 def _smooth_steps(scans: LaserScans, log: SensorLog, chosen: Ints) -> tuple[Floats, Floats]:
-    """Measure steps twice: what scans do not show, the second time goes on as before and after."""
+    """Measure steps twice: the second time, directions that scans do not measure continue the motion before and after."""
     first, second = chosen[:-1], chosen[1:]
     steps, share = scan_steps(scans, log.mounting, first, second, np.zeros((len(first), 3)), _SEARCHES)
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(steps, ((3, 3), (0, 0)), mode="edge"), 7, axis=0)

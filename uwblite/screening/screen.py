@@ -18,21 +18,21 @@ _GAP = 2.0
 _STANDS = (0.05, 0.05)
 """Distance, m, and turn, rad, by the wheels, below which the robot stood meanwhile."""
 _SHORTEST_PATH = 2.0
-"""A shorter path shows little of anything, m."""
+"""A shorter path is not enough for the tests, m."""
 _ANYWHERE = (20.0, 20.0, 3.0)
-"""Standard deviation of a step that nothing measured, m, m, rad."""
+"""Standard deviation of a step that no sensor measured, m, m, rad."""
 _STEP = 2.0
-"""Time between the steps of lost wheels, where no lidar stands in for them, s."""
+"""Time between the steps of lost wheels, where no lidar replaces them, s."""
 _LONG_STAND = 5.0
-"""Stand of the wheels, s, that ranges are asked about where no lidar sees it."""
+"""Least time without motion of the wheels, s, that is tested with ranges where there is no lidar."""
 _APART = 3.0
-"""A cut so near in time to another break is the same, s."""
+"""A cut nearer than this in time to another break is the same, s."""
 UNKNOWN = 3.0
-"""Steps uncertain by so much, m, are no guess of where the robot is."""
+"""Steps with an uncertainty of so much, m, do not predict where the robot is."""
 
 
 def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
-    """Return the recording repaired, with what was found in its `screening`; a recording screened before stays as it is.
+    """Return the recording repaired, with the findings in its `screening`; a recording screened before is returned unchanged.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
 
     Raises
     ------
-    DataError : a unit is plainly wrong, or two recordings were written into one.
+    DataError : a unit is clearly wrong, or two recordings were written into one.
     """
     if log.screening is not None:
         return log
@@ -79,12 +79,12 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
 
 
 def _way_ratio(pairs: Pairs | None) -> float:
-    """Return the way that the lidar measures by that of the wheels; nan where it measures none."""
+    """Return the ratio of the distance by the lidar to that by the wheels; nan where the lidar measures none."""
     return float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
 
 
 def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:
-    """Compare wheels and lidar, the laser turned to where the driving shows that it looks."""
+    """Compare wheels and lidar, with the laser in the direction that the driving shows."""
     pairs = wheel_motion.compare(log)
     if pairs is None:
         return log, None, []
@@ -124,7 +124,7 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
         step = se2.between(poses[k], poses[k + 1])
         held = bool(np.hypot(*step[:2]) < _STANDS[0])
         stood = held and bool(abs(step[2]) < _STANDS[1])
-        # A gyro may have turned with the robot while nothing counted its way.
+        # A gyro may have turned with the robot while no sensor measured its distance.
         elsewhere = held and _elsewhere(log, a, b)
         when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
         if elsewhere:
@@ -168,7 +168,7 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
 
 
 def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
-    """Find stretches in which the wheels stand and other sensors move, and put something in their place."""
+    """Find stretches in which the wheels stand and other sensors move, and replace the wheels there."""
     start = float(log.odometry.stamps[0])
     unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if pairs is None or not wheel_motion.seen(pairs, *s)]
     unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
@@ -190,7 +190,7 @@ def _lost_remark(a: float, b: float, outcome: str) -> Remark:
 
 
 def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:
-    """Return steps every few seconds in which the robot may have driven as fast as usual, to anywhere."""
+    """Return steps every few seconds with the uncertainty of a robot that may have driven at usual speed in any direction."""
     usual = float(odometry_chain.Motion.of(odometry).speed[0]) / 4.0
     stamps = [np.arange(a + 0.5 * _STEP, b, _STEP) for a, b in stretches]
     at = np.concatenate([np.zeros(0), *stamps])

@@ -1,9 +1,9 @@
-"""Anchors that answer to one name: ranges that go to and fro between two places while the robot drives on.
+"""Anchors with one name: their ranges alternate between two places while the robot drives on.
 
-Neighbouring ranges to one place differ by at most the way driven in between (the triangle inequality), apart from noise and
-late echoes. While two places are in reach, the ranges leap between two distances, each of which changes by at most the way
-driven, and their difference varies. Echoes are late by a constant, or by something else each time; a way that the wheels
-miss makes ranges leap, but not back.
+Neighbouring ranges to one place differ by at most the distance driven in between (the triangle inequality), apart from noise
+and multipath. While two places are in reach, the ranges jump between two distances, each of which changes by at most the
+distance driven, and their difference varies. Multipath delays are constant, or different each time; a motion that the wheels
+miss makes ranges jump, but not back.
 """
 
 from dataclasses import replace
@@ -19,16 +19,16 @@ _STRETCH, _MARGIN, _TIMES_NOISE = 1.5, 0.5, 5.0
 """Factor by which wheels may count too little, m that a line of sight blocked for a moment explains, and standard deviations
 of a range."""
 _LEAST, _SHARE = 12, 0.1
-"""Leaps, and their share of the ranges' differences, that two places show; of one place 3 % at most."""
+"""Least number of jumps, and their least share of the ranges' differences, for two places; one place has 3 % at most."""
 _NEXT = 0.6
-"""Way, m, over which a leap is compared with the next one."""
+"""Distance, m, over which a jump is compared with the next one."""
 _STEADY, _VARIES = 0.9, 0.7
 """Share of leaps whose ends are where the next one's are, and by how much all differ (10 to 90 %, by their median). Two places
 have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
 
 
 def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Leave out the ranges of each name that two anchors answer to: none is known to belong to either place."""
+    """Leave out the ranges of each name that two anchors have: the place of none of them is known."""
     ranges = log.ranges
     if ranges is None or len(log.odometry.stamps) < 2:
         return log, []

@@ -9,13 +9,13 @@ from ..arrays import Bools, Floats, runs_of, white_noise
 from ..sensor_log import Remark, SensorLog
 
 _SAME_RANGES = 12
-"""Ranges in a row that stand still at least."""
+"""Least number of constant ranges in a row."""
 _MOVED = 0.5
 """Travelled distance, m, from which on a robot is elsewhere."""
 _NEW_PLACE = 0.01
 """Travelled distance, m, after which a range is a new measurement, for a robot that hardly moves."""
 _UNLIKELY = 25.0
-"""Negative logarithm of a probability that no recording's number of stretches makes likely."""
+"""Negative logarithm of a probability so small that chance does not reach it in any recording."""
 _MIDDLE = (0.05, 0.95)
 """Quantiles between which ranges count as standing; about the ends of a stretch some do not."""
 _FINEST, _FINEST_STEP = 0.02, 0.001
@@ -23,22 +23,22 @@ _FINEST, _FINEST_STEP = 0.02, 0.001
 _CHANGES, _STEPS = 0.2, 4.0
 """Change of a range, m and in steps of its resolution, with which it is measured and not repeated."""
 _QUIET, _ENOUGH = 0.25, 8
-"""Quantile of the noise of stretches that stands for a free line of sight, and stretches without which it is not known."""
+"""Quantile of the noise of stretches that represents line of sight, and the least number of stretches to know it."""
 _USUAL_NOISE, _LEAST_NOISE = 0.03, 0.005
 """Noise of such radios, m, where the recording does not show it, and the least that is assumed."""
 _SAME_SCANS = 3
-"""Equal scans in a row that no lidar gives: some beam of hundreds always changes."""
+"""Number of equal scans in a row that a working lidar never gives: some beam of hundreds always changes."""
 _OFTEN, _FEW_REPEATS = 0.1, 5
 """Share of the scans, and number, from which on even single repeats are no chance; of seven real recordings one has any
 (0.5 %)."""
 _LEAST_SEEN = 10
-"""Beams that must see something; scans that see nothing are rightly equal."""
+"""Least number of beams with a reading; scans without readings may be equal."""
 
 
 def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     """Spread readings of odometry and lidar that share one stamp because they waited in a buffer.
 
-    Each burst is spread evenly over the time since the one before; what then remains is a delay, which is calibrated.
+    Each burst is spread evenly over the time since the one before; the remaining delay is calibrated.
     """
     remarks = []
     for name, what, sensor in (("odometry", "odometry readings", log.odometry), ("scans", "scans", log.scans)):
@@ -192,7 +192,7 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if ranges is None or len(ranges.stamps) < _MARKS:
         return log, []
     travelled = log.odometry.travelled_at(ranges.stamps)
-    # A robot that stands repeats itself rightly.
+    # A robot that stands may repeat its readings.
     apart = np.column_stack([ranges.ranges, ranges.anchor, np.floor(travelled / _MOVED)])[ranges.ranges > 0.0]
     mark = _mark(np.unique(apart, axis=0)[:, 0])
     if mark is None:
@@ -210,7 +210,7 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
 
 
 def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Take a reading that stands for no distance as no wall: what a lidar or its driver reports beyond its reach, say."""
+    """Remove a reading that stands for no distance: for example the value of a lidar or its driver beyond its reach."""
     scans = log.scans
     if scans is None or not len(scans.stamps):
         return log, []

@@ -1,4 +1,4 @@
-"""Units that are plainly wrong, named before anything is computed with them."""
+"""Units that are clearly wrong, reported before anything is computed with them."""
 
 import numpy as np
 
@@ -7,19 +7,19 @@ from ..errors import DataError
 from ..sensor_log import LONGEST_RANGE, Odometry, SensorLog
 
 FASTEST = 3.0
-"""A ground robot that maps a building is not faster, m/s."""
+"""Largest speed of a ground robot that maps a building, m/s."""
 _FAR_TOO_FAST = 9.0
-"""Usual speed, m/s, that no such robot keeps; millimetres taken for metres give 20 m/s at a crawl."""
+"""Usual speed, m/s, that no such robot has for long; millimetres taken as metres give 20 m/s at a very low speed."""
 _CENTIMETRES = 90.0
 """Usual speed, m/s, from which positions are rather millimetres than centimetres."""
 _FAST_TURN, _MORE_THAN_A_TURN = 1.0, 7.0
 """Usual turn rate, rad/s, and range of headings, rad, without which they cannot be degrees."""
 _LONGEST_READING = 150.0
-"""No lidar of this kind sees farther as a rule, m."""
+"""Largest usual reach of a lidar of this kind, m."""
 _CHORD = 1.0
 """Time over which speed is taken, s: readings of two robots by turns, or in bursts, jump from one to the next."""
 _ENOUGH = 10
-"""Readings from which a unit is judged."""
+"""Least number of readings for a test of the unit."""
 _LENGTHS = {"feet": 0.3048, "centimetres": 0.01, "millimetres": 0.001}
 _YARD, _SAME_UNIT = 0.9144, 0.05
 """m; and by how much, relatively, a factor that a map found may differ from that of a unit: ranges in yards came out as 1.09 to
@@ -29,7 +29,7 @@ _OTHER_LENGTH = 1.2
 _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _LONG_TIMES = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _SELDOM, _OFTEN = 1.0, 0.005
-"""Times between readings, s, between which stamps are taken for seconds."""
+"""Limits of the time between readings, s, within which stamps are taken as seconds."""
 _RAPID, _SPIN = 0.002, 3.0
 """Time between readings of the odometry, s, that is shorter than any; and mean turn rate, rad/s, that no robot keeps."""
 _USUAL_SPEED = 0.3
@@ -41,25 +41,25 @@ _SAME_LENGTH = 2.0
 _AGREEMENT = 0.7
 """Agreement of heading and direction of motion below which the heading is not the path's."""
 _CLEARLY = 0.2
-"""Another reading of the heading must agree by so much better."""
+"""Another interpretation of the heading must agree better by so much."""
 
 
 def refuse_wrong_lengths(log: SensorLog) -> None:
-    """Raise DataError where the recording's lengths have plainly another unit than metres."""
+    """Raise DataError where the recording's lengths clearly have another unit than metres."""
     found = [text for text in (_positions(log.odometry), _of_ranges(log), _of_scans(log)) if text]
     if found:
         raise DataError("; ".join(found))
 
 
 def refuse_wrong_times(log: SensorLog) -> None:
-    """Raise DataError where stamps have plainly another unit than seconds."""
+    """Raise DataError where stamps clearly have another unit than seconds."""
     text = _odometry_stamps(log.odometry) or _other_stamps(log)
     if text:
         raise DataError(text)
 
 
 def refuse_degrees(odometry: Odometry) -> None:
-    """Raise DataError where the odometry's heading is plainly written in degrees."""
+    """Raise DataError where the odometry's heading is clearly in degrees."""
     text = _heading(odometry)
     if text:
         raise DataError(text)

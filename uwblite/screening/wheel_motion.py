@@ -1,8 +1,8 @@
-"""Do wheels and lidar measure the same motion, stretch by stretch?
+"""Comparison of the motion by wheels and by lidar, stretch by stretch.
 
-Pairs of scans a moment apart, spread over the recording, are matched and compared with the odometry of the same moment.
-One factor for all ways and one for all turns is calibration, and taken out before. What then remains over a stretch is a
-fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other lasting
+Pairs of scans a short time apart, spread over the recording, are matched and compared with the odometry of the same time.
+One factor for all distances and one for all turns are calibration, and removed before. A remaining difference over a stretch is
+a fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other lasting
 difference is a doubt.
 """
 
@@ -18,19 +18,19 @@ from .motion_ratios import ratios, undiluted
 _PAIRS = 250
 """Pairs of scans compared over the whole recording."""
 _PAIRS_STANDING = 8
-"""Pairs looked at in each stretch in which the wheels stand, besides."""
+"""Further pairs in each stretch in which the wheels stand."""
 _STRETCHES = 30
-"""Longest such stretches looked at."""
+"""Number of such stretches that are tested, the longest first."""
 _STILL = (0.005, 0.01)
-"""Way, m, and turn, rad, within a second below which wheels stand."""
+"""Distance, m, and turn, rad, within a second below which wheels stand."""
 _HALF, _EDGE = 0.5, 0.45
 """Half of that second, and how much of it belongs to the stretch on either side, s."""
 _LEAST_STANDING = 1.5
-"""Shorter stretches are lost on nobody, s."""
+"""Shorter stretches do not matter, s."""
 _APART = 0.1
-"""Usual way between the scans of a pair, m."""
+"""Usual distance between the scans of a pair, m."""
 _CLEAR_SHARE = 0.9
-"""Pairs that match so well from the wheels' guess are not matched from rest too."""
+"""Pairs that match so well from the wheels' guess are not also matched from zero motion."""
 _GAIN = 0.03
 """Share by which rest must explain a pair better than the wheels do, of all points and of those that face the way fewest do."""
 _EVERYWHERE = 0.5
@@ -40,7 +40,7 @@ _SHARE = 0.6
 _ABSOLUTE, _RELATIVE = (0.05, 0.06), 0.35
 """Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
 _SEEN_MOVING = (0.03, 0.03)
-"""Motion between the scans of a pair that is no noise, m and rad."""
+"""Motion between the scans of a pair that is larger than noise, m and rad."""
 _MOST = 0.6
 """Share of a stretch's pairs from which it is reported."""
 _LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
@@ -158,7 +158,7 @@ def _within(pairs: Pairs, start: float, end: float) -> Bools:
 
 
 _FEW = 3
-"""Pairs of scans below which nothing is shown."""
+"""Least number of pairs of scans for a result."""
 
 
 def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
@@ -177,7 +177,7 @@ def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
 def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
     """Return which pairs (e,) match clearly worse if the robot stood: about a single column it may turn as well.
 
-    What a robot at rest measures twice differs by the noise of its lidar, and some motion fits that better.
+    Two scans of a robot at rest differ by the noise of its lidar, and some motion fits that better.
     """
     moving, rest = (_misfits(log, pairs, motion) for motion in (pairs.lidar, 0.0 * pairs.lidar))
     return _clearly_worse(rest, moving)
@@ -238,7 +238,7 @@ _WORSE_BY_WHEELS = 1.2
 
 
 def unmatched(pairs: Pairs) -> list[Remark]:
-    """Return a doubt where scans a moment apart hardly ever show the same things; pairs that saw too little do not count."""
+    """Return a doubt where scans a short time apart hardly ever match; pairs with too few readings do not count."""
     seen = pairs.share[pairs.share > 0.0]
     if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
         return []
@@ -260,7 +260,7 @@ def way_ratio(pairs: Pairs) -> float:
 
 
 def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
-    """Return the longest stretch in which ways or turns have another ratio than elsewhere."""
+    """Return the longest stretch in which distances or turns have another ratio than elsewhere."""
     for columns, clear in ((slice(0, 2), _CLEAR_WAY), (slice(2, 3), _CLEAR_TURN)):
         rows, ratio = ratios(own.wheels[:, columns], own.lidar[:, columns], clear)
         if len(rows) < 3 * _CHUNK:
@@ -284,7 +284,7 @@ def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
 _CLEAR_MOTION = 0.03
 """Way, m, or turn, rad, of most pairs of a robot that drives or turns."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.1
-"""Ways, m, and turns, rad, whose ratio is no noise."""
+"""Distances, m, and turns, rad, that are large enough for a ratio."""
 _CHUNK = 12
 """Pairs whose median ratio is taken."""
 _OTHER_RATIO, _RATIO_SIGMAS = 0.15, 5.0
