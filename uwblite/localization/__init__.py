@@ -1,4 +1,4 @@
-"""Where a robot is in a map that is there already, while it drives: from an unknown start, and how sure that is."""
+"""Localisation of a robot in an existing map while it drives: from an unknown start, with its uncertainty."""
 
 from .localizer import Localizer
 from .records import LocalizerState, Scanner

@@ -1,4 +1,4 @@
-"""Places in the map against one another: how well each explains what was measured during the last metres."""
+"""Comparison of places in the map: how well each explains the measurements of the last metres."""
 
 from collections.abc import Generator
 from dataclasses import dataclass, replace
@@ -17,29 +17,29 @@ from .window import Ranges, Window
 INDEPENDENT_RAYS = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
 LOOK_BACK = 4.0
-"""m driven, of whose scans places are compared."""
+"""m driven; places are compared by the scans of this distance."""
 _SEARCH_LOOKS = 2.5
-"""m driven, of whose scans the search makes one cloud."""
+"""m driven; the search makes one cloud of the scans of this distance."""
 _SIGMA_SCAN = (0.2, 0.2, 0.06)
 """m, m, rad; of a place that the search found by scans."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
-"""m, m, rad; drift within the window, on top of what ranges say of a place."""
+"""m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
 _AT_ONCE = 8
 """Places whose rays are compared with the map at once, a unit of work of 3 ms."""
 _UNITS = 2
 """Units of work of a step."""
 _RADIO_REACH = 15.0
-"""m beyond the outermost anchors; where a robot may be in a map without a grid."""
+"""m beyond the outermost anchors; limit of the area of the robot in a map without a grid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Places in the map, and how well each explains what was measured."""
+    """Places in the map, and how well each explains the measurements."""
 
     bank: Hypotheses
     """The present hypotheses first."""
     complete: bool
-    """No place that is as good was left out."""
+    """No equally good place was left out."""
     weight: Floats
     """(h,) log-likelihood."""
     fit: Floats
@@ -49,7 +49,7 @@ class Comparison:
     rays: Rays
     """Of the last metres, in the present frame of the base."""
     looks: int
-    """Scans that they are of."""
+    """Number of their scans."""
     ranges: Ranges
 
     @property
@@ -59,12 +59,12 @@ class Comparison:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether another place explains what was measured better than the first hypothesis."""
+        """Whether another place explains the measurements better than the first hypothesis."""
         return self.complete and bool(self.weight[1:].max(initial=-np.inf) > self.weight[0] + verdict.CERTAIN)
 
 
 class PlaceSearch:
-    """The whole map, ready to be searched, a little at a time.
+    """The whole map, ready for a search in small units of work.
 
     A search and the comparison of what it found are made in the frame that the robot had at their beginning.
     """
@@ -84,7 +84,7 @@ class PlaceSearch:
         return self._steps is None
 
     def begin(self, window: Window, odom: Floats, way: float) -> None:
-        """Begin to search the whole map for what a window holds.
+        """Begin to search the whole map with the measurements of a window.
 
         Parameters
         ----------
@@ -94,11 +94,11 @@ class PlaceSearch:
         self._steps = self._compared(window.ranges_since(odom, way), *window.seen(odom, way, LOOK_BACK))
 
     def drop(self) -> None:
-        """Leave a search that is under way."""
+        """Cancel a running search."""
         self._steps = None
 
     def advance(self, bank: Hypotheses, odom: Floats) -> Comparison | None:
-        """Do some units of the work; return how well each place explains what the window held, if that was the last one.
+        """Do some units of work; return how well each place explains the window's measurements, if that was the last unit.
 
         Parameters
         ----------
@@ -170,7 +170,8 @@ class PlaceSearch:
 def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
     """Return which poses (h, 3) stay: the first ones, and those of the others that are no earlier one's place.
 
-    One near an earlier one stays if it is far better: what was tracked there has slid along a wall, or was carried so far.
+    One near an earlier one stays if it is far better: the tracked pose has slid along a wall, or the robot was carried a
+    little.
     """
     better = weight[before:] > weight[:before, None] + verdict.CERTAIN
     new = (hypotheses.apart(poses[:before, None], poses[before:]) | better).all(axis=0)

@@ -1,7 +1,7 @@
-"""The turns of a gyro in place of the wheels', as both come in: distances from the wheels, directions from the gyro.
+"""The turns of a gyro in place of those of the wheels, live: distances from the wheels, directions from the gyro.
 
-What odometry.gyro does with a whole recording, done with the last minute: which way and in which unit the gyro counts is
-given by the wheels, its bias by the robot's rests, else by the wheels. Until both are known the wheels' own turns are taken.
+The same as odometry.gyro for a whole recording, with the last minute: sign and unit of the gyro follow from the
+wheels, its bias from times without motion, else from the wheels. Until both are known the turns of the wheels are used.
 """
 
 from bisect import bisect_left
@@ -14,11 +14,11 @@ from ..odometry.gyro import GAP, bias_of, reading_of
 from ..sensor_log import Gyro, Odometry
 
 _SECONDS = 60.0
-"""s that are compared."""
+"""s; length of the time that is compared."""
 _LEAST, _EVERY = 15.0, 5.0
-"""s from which the gyro is judged, and between two judgements: three windows of the comparison."""
+"""s from which the gyro is tested, and between two tests: three windows of the comparison."""
 _FASTEST = 5.0
-"""rad/s; a turn that is faster was not driven: the gyro's heading began again."""
+"""rad/s; a faster turn is not real: the gyro's heading was reset."""
 
 
 class GyroTurns:
@@ -84,7 +84,7 @@ class GyroTurns:
         self._stamps, self._headings = self._stamps[old:], self._headings[old:]
 
     def _judge(self, now: float) -> None:
-        """Forget what is old, and learn how the gyro counts."""
+        """Remove old readings, and learn the gyro's sign, unit and bias."""
         self._forget(now - _SECONDS)
         self._wheels = [w for w in self._wheels if w[0] >= now - _SECONDS]
         self._judged = now

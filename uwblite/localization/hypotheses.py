@@ -1,8 +1,8 @@
-"""Several robots in one: a Gaussian-sum filter, one extended Kalman filter for every place where the robot may be.
+"""Gaussian-sum filter: one extended Kalman filter for every place where the robot may be.
 
 Each hypothesis carries the pose, the calibration of the wheels and one slowly varying error per anchor (multipath, antenna
 patterns, an anchor's place that is off by decimetres), which fades with the distance driven. Measurements move each
-hypothesis and change its weight by how likely it made them; mirror images live side by side until one of them has become
+hypothesis and change its weight by their likelihood; mirror images are kept side by side until one of them has become
 unlikely (D. Alspach, H. Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972). All arrays hold
 all hypotheses: no step below loops over them.
 """
@@ -28,7 +28,8 @@ WHEEL_SIGMA = (0.02, 0.03, 0.01)
 SLOW_SIGMA = 0.12
 """m; common error of ranges to one anchor, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
 SLOW_LEFT = 0.08
-"""m; the same where the map says the range error at a place: what a few ranges nearby leave of it."""
+"""m; the same where the map contains the range error at a place: the error that remains after correction by a few ranges
+nearby."""
 SLOW_LENGTH = 5.0
 """m; its correlation length: fields of a room's size last longer than the 1.5 m of single reflections."""
 _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
@@ -76,7 +77,7 @@ def none(anchors: int) -> Hypotheses:
 
 
 def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW_SIGMA) -> Hypotheses:
-    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and nothing learnt yet.
+    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
@@ -93,7 +94,8 @@ def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW
 
 
 def placed(bank: Hypotheses, which: int, pose: Floats, covariance: Floats) -> Hypotheses:
-    """Return the hypotheses with another pose (3,) and covariance (3, 3) of one of them, which then say nothing of the rest."""
+    """Return the hypotheses with another pose (3,) and covariance (3, 3) of one of them, uncorrelated with the other
+    unknowns."""
     mean, whole = bank.mean.copy(), bank.covariance.copy()
     mean[which, POSE] = pose
     whole[which, POSE, :] = whole[which, :, POSE] = 0.0
@@ -107,7 +109,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     Parameters
     ----------
     step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
-        motion that the wheels did not see. slow_sigma : standard deviation of the common error of ranges to one anchor, m.
+        motion that the wheels did not measure. slow_sigma : standard deviation of the common error of ranges to one anchor, m.
 
     Notes
     -----
@@ -152,10 +154,10 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: 
     Notes
     -----
     The scan measures the pose alone, so that the update is made for it, with prior information I and the scan's H and
-    gradient, and carried over to the rest of the state by its covariance with the pose. Along an aisle H is that of the
-    walls' normals, which scatter: it is left out (lidar.degeneracy), or a hundred scans would be sure of what none has seen.
-    Until the pose is certain it is not, since a search has compared the places along the aisle and another one must agree
-    before any is believed; without it a robot beside a single wall is found late.
+    gradient, and transferred to the rest of the state by its covariance with the pose. Along an aisle H comes from the scatter
+    of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would seem to measure a direction that none has
+    measured. Until the pose is certain it is kept, since a search has compared the places along the aisle and another one must
+    agree before any is accepted; without it a robot beside a single wall is found late.
     """
     if not len(bank):
         return bank
@@ -218,5 +220,5 @@ def pruned(bank: Hypotheses, most: int, least: float) -> Hypotheses:
 
 
 def symmetric(matrices: Floats) -> Floats:
-    """Return matrices (h, n, n) without what rounding has made unsymmetric."""
+    """Return matrices (h, n, n) made symmetric again after rounding."""
     return 0.5 * (matrices + matrices.transpose(0, 2, 1))

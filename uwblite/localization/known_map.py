@@ -1,4 +1,4 @@
-"""What a live localisation is given: anchors with their calibration, walls, and where the laser sits on the robot."""
+"""Input of a live localisation: anchors with their calibration, walls, and the mounting of the laser on the robot."""
 
 from collections.abc import Container
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ class KnownAnchors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownMap:
-    """An earlier map, ready to be looked up."""
+    """An earlier map, prepared for look-up."""
 
     anchors: KnownAnchors
     walls: Walls | None
@@ -70,7 +70,7 @@ class KnownMap:
 _OFF = (0.02, 0.02, 0.005)
 """m, m, rad; standard deviation of a map in cells of 0.05 m. In larger ones a wall lies anywhere within half a cell."""
 _SIGMA = 0.1
-"""m; spread of ranges to an anchor of which the map does not say it."""
+"""m; spread of ranges to an anchor for which the map does not contain it."""
 _LEAST_SIGMA = 0.05
 """m; largest standard deviation of such radios in another recording."""
 
@@ -80,7 +80,7 @@ def from_result(result: StoredResult) -> KnownMap:
 
     Raises
     ------
-    DataError : it holds neither an anchor with a place nor a grid.
+    DataError : it contains neither an anchor with a place nor a grid.
     """
     calibration = _calibration(result.report)
     anchors = _with_errors(known_anchors(result.anchors, calibration), result)
@@ -92,12 +92,12 @@ def from_result(result: StoredResult) -> KnownMap:
 
 
 def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
-    """Return a map of anchors and a grid alone, with a laser that sits where recordings say."""
+    """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
     return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
 
 
 def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:
-    """Return the anchors that have a sure place; of one that was moved, the last place."""
+    """Return the anchors that have a certain place; of one that was moved, the last place."""
     by_name = {a.id: a for a in stored}
     places = {radio: by_name[name] for radio, name in last_places(by_name).items()}
     last = {radio: a for radio, a in places.items() if a.status == "ok" and np.isfinite(a.position).all()}
@@ -113,7 +113,7 @@ def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float
 
 
 def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
-    """Return the anchors with what the result's own ranges to them left over."""
+    """Return the anchors with the remaining errors of the result's own ranges to them."""
     stored = result.ranges
     index = {name: k for k, name in enumerate(map(last_places({a.id for a in result.anchors}).get, anchors.ids))}
     anchor = np.array([index.get(name, -1) for name in stored.anchors], dtype=np.int64)

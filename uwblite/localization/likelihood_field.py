@@ -1,4 +1,4 @@
-"""The likelihood field of a map's walls, and its maxima over squares of cells: what branch and bound looks points up in."""
+"""The likelihood field of a map's walls, and its maxima over squares of cells, for branch and bound."""
 
 from dataclasses import dataclass
 

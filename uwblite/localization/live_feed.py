@@ -1,4 +1,4 @@
-"""A live localisation of what a log holds as it is written: how the sensors sit, and which of them have fallen silent."""
+"""Live localisation from a log while it is written: mounting of the sensors, and reports of silent sensors."""
 
 from collections.abc import Callable, Iterator
 
@@ -18,7 +18,7 @@ _SENSORS = {
     "uwb": "the pose rests on scans and odometry",
     "gyro": "directions are the wheels' own",
 }
-"""And what it means that one is silent; a gyro is missed only where one sent before."""
+"""The consequence of each silent sensor; a gyro is reported only where one sent before."""
 
 
 class LiveFeed:
@@ -26,7 +26,7 @@ class LiveFeed:
 
     Parameters
     ----------
-    mounting : from how the log says that the sensors sit to how they do. note : takes each line for people.
+    mounting : converts the mounting of the sensors in the log to the true one. note : receives each line for people.
     """
 
     def __init__(
@@ -48,12 +48,12 @@ class LiveFeed:
                 yield from self._use(self._localizer, measured)
                 continue
             self._early.append(measured)
-            # The log has said how the sensors are mounted with the first scan, or when none comes for so long.
+            # The log contains the mounting before the first scan; or no scan comes for so long.
             if isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR:
                 yield from self._begin()
 
     def end(self) -> Iterator[LocalizerState]:
-        """Use what still waits, yield the states, and say what was left out."""
+        """Use the measurements that still wait, yield the states, and report what was left out."""
         yield from self._begin()
         if self._reader.broken:
             self._note(f"{self._reader.broken} broken lines were left out")
@@ -87,7 +87,7 @@ class LiveFeed:
             yield localizer.add_scan(measured.stamp, s.ranges[0], scanner)
 
     def _watch(self, measured: Measured) -> None:
-        """Say once when a sensor that was there, or should be, falls silent."""
+        """Report once when a sensor that was there, or should be, becomes silent."""
         kind = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}.get(type(measured), "lidar")
         now = measured.order if self._localizer is None else self._localizer.on_time(measured.order)
         if not self._seen:

@@ -1,8 +1,8 @@
-"""Where a robot drove within a map that is there already: the live localiser, forwards and backwards over a recording.
+"""Localisation of a recording in an existing map: the live localiser, forwards and backwards over the recording.
 
-The start pose need not be known; the map is not changed. What both passes know is averaged (passes); poses that neither knows
-are left out. Where the scans fit the map's walls nowhere, the place has changed or is another one: the anchors alone then say
-where the robot was, and the result is doubted.
+The start pose need not be known; the map is not changed. Poses of both passes are averaged (passes); poses that neither pass
+has are left out. Where the scans fit the map's walls nowhere, the place has changed or is another one: the anchors alone then
+determine where the robot was, and the result is doubted.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     Cancelled : progress returned False.
     """
     _refuse_nothing_in_common(log, known)
-    # Each anchor of the map takes time in every step; those that are not heard say nothing.
+    # Each anchor of the map takes time in every step; those without ranges add no information.
     known = replace(known, anchors=known.anchors.only(_shared(log, known)))
     log = screen(log, turn_laser)
     rows = pose_rows(log)

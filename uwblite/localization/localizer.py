@@ -1,7 +1,7 @@
-"""A robot's pose in a map that is there already, as its measurements come in.
+"""A robot's pose in an existing map, from its measurements as they come in.
 
-Measurements wait here until the odometry has reached them, then they are corrected by the map's calibration and brought to the
-robot's base; what is known of the pose by them is the estimator's (pose_estimator).
+Measurements wait here until the odometry has reached them, then they are corrected by the map's calibration and transformed to
+the robot's base; the pose is estimated from them in pose_estimator.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _SET_BACK, _IN_A_ROW = 0.5, 4
 
 
 _BEYOND = 1e8
-"""m and rad; a pose or a heading that is farther from its zero is none: steps from there have no digits left."""
+"""m and rad; a pose or a heading farther from zero is invalid: differences between such numbers lose all digits."""
 
 
 class Localizer:
@@ -40,7 +40,7 @@ class Localizer:
 
     Parameters
     ----------
-    known : the map. mounting : where the robot's sensors sit. scanner : its lidar; None where scans bring it with them.
+    known : the map. mounting : of the robot's sensors. scanner : its lidar; None where it comes with the scans.
 
     Notes
     -----
@@ -90,7 +90,8 @@ class Localizer:
             return self.state()
         self._behind = []
         if self._measured < min(stamp, self._odometer.stamp) and stamp <= self._measured + LEAD:
-            # It was not silent but late, or comes rarely: what was bridged is measured now, and next time it is waited for.
+            # It was not silent but late, or rare: the bridged motion is measured now, and the next time the localiser waits
+            # longer.
             self._patience = min(2.0 * self._patience, LEAD)
             self._odometer.forget_from(np.nextafter(self._measured, np.inf))
         leap, self._leap = self._leap, None
@@ -204,7 +205,7 @@ class Localizer:
         self._estimator.search_or_check(free=not any(isinstance(entry, Scan) for _, entry in due))
 
     def _bridge_silence(self) -> None:
-        """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
+        """Where the odometry is silent, let the robot stand, and increase the uncertainty of the pose."""
         latest = self._waiting.latest(self._odometer.stamp)
         gap = latest - self._odometer.stamp
         if gap > self._patience:

@@ -6,22 +6,22 @@ from .. import se2
 from ..arrays import Floats
 
 _SECONDS = 30.0
-"""s that are kept: longer than any sensor's message is late."""
+"""s that are kept: more than the largest delay of a sensor's message."""
 _FASTEST = 5.0
-"""m/s and rad/s; a step that is faster was not driven: the base's counters began again."""
+"""m/s and rad/s; a faster step is not real: the base's counters were reset."""
 _LEAST_STEP = 0.5
 """m and rad; a smaller step is no jump, however short its time."""
 
 
 class Odometer:
-    """A trajectory that grows at its end and is forgotten at its beginning."""
+    """A trajectory of the last seconds: poses are added at its end and removed at its beginning."""
 
     def __init__(self) -> None:
         self._stamps = np.zeros(64)
         self._poses = np.zeros((64, 3))
         self._begin = self._end = 0
         self.jumps = 0
-        """Steps that no robot drives; they count as standing still."""
+        """Number of impossible steps; they count as standing still."""
         self.late = 0
         """Poses that were left out: not newer than the one before, or not finite."""
 
@@ -62,7 +62,7 @@ class Odometer:
         return step
 
     def forget_from(self, stamp: float) -> None:
-        """Forget the poses from a time on, s, but for the first of all."""
+        """Remove the poses from a time on, s, except the first of all."""
         kept = int(np.searchsorted(self._stamps[self._begin : self._end], stamp))
         self._end = self._begin + max(kept, 1)
 
@@ -78,7 +78,7 @@ class Odometer:
         self._end += 1
 
     def _shift(self) -> None:
-        """Make room: forget what is old, and where that is too little, take more memory."""
+        """Make room: remove old poses, and where that is not enough, allocate more memory."""
         recent = int(np.searchsorted(self._stamps[: self._end], self.stamp - _SECONDS))
         first = max(self._begin, min(recent, self._end - 2))
         stamps, poses = self._stamps[first : self._end].copy(), self._poses[first : self._end].copy()

@@ -1,9 +1,9 @@
-"""A recording played through the live localiser, forwards or backwards, and both passes put together.
+"""A recording played through the live localiser, forwards or backwards, and the combination of both passes.
 
-A pass says where the robot was by all that was measured before; the one in the opposite direction, by all that came after.
-Both know nothing of one another, so that their poses are averaged by their covariances: the two-filter form of the optimal
+A pass estimates the pose from all earlier measurements; the pass in the opposite direction from all later ones.
+They are independent, so that their poses are averaged by their covariances: the two-filter form of the optimal
 smoother (D. Fraser, J. Potter, The optimum linear smoother as a combination of two optimum linear filters, 1969). The
-metres that one pass needs for its start are known from the other one.
+poses of the metres that one pass needs for its start come from the other one.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .localizer import Localizer
 from .records import Scanner
 
 _SPACING = (0.1, 0.1, 1.0)
-"""m, rad and s between poses, and between the scans that are used: nearer ones repeat one another."""
+"""m, rad and s between poses, and between the scans that are used: nearer ones are redundant."""
 _ODOMETRY, _RANGE, _SCAN = 1, 0, 2
 """Kinds of events; of a range and an odometry at the same time the range comes first, and waits."""
 _APART = 25.0
@@ -28,7 +28,7 @@ _APART = 25.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """What one pass found."""
+    """Result of one pass."""
 
     poses: Floats
     """(k, 3) T_map_base at the wanted times; nan where it was lost."""
@@ -60,7 +60,7 @@ def _first_of_each(way: Floats) -> Ints:
 
 
 def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, report: Callable[[int, int], None]) -> Pass:
-    """Play a recording through a localiser that knows nothing but the map.
+    """Play a recording through a localiser whose only prior knowledge is the map.
 
     Parameters
     ----------
@@ -128,8 +128,8 @@ class Smoothed:
 def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
     """Average two passes by their covariances.
 
-    ``x = a + A (A + B)^-1 (b - a)``, ``P = A - A (A + B)^-1 A``. Where they contradict one another the surer one stays, with a
-    covariance that reaches to the other.
+    ``x = a + A (A + B)^-1 (b - a)``, ``P = A - A (A + B)^-1 A``. Where they contradict one another the more certain one is
+    kept, with a covariance that includes the other.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""What is known of a robot's pose, by its ranges and scans, each with the odometry at its time.
+"""Estimation of a robot's pose from its ranges and scans, each with the odometry at its time.
 
-Nothing is known at the start. While the robot drives, the last metres' ranges and scans are searched for in the whole map
-(search); what is found lives on as hypotheses, each an extended Kalman filter of its own (hypotheses), and is weighted again
-with every search. Only when one explains what was measured, twice in a row, and every other place is a few hundred times
+The start is unknown. While the robot drives, the whole map is searched with the last metres' ranges and scans
+(search); the resulting poses become hypotheses, each an extended Kalman filter (hypotheses), and are weighted again
+with every search. Only when one explains the measurements, twice in a row, and every other place is a few hundred times
 less likely, the pose counts as found. From then on that filter tracks, at a millisecond a scan; where measurements
-and map fall apart, the pose counts as lost, and the search begins again with what was measured since.
+contradict the map, the pose counts as lost, and the search begins again with the measurements since then.
 """
 
 import numpy as np
@@ -35,9 +35,9 @@ _PROVEN = 3
 _KNOWN = 0.5
 """Share of a scan's ends that must lie in known space for it to move a pose that was found."""
 _MOST, _FORGET = 40, -14.0
-"""Hypotheses, and log-weight below which one goes."""
+"""Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
-"""Into how many parts the window is divided at most: a quarter of ten metres holds what a start needs."""
+"""Most parts of the window: a quarter of ten metres is enough for a start."""
 _SCANS_DIFFER = "the scans do not fit the walls any more"
 
 
@@ -46,7 +46,7 @@ class PoseEstimator:
 
     Parameters
     ----------
-    known : the map. odometer : the odometry of the last seconds, which somebody else adds to: its last pose is the present one.
+    known : the map. odometer : the odometry of the last seconds, which the caller updates: its last pose is the present one.
     """
 
     def __init__(self, known: KnownMap, odometer: Odometer) -> None:
@@ -57,10 +57,10 @@ class PoseEstimator:
         self._bank = hypotheses.none(len(known.anchors.ids))
         self._places = PlaceSearch(known)
         self._searched = Window()
-        """What the search that is under way goes by."""
+        """Measurements of the running search."""
         self._window = Window()
         self._parts = 1
-        """Into how many parts the window is divided, of which the newest is searched for."""
+        """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
         self._search_stamp = -np.inf
         self._certain = False
@@ -77,9 +77,9 @@ class PoseEstimator:
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
-        """Let the pose become unsure by a standard deviation, m and rad, of motion that nothing has measured.
+        """Increase the uncertainty of the pose by a standard deviation, m and rad, of unmeasured motion.
 
-        What came before it cannot be joined with what comes after.
+        Measurements before and after it cannot be combined.
         """
         self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma, self.known.anchors.slow_sigma)
         self._window, self._confirmed = Window(), None
@@ -113,7 +113,7 @@ class PoseEstimator:
         some = rays.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
-            # What does not agree as a whole must not move the pose: walls that the map does not hold lie near others.
+            # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
             self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.log_likelihood)
@@ -143,8 +143,8 @@ class PoseEstimator:
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
         elif free and (not self._certain or self._running.in_doubt()) and self._due():
-            # Of a pose that is in doubt, places are compared by what was measured since scans fitted there: ranges to a wrong
-            # place agree by chance.
+            # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
+            # wrong place by chance.
             self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
             self._places.begin(self._searched, odom, self._way)
 
@@ -169,7 +169,7 @@ class PoseEstimator:
         return self.known.walls is not None and bool(self._window.looks)
 
     def _due(self) -> bool:
-        """Return whether it is time for another search, and remember it."""
+        """Return whether it is time for another search, and record it."""
         now = self._odometer.stamp
         if self._way - self._search_way < _SEARCH_WAY and now - self._search_stamp < _SEARCH_TIME:
             return False
@@ -179,7 +179,7 @@ class PoseEstimator:
     def _doubted(self, free: bool) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
-        One that ranges vouch for is given up only where another place explains better what was measured since.
+        A pose that ranges support is rejected only where another place explains the later measurements better.
 
         Parameters
         ----------
@@ -195,14 +195,14 @@ class PoseEstimator:
         return "the ranges do not fit the anchors any more" if self._running.ranges_contradict() else ""
 
     def _other_unit(self) -> str:
-        """Return why the map's unit is another one than the sensors', by the last metres; "" = it is not."""
+        """Return the reason why, by the last metres, the map's unit differs from that of the sensors; "" = it does not."""
         odom, way = self._odometer.pose, self._way
         rays, ago = self._window.seen(odom, way, LOOK_BACK)
         ranges = self._window.ranges_since(odom, way)
         return verdict.other_unit(self.known.walls, self._bank.poses[0], rays, len(np.unique(ago)), ranges, False)
 
     def _lose(self, why: str, since: float | None = None) -> None:
-        """Begin again with what was measured since a time, s; None = since measurements spoke for the pose."""
+        """Begin again with the measurements since a time, s; None = since measurements last supported the pose."""
         self._certain, self._confirmed, self._reason = False, None, why
         self._window, self._parts = self._window.since(self._running.agreed() if since is None else since), 1
         self._places.drop()
@@ -210,7 +210,7 @@ class PoseEstimator:
         self._search_stamp = -np.inf
 
     def _decide_by(self, found: Comparison) -> None:
-        """Weight all hypotheses again by what a search found, and decide."""
+        """Weight all hypotheses again by the result of a search, and decide."""
         if not len(found.bank):
             self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
             return
@@ -230,19 +230,19 @@ class PoseEstimator:
         self._decide(pose, verdict.confirming_way(fit, known, fitting, proven))
 
     def _trim(self, nowhere: bool) -> None:
-        """Choose the part of the window that the next search goes by.
+        """Choose the part of the window for the next search.
 
-        What fits nowhere may be of two places, before and after the robot was carried: its newest half is tried, then
-        its newest quarter. Once such a part is enough by itself, the rest is forgotten.
+        Measurements that fit nowhere may be of two places, before and after the robot was carried: their newest half is tried,
+        then their newest quarter. Once such a part is enough by itself, the rest is removed.
         """
         if self._parts > 1 and not self._reason:
             self._window = self._searched
         self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
 
     def _decide(self, pose: Floats, confirm: float) -> None:
-        """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt.
+        """Accept the best hypothesis where two searches, so many metres apart, found it without a doubt.
 
-        0 m: a second search of a standing robot will do; below 0 the first one will.
+        0 m: a second search of a standing robot is enough; below 0 the first one is.
         """
         if self._reason:
             self._confirmed = None

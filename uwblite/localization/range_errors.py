@@ -1,10 +1,10 @@
-"""By how much a map's own recording found each anchor's ranges wrong, and where: ranges are corrected by it near that path.
+"""Errors of each anchor's ranges by place, from the map's own recording: ranges are corrected by them near its path.
 
-Multipath, walls and an anchor whose place is off by decimetres make errors that stay with the tag's place: who comes there
-again meets them again. What the map's ranges left over is therefore interpolated over the floor by a Gaussian process, whose
-noise is learnt from the same errors as the mapping learns it (radio.range_noise): covariance ``slow^2 exp(-d / length)``, and
-far from the path no correction but the anchor's mean (C. Rasmussen, C. Williams, Gaussian Processes for Machine Learning,
-2006, algorithm 2.1). What a robot's own body and antenna make of a direction is not the place's, and is taken off before.
+Multipath, walls and an anchor whose place is off by decimetres cause errors that depend on the tag's place and are the same
+on every visit. The range residuals of the map are therefore interpolated over the floor by a Gaussian process, whose
+noise is learnt from them as in mapping (radio.range_noise): covariance ``slow^2 exp(-d / length)``, and
+far from the path only the anchor's mean is corrected (C. Rasmussen, C. Williams, Gaussian Processes for Machine Learning,
+2006, algorithm 2.1). The error by direction, from the robot's own body and antenna, is subtracted before.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _CONSTANT = 0.1
 _CELL = 0.25
 """m; ranges from one square of this size are averaged: their errors are correlated."""
 _MOST_CELLS = 400
-"""Of one anchor; where there are more the squares are larger, for the time that a matrix of them takes."""
+"""Most squares of one anchor; where there are more the squares are larger, to bound the time for a matrix of them."""
 _GATE = 2.0
 """White standard deviations at which a range's weight falls to a half (Cauchy)."""
 _ITERATIONS = 4
@@ -63,7 +63,7 @@ def range_errors(anchor: Ints, tags: Floats, bearings: Floats, errors: Floats, c
 
 
 def _robust_fit(jacobian: Floats, errors: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """Return the unknowns (n,) with standard deviations (n,) before, and the errors' weights (m,)."""
+    """Return the unknowns (n,) with prior standard deviations (n,), and the errors' weights (m,)."""
     x = np.zeros(len(prior))
     weight, information = np.ones(len(errors)), np.diag(prior**-2.0)
     for _ in range(_ITERATIONS):

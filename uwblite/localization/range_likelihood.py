@@ -1,4 +1,4 @@
-"""How likely a window's ranges are at poses of the map, and what they say of the pose."""
+"""Likelihood of a window's ranges at poses of the map, and the pose that they determine."""
 
 import numpy as np
 
@@ -7,14 +7,14 @@ from ..arrays import Floats
 from .window import Ranges
 
 _INDEPENDENT = 0.5
-"""Share of the window's ranges that are worth a new one: they are a quarter of a metre apart, and their errors are correlated
-over 1.5 m in part."""
+"""Share of the window's ranges that count as independent: they are a quarter of a metre apart, and a part of their errors is
+correlated over 1.5 m."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
 _AT_ONCE = 512
-"""Poses of the lattice whose ranges fit into a processor's cache."""
+"""Poses of the lattice whose ranges fit into the processor's cache."""
 _MOST_MOMENTS = 40
-"""Ranges of which moments are made, for the time that it takes."""
+"""Most ranges from which moments are computed, to bound the time."""
 
 
 def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
@@ -34,7 +34,7 @@ def _misfits(poses: Floats, ranges: Ranges) -> Floats:
 
 
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
-    """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; detours and nonsense happen.
+    """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
 
     Errors of ranges to one anchor are correlated, see _INDEPENDENT.
 
@@ -67,7 +67,7 @@ def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
 def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
 
-    Detours leave the likelihood flat where its curvature, with every range that is late left out, promises a sharp peak: the
+    With NLOS the likelihood is flat where its curvature, without the late ranges, would give a sharp peak: so the
     moments are summed over a lattice of poses.
     """
     axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
@@ -80,7 +80,7 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     mean = weight @ off
     steps = np.array([axis[1] - axis[0] for axis in axes])
     off -= mean
-    # Each point of the lattice stands for a cell: the cell's own variance besides.
+    # Each point of the lattice represents a cell: the variance within the cell is added.
     covariance = (off * weight[:, None]).T @ off + np.diag(steps**2 / 12.0)
     return np.concatenate([pose[:2] + mean[:2], [se2.wrap_angle(pose[2] + mean[2])]]), covariance
 

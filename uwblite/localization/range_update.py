@@ -1,4 +1,4 @@
-"""One range corrects every hypothesis: its error by the anchor's slow one, by the map's and by the direction's, robustly."""
+"""Robust update of every hypothesis by one range, with its errors by anchor (slow), by place in the map and by direction."""
 
 from dataclasses import dataclass
 
@@ -12,16 +12,16 @@ from .hypotheses import FIRST_ANCHOR, PATTERN, Hypotheses, symmetric
 from .range_errors import RangeErrors
 
 _TAIL, _DETOUR, _WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0
-"""Share of ranges with a detour and its mean, m; share of nonsense and its extent, m: the mixture of radio.nlos_mixture. The
-map's own ranges have a tail of 0.15 and 0.25 m where its robot drove, those of another robot on another path 0.22 and 0.28 m in
-the middle of eleven buildings; how many of them are late in a place that is new differs, so that more are expected."""
+"""Share of ranges with a detour and its mean, m; share of gross errors and their width, m: the mixture of radio.nlos_mixture.
+The map's own ranges have a tail of 0.15 and 0.25 m where its robot drove, those of another robot on another path 0.22 and 0.28
+m in the middle of eleven buildings; how many of them are late in a place that is new differs, so that more are expected."""
 _ANYWHERE = 30.0
-"""m over which ranges are spread where nothing is known of the place: the reach of the radio indoors."""
+"""m over which ranges are distributed where the place is unknown: the reach of the radio indoors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeFacts:
-    """One range and what is known of it."""
+    """One range and its parameters."""
 
     anchor: int
     """Number of the anchor in the map."""
@@ -36,7 +36,7 @@ class RangeFacts:
     scale: float
     """Relative error of all ranges."""
     errors: RangeErrors | None = None
-    """By the tag's place, as the map knows it."""
+    """By the tag's place, from the map."""
 
 
 def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats, Floats]:

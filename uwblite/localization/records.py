@@ -1,4 +1,4 @@
-"""What goes into a live localisation and what comes out: the lidar's geometry and the state of knowledge."""
+"""Input and output of a live localisation: the lidar's geometry and the state."""
 
 from dataclasses import dataclass, field
 
@@ -23,13 +23,13 @@ class Scanner:
 
     @property
     def usable(self) -> bool:
-        """Whether it says where each ray goes; a header that is broken does not."""
+        """Whether it gives the direction of each ray; a broken header does not."""
         return bool(np.isfinite((self.angle_min, self.angle_increment, self.time_increment)).all())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalizerState:
-    """Where the robot is, as far as is known."""
+    """Present estimate of the robot's pose."""
 
     stamp: float
     """s, of the last odometry."""
@@ -42,10 +42,10 @@ class LocalizerState:
     odometry: Floats
     """(3,) T_odom_base at the same time, as the wheels have it: pose * odometry^-1 is T_map_odom."""
     lost: bool
-    """The pose is not known; what stands in `pose` is the best guess."""
+    """The pose is not known; `pose` is the best guess."""
     reason: str = ""
     """Why it is not known, for people."""
     alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(k, 3) other poses that are possible, the likeliest first."""
     moved_anchors: tuple[str, ...] = ()
-    """Anchors whose ranges have long disagreed with the pose that all else agrees on."""
+    """Anchors whose ranges have disagreed for long with a pose on which all other measurements agree."""

@@ -1,4 +1,4 @@
-"""How well the last measurements agree with the tracked pose: from that, whether it is lost, and which anchors have moved."""
+"""Agreement of the last measurements with the tracked pose; from it, whether the pose is lost, and which anchors have moved."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ _RANGES_LOST = 0.25
 _FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 """Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
 _SEEN = 0.5
-"""Share of the last scans that must have met known space for their fit to speak for a pose that ranges contradict."""
+"""Least share of the last scans in known space for their fit to support a pose that ranges contradict."""
 _SOUND_WEIGHT = 0.5
-"""Weight from which a range speaks for the pose. The search for a robot that is lost begins with what was measured after the
+"""Weight from which on a range supports the pose. The search for a lost robot begins with the measurements after the
 last such range, or after the last scan that fits."""
 _RANGES_SOUND, _RECENT = 0.5, 5.0
-"""Mean weight of ranges, the last of them s ago, from which they speak for a pose that scans contradict: it is given up only
-for a better one. Rooms that the map holds in part look like that, and people around the robot."""
+"""Mean weight of ranges, and s since the last of them, with which they support a pose that scans contradict: it is replaced
+only by a better one. Rooms that are only partly in the map, and people around the robot, cause this."""
 _JUMPED = 6.0
 """Log-likelihood, 400 : 1, by which the ranges must be likelier from anywhere than from the pose for it to be lost at once."""
 _DOUBTED = 3.0
@@ -49,7 +49,7 @@ class RunningFit:
     first: float = np.inf
     """s, of the first range since then."""
     sound: float = -np.inf
-    """s, of the last measurement that spoke for the pose."""
+    """s, of the last measurement that supported the pose."""
     ranged: float = -np.inf
     """s, of the last range."""
     matched: float = -np.inf
@@ -61,14 +61,14 @@ class RunningFit:
         self.forget_anchors()
 
     def forget_anchors(self) -> None:
-        """Trust all anchors again; ranges that contradict already are no jump."""
+        """Use all anchors again; ranges that contradict already are no jump."""
         self.trust[:], self.against[:], self.before, self.first = (1.0, 0.0), 0.0, self.ranges, np.inf
 
     def add_range(self, anchor: int, weight: float, ratio: float, stamp: float) -> None:
         """Take the weight, 0..1, of a range at the pose, and the logarithm of how much likelier it is there than anywhere.
 
         The sum since it was last above 0 is Page's test for a sudden change (Continuous inspection schemes, Biometrika 1954);
-        errors of ranges to one anchor are correlated, so that each anchor counts once, as far as it was trusted.
+        errors of ranges to one anchor are correlated, so that each anchor counts once, with its weight.
         """
         self.against[anchor] = self.trust[anchor, 0] * ratio
         self.first = min(self.first, stamp)
@@ -89,7 +89,7 @@ class RunningFit:
                 self.sound, self.matched = max(self.sound, stamp), max(self.matched, stamp)
 
     def in_doubt(self) -> bool:
-        """Return whether measurements fit worse than they should: people may be about, or the robot is elsewhere."""
+        """Return whether measurements fit worse than they should: people may be near, or the robot is elsewhere."""
         return self.fit < FIT_SOUND or self._jump() > _DOUBTED
 
     def scans_contradict(self) -> bool:
@@ -97,7 +97,7 @@ class RunningFit:
         return self.fit < FIT_LOST
 
     def ranges_contradict(self) -> bool:
-        """Return whether the ranges contradict the pose, and no scans speak for it."""
+        """Return whether the ranges contradict the pose, and no scans support it."""
         return (self.ranges < _RANGES_LOST or self.jumped()) and not (self.seen > _SEEN and self.fit > FIT_SOUND)
 
     def jumped(self) -> bool:
@@ -105,15 +105,15 @@ class RunningFit:
         return self._jump() > _JUMPED
 
     def _jump(self) -> float:
-        """Return by how much, log-likelihood, ranges that agreed contradict the pose since."""
+        """Return the log-likelihood by which ranges that agreed before contradict the pose."""
         return -float(self.against.sum()) if self.before > _RANGES_SOUND else 0.0
 
     def ranges_vouch(self, now: float) -> bool:
-        """Return whether recent ranges speak for the pose."""
+        """Return whether recent ranges support the pose."""
         return self.ranges > _RANGES_SOUND and now - self.ranged < _RECENT
 
     def agreed(self) -> float:
-        """Return until when, s, the measurements spoke for the pose: by chance some still do after a jump."""
+        """Return until when, s, the measurements supported the pose: by chance some still do after a jump."""
         return min(self.sound, float(np.nextafter(self.first, -np.inf))) if self.jumped() else self.sound
 
     def moved_anchors(self) -> Ints:

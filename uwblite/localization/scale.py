@@ -1,9 +1,9 @@
-"""Whether sensors and map measure with the same metre.
+"""Test whether sensors and map have the same unit of length.
 
 A map that was drawn, converted or measured in another unit still looks like the place: near every wall the pose follows the
-wall. What gives it away is that from the right place all distances are too long, or too short, by the same share. So the pose
-is matched once more together with two scales, one of the lidar's (or the radio's) distances and one of the way between the
-measurements, which belongs to the wheels and takes their error.
+wall. But from the right place all distances are too long, or too short, by the same factor. So the pose
+is matched once more together with two scales, one of the lidar's (or the radio's) distances and one of the motion between the
+measurements, which belongs to the wheels and absorbs their error.
 """
 
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ from .walls import Rays, Walls
 from .window import Ranges
 
 _PRIOR = (0.3, 0.3, 0.1, 0.1, 0.3)
-"""m, m, rad, 1, 1; of pose, way and distances."""
+"""m, m, rad, 1, 1; prior of pose, motion and distances."""
 _NO_SCALE = 1e-6
-"""Prior of distances that are the map's."""
+"""Prior of distances in the unit of the map."""
 _GATES = ((0.5, 0.3), (0.5, 0.3), (0.4, 0.2), (0.4, 0.15), (0.4, 0.15))
 """m; gate and kernel width of each iteration, wide: in a map 5 % too large the far wall of a room of 5 m is off by 0.25 m."""
 _WALL_SIGMA, _PER_LOOK = 0.03, 20.0
 """m, of a point about its wall, and points of a scan whose errors are independent, as in hypotheses.matched."""
 _ANCHOR_SIGMA = 0.12
-"""m; what all ranges to one anchor are off by."""
+"""m; common error of all ranges to one anchor."""
 _ITERATIONS = 6
 SCAN_LIMIT, RANGE_LIMIT = 0.03, 0.05
-"""Relative error that is a lidar's or a map's own: data sheets allow 1 to 3 %; of radios besides what walls add."""
+"""Relative error of a lidar or a map: data sheets allow 1 to 3 %; for radios, the delay by walls is added."""
 _SURE = 4.0
 """Standard deviations from which a scale error is certain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """By how much the map's distances are longer than the sensor's."""
+    """Relative difference of the map's distances from those of the sensor."""
 
     error: float
     """Relative, 1."""
@@ -49,7 +49,7 @@ class Scale:
 
 
 def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
-    """Match the rays of several scans with pose, way and distances free.
+    """Match the rays of several scans with pose, motion scale and distance scale free.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
 
     Notes
     -----
-    Along a single wall every distance fits, with a pose that is moved by as much; the match then ends anywhere, and its
-    standard deviation does not show that. So one that is off is compared with a match by the map's own metre.
+    Along a single wall every scale fits, with a pose that is moved accordingly; the match then ends at an arbitrary scale, and
+    its standard deviation does not show that. So a scale that is off is compared with a match in the map's own unit.
     """
     error, sigma, whole = _matched(walls, pose, rays, looks, _PRIOR[4])
     found = Scale(error, sigma)
@@ -87,7 +87,8 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
 
     Returns
     -------
-    The error that is fewer of its standard deviations from 0: an anchor that was moved makes no other metre.
+    Of both scale errors, the one that is fewer standard deviations from 0 is returned: a moved anchor must not look like
+    another unit.
     """
     whole, own = _fitted(pose, ranges)
     odd = ranges.anchor == np.unique(ranges.anchor)[int(np.argmax(np.abs(own)))]

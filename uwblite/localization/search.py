@@ -1,14 +1,14 @@
-"""Where a robot may be, from nothing: every pose of the map is judged by the last metres' ranges and scans.
+"""Global search for the robot's pose: every pose of the map is tested with the last metres' ranges and scans.
 
-Ranges first: a place to which the measured distances cannot belong, whatever the robot's heading, is left out. On what
-remains the scans of the last metres, laid together by the odometry, are matched by branch and bound over a pyramid of the
+Ranges first: a place that contradicts the measured distances at every heading of the robot is left out. At the remaining
+places the scans of the last metres, combined by the odometry, are matched by branch and bound over a pyramid of the
 walls' likelihood field, of which each level bounds the one below (W. Hess et al., Real-time loop closure in 2D lidar SLAM,
 ICRA 2016); unlike there, all poses near the best score are kept, not the best alone: a place that looks like another one is
 not decided here. Where no wall is visible, headings and places are tried by the ranges alone. What is found is refined and
-compared by everything that the window holds.
+compared by all measurements of the window.
 
-The functions are generators that pause after every unit of work, a few thousand places: whoever has to keep pace with a lidar
-does some units between two scans.
+The functions are generators that pause after every unit of work, a few thousand places: a caller that must keep pace with a
+lidar does some units between two scans.
 """
 
 from collections.abc import Generator
@@ -29,11 +29,11 @@ _HEADING = 0.05
 _POINTS = 72
 """Points of the scans that are matched."""
 _MOST_NODES = 60_000
-"""Nodes of a level that are followed up; where more are as good, the search is not complete."""
+"""Most nodes of a level that are expanded; where more are equally good, the search is not complete."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
 _FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
-"""Points of walls below which scans say nothing; the second where ranges to three anchors fix the place."""
+"""Least number of points of walls for matching; the second where ranges to three anchors determine the place."""
 MOST_PLACES = 32
 """Poses that are returned."""
 
@@ -45,11 +45,11 @@ class Places:
     poses: Floats
     """(c, 3)."""
     complete: bool
-    """No place that is as good was left out."""
+    """No equally good place was left out."""
 
 
 Steps = Generator[None, None, Places]
-"""A search under way; it pauses after every unit of work and returns what it found."""
+"""A running search; it pauses after every unit of work and returns its result."""
 
 
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
@@ -127,7 +127,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
 def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
     """Return the best of poses (n, 3) by their scores (n,), in whose order they are, and by the ranges together.
 
-    Along a wall scans leave places open that ranges distinguish.
+    Ranges distinguish places along a wall, which scans do not.
     """
     tried, few = poses[:_MOST_RIVALS], _some(ranges)
     weight = _PER_SCORE * scores[: len(tried)]
@@ -173,7 +173,7 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
 
 
 _AT_ONCE = 4096
-"""Nodes scored at once, a unit of work of 2 ms: what fits into a processor's cache."""
+"""Nodes scored at once, a unit of work of 2 ms, so that they fit into the processor's cache."""
 
 
 def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats) -> Generator[None, None, float]:
@@ -214,10 +214,11 @@ def _children(nodes: NDArray[np.int32], half: int) -> NDArray[np.int32]:
 
 
 def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[None, None, Bools]:
-    """Return where (n,) the robot may be by its ranges alone, whatever its heading, within a half width of a place, m.
+    """Return where (n,) the robot may be by its ranges alone, for any heading, within a half width of a place, m.
 
-    The tag was within |t| of where it is now: a range further off than that, the cell and four sigmas disagrees. Detours make
-    ranges long: a place that is too near an anchor is half a disagreement. The best places and those with little more stay.
+    The tag was within |t| of its present place: a range disagrees if it is off by more than that, the cell and four sigmas.
+    NLOS makes ranges long: a place too near an anchor counts as half a disagreement. The best places and those with little more
+    are kept.
     """
     if not len(ranges) or not len(centre):
         return np.ones(len(centre), bool)
@@ -227,7 +228,7 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[None, Non
         x, y = (centre - ranges.places[k]).T
         off = ranges.values[k] - np.sqrt(x * x + y * y)
         beyond = np.abs(off) - moved[k] - 1.5 * half - 4.0 * ranges.sigma[k]
-        # One that is a metre off is as wrong as one that is ten off.
+        # A range that is one metre off counts like one that is ten metres off.
         cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
         if k % at_once == at_once - 1:
             yield

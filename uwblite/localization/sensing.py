@@ -13,14 +13,14 @@ from .records import Scanner
 from .walls import Rays
 
 _FARTHEST = 1000.0
-"""m; a reading that is farther is none, whatever the device calls its reach."""
+"""m; a longer reading is invalid, whatever reach the device states."""
 _CLEAR = 3.0
-"""m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
+"""m; up to here a ray without a reading shows that there is no wall, as grid.max_clear_distance."""
 TRACK_RAYS = 180
 """Rays of a scan that are matched."""
 LEAD = 5.0
-"""s; a stamp that is farther ahead of the odometry is not believed before others confirm it: one alone is a clock's fault.
-One that is as far behind is none that a sensor was late with."""
+"""s; a stamp farther ahead of the odometry is not used before others confirm it: a single one is a fault of the clock.
+One as far behind is not explained by delay."""
 _CONFIRMED = 4
 """Different stamps, all so far ahead, after which the odometry was silent for so long."""
 
@@ -72,7 +72,7 @@ class Waiting:
         return max(near) if near else min(ahead) if len(ahead) >= _CONFIRMED else -np.inf
 
     def refuse(self, now: float) -> None:
-        """Leave out what is too far ahead of an odometry that has just been measured."""
+        """Leave out measurements that are too far ahead of an odometry that has just been measured."""
         kept = [w for w in self._entries if w[0] <= now + LEAD]
         self.refused += len(self._entries) - len(kept)
         self._entries = kept
@@ -91,7 +91,7 @@ def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
 
     Parameters
     ----------
-    mounting : of the laser, with what the map corrects of it.
+    mounting : of the laser, with the map's correction.
     """
     stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
     count = len(readings)

@@ -1,4 +1,5 @@
-"""A sensor's clock against the odometry's: where either jumps while both go on, the sensor's stamps are moved by as much."""
+"""A sensor's clock against the odometry's: where either jumps while both continue, the sensor's stamps are shifted by the
+jump."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -8,7 +9,7 @@ import numpy as np
 T = TypeVar("T")
 
 JUMP = 0.5
-"""s by which a stamp, or a lead, must be off what is usual for a jump; messages are late by less."""
+"""s by which a stamp, or a lead, must differ from its usual value for a jump; messages are late by less."""
 _CONFIRMED = 4
 """Measurements, each after another odometry, that show that a jump lasts."""
 _LEARNT = 0.1
@@ -20,9 +21,9 @@ _LONGEST = 5.0
 class SensorClock(Generic[T]):
     """From a sensor's stamps to those of the odometry's clock.
 
-    Measurements are ahead of the odometry, when they arrive, by about the same time always. That changes bit by bit where a
-    device is silent or its messages become late; where a stamp leaps, the sensor's or the odometry's, and from then on the
-    lead is another one, a clock has jumped. Until that is clear, measurements wait.
+    When measurements arrive, their lead over the odometry is nearly constant. It changes slowly where a
+    device is silent or its messages become late; where a stamp jumps, the sensor's or the odometry's, and the
+    lead has another value from then on, a clock has jumped. Until that is clear, measurements wait.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ CERTAIN = 6.0
 _CERTAIN_AGAIN = 4.6
 """The same in a map that is the right one: 100 : 1."""
 SIGMA_FOUND = (0.25, 0.1)
-"""m and rad; a pose that is less sure is not found yet."""
+"""m and rad; a pose that is less certain is not found yet."""
 FIT_BESIDE_RANGES, FIT_ALONE = -0.5, -0.25
 """Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.2, with people
 close by -0.5; rooms that are alike in part reach -0.3, other buildings beside ranges -0.35 to -0.7."""
@@ -25,19 +25,19 @@ RANGES_FOUND, RANGES_ALONE = 0.6, 0.8
 """Share of the ranges that must agree with a start, beside scans and alone: in the right place 0.9 to 1 alone, with anchors of
 another building 0.75 to 0.8."""
 _RANGES_AGAIN = 0.5
-"""The same beside scans in a map that is the right one: what disagrees there has taken detours."""
+"""The same beside scans in a map that is the right one: ranges that disagree there are NLOS."""
 FEW_ENDS, FEW_BESIDE = 12, 4
-"""Rays' ends in known space from which a scan counts; the second beside ranges to three anchors."""
+"""Least number of rays' ends in known space for a scan to count; the second beside ranges to three anchors."""
 ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
-"""Rays' ends, or ranges to two anchors, that a start needs."""
+"""Least number of rays' ends, or of ranges to two anchors, for a start."""
 _FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.8, 3
-"""Fit of the rays, share of the ranges and anchors from which they speak clearly for a place."""
+"""Fit of the rays, share of the ranges and number of anchors from which on they clearly support a place."""
 _CONFIRM, _CONFIRM_BUSY, _CONFIRM_ALONE = 0.5, 1.0, 2.0
-"""m driven between two searches that agree; the second where people are about, the third where scans or ranges are alone."""
+"""m driven between two searches that agree; the second where people are near, the third with scans or ranges alone."""
 _UNIT_KNOWN = 0.04
 """Standard deviation of the map's unit from which another one would have been noticed."""
 _UNIT_CLEAR = 0.01
-"""The same by scans, from which ranges say nothing against a pose that was found: of four anchors two may have been moved."""
+"""The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
 
 
 def doubt(
@@ -69,10 +69,10 @@ def doubt(
 
 
 def nowhere(fit: float, ends: float, fitting: "RangeFit", proven: bool = False) -> str:
-    """Return what contradicts even the best place; "" = nothing does.
+    """Return the reason why even the best place is contradicted; "" = it is not.
 
-    In a map that is the right one, ranges to two anchors leave no other building for scans to exclude; half of them may have
-    taken detours where scans fit.
+    In a map that is the right one, with ranges to two anchors, scans need not exclude another building; half of the ranges may
+    be NLOS where scans fit.
     """
     seen = share_of_needed(ends)
     beside = fitting.enough or (proven and fitting.anchors >= 2)
@@ -113,9 +113,9 @@ class RangeFit:
 
     count: int
     share: float
-    """Of the ranges that agree, 0..1."""
+    """Share of the ranges that agree, 0..1."""
     anchors: int
-    """To which ranges agree."""
+    """Anchors whose ranges agree."""
 
     @property
     def share_of_needed(self) -> float:
@@ -130,7 +130,7 @@ class RangeFit:
 def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> float:
     """Return how far a robot must drive, m, between two searches that agree; below 0, a second one is not needed.
 
-    Errors of scans and ranges have nothing in common: where both speak clearly for a place, each confirms the other.
+    Errors of scans and ranges are independent: where both clearly support a place, each confirms the other.
 
     Parameters
     ----------

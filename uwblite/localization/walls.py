@@ -1,8 +1,8 @@
-"""A map's walls as scans are compared with them: the nearest wall of every place, and what a ray may not pass through.
+"""A map's walls for comparison with scans: the nearest wall of every place, and the cells that a ray must not pass.
 
 A scan's point lies on a wall when the nearest occupied cell is near; across the wall's line it measures the pose. A ray
-that ends in free space met something that is not in the map, and one that passes an occupied cell contradicts the map; both
-count against a pose, and pull at none. Points in unknown space count for nothing.
+that ends in free space hit an object that is not in the map, and one that passes an occupied cell contradicts the map; both
+lower the likelihood of a pose, but do not move it. Points in unknown space do not count.
 """
 
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import make_cloud
 
 REACH = 0.5
-"""m; a wall farther away is no neighbour."""
+"""m; largest distance of a neighbouring wall."""
 _NORMAL_RADIUS = 0.2
 """m; neighbourhood of a wall's line: four cells of 0.05 m."""
 _BEHIND = 0.013
 """m; the surface behind the first occupied cells' centres. A cell before it is occupied where more than a third of the rays
 that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
 _SIDE = (0.1, 0.15, 0.2, 0.25)
-"""m; where the free side of a wall is looked for."""
+"""m; distance at which the free side of a wall is searched."""
 _MOST_CELLS = 4_000_000
 """Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
 
@@ -35,7 +35,7 @@ class Rays(Table):
     """Thinned rays of a scan in the frame of the base."""
 
     ends: Floats
-    """(p, 2) m; of a ray that saw nothing, the place up to which it would have seen a wall."""
+    """(p, 2) m; for a ray without a reading, the place up to which there is no wall."""
     origins: Floats
     """(p, 2) m, of the laser at each ray."""
     hit: Bools
@@ -55,9 +55,9 @@ class Agreement:
     """How scans agree with the map at poses (h,)."""
 
     log_likelihood: Floats
-    """(h,) mean over the rays; 0 = all as the map has it."""
+    """(h,) mean over the rays; 0 = all agree with the map."""
     fit: Floats
-    """(h,) the same over the rays that the map can judge: not those that end in unknown space."""
+    """(h,) the same over the rays that do not end in unknown space."""
     on_wall: Floats
     """(h,) share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
     known: Floats
@@ -156,7 +156,7 @@ class Walls:
         more = [nx * (c * u - s * v) + ny * (s * u + c * v) for u, v in (rate[rays.hit].T for rate in rates)]
         jacobian = np.stack([nx, ny, ny * rx - nx * ry, *more], axis=1)
         weighted = jacobian * w[:, None]
-        # The tangent (-ny, nx) stands where the normal stood.
+        # The tangent (-ny, nx) replaces the normal.
         tangent = np.stack([-ny, nx, nx * rx + ny * ry], axis=1)
         spurious = (tangent * (w * self.normal_variance.take(near))[:, None]) @ tangent.transpose(0, 2, 1)
         return weighted @ jacobian.transpose(0, 2, 1), spurious, np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
@@ -164,8 +164,8 @@ class Walls:
     def agreement(self, poses: Floats, rays: Rays) -> Agreement:
         """Return how rays agree with the map at poses (h, 3).
 
-        An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two: nothing either
-        way; a ray that passes a wall counts as if it ended in free space, or half of that where it saw nothing.
+        An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
+        a ray that passes a wall counts as if it ended in free space, or half of that where it has no reading.
         """
         c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
 
@@ -181,7 +181,7 @@ class Walls:
         value = np.where(rays.hit, value, 0.0)
         ox, oy = laid(rays.origins)
         along, across = x - ox, y - oy
-        # Up to 0.3 m before the end: there the wall may be that it ends on.
+        # Up to 0.3 m before the end: beyond that it may be the wall on which the ray ends.
         t = _LOOKS[:, None, None] * np.maximum(1.0 - 0.3 / np.maximum(np.hypot(along, across), 0.3), 0.0)
         passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
         value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(_STRANGE)), value)
@@ -200,7 +200,7 @@ _ON_WALL, _FINE = 0.1, 0.05
 _STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
 _LOOKS = np.arange(1, 11) / 10.0
-"""Places along a ray, as shares of its length, at which it is asked whether it passes a wall."""
+"""Places along a ray, as shares of its length, at which it is tested for passing a wall."""
 
 
 def walls_of(grid: OccupancyGrid) -> Walls:
@@ -224,7 +224,8 @@ def walls_of(grid: OccupancyGrid) -> Walls:
 def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
     """Return the centres (n, 2) of the occupied cells that border on free space, m.
 
-    Rays wear away the cells before a wall and noise fills the ones behind: all cells together lie 2 to 4 cm behind the surface.
+    Rays clear the cells in front of a wall and noise fills those behind: the mean of all cells lies 2 to 4 cm behind the
+    surface.
     """
     near = np.zeros(states.shape, dtype=bool)
     free = states == FREE

@@ -1,7 +1,7 @@
-"""What was measured during the last metres of driving, in the frame of the robot as it stands now: all that a start goes by.
+"""Measurements of the last metres of driving, in the present frame of the robot: the input of a start.
 
-Poses of the past are relative to the present one, by the odometry. The place of the robot now fixes where everything was
-measured, so that a start is a search over one pose.
+Earlier poses are relative to the present one, by the odometry. The present pose of the robot determines all of them,
+so that a start is a search over one pose.
 """
 
 from dataclasses import dataclass, field
@@ -14,15 +14,15 @@ from .range_update import RangeFacts
 from .walls import Rays
 
 LENGTH = 10.0
-"""m driven, beyond which a measurement is forgotten: the odometry has then drifted by decimetres."""
+"""m driven, beyond which a measurement is removed: the odometry has then drifted by decimetres."""
 _TURNING = 1.0
-"""m of driving that a turn by one radian counts as."""
+"""m of driving that count for a turn by one radian."""
 _LOOK_EVERY, _RANGE_EVERY = 0.4, 0.25
 """m driven between the scans, and between the ranges to one anchor, that are kept."""
 _ALIKE = 3
 """Ranges to one anchor that a standing robot keeps."""
 _STANDING, _LOOK_AGAIN = 0.05, 1.0
-"""m driven, below which a scan takes the last one's place, and s after which it does: people who hid the walls move on."""
+"""m driven, below which a scan replaces the last one, and s after which it does: people who hid the walls move on."""
 RAYS = 48
 """Rays kept of a scan."""
 
@@ -68,7 +68,7 @@ class Ranges(Table):
     values: Floats
     """(m,) horizontal distances, m."""
     sigma: Floats
-    """(m,) m; what drift since then adds is in it."""
+    """(m,) m; including the drift since then."""
 
     def __len__(self) -> int:
         return len(self.values)
@@ -76,13 +76,13 @@ class Ranges(Table):
 
 @dataclass(slots=True)
 class Window:
-    """Measurements of the last metres; the only thing here that changes."""
+    """Measurements of the last metres (mutable)."""
 
     ranges: list[WindowRange] = field(default_factory=list)
     looks: list[WindowLook] = field(default_factory=list)
 
     def since(self, stamp: float) -> "Window":
-        """Return a window of what was measured after a time, s."""
+        """Return a window of the measurements after a time, s."""
         return Window([r for r in self.ranges if r.stamp > stamp], [k for k in self.looks if k.stamp > stamp])
 
     def newest(self, parts: int) -> "Window":
@@ -91,7 +91,7 @@ class Window:
         return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
 
     def forget(self, way: float) -> None:
-        """Forget what was measured more than LENGTH before, m by the odometer."""
+        """Remove measurements from more than LENGTH before, m by the odometer."""
         self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
         self.looks = [k for k in self.looks if way - k.way <= LENGTH]
 
@@ -113,7 +113,7 @@ class Window:
         return way - self.looks[-1].way < _STANDING and stamp - self.looks[-1].stamp >= _LOOK_AGAIN
 
     def add_look(self, look: WindowLook) -> None:
-        """Keep a scan; that of a robot that stands takes the last one's place."""
+        """Keep a scan; that of a robot that stands replaces the last one."""
         if self.looks and look.way - self.looks[-1].way < _STANDING:
             self.looks.pop()
         self.looks.append(look)
@@ -148,5 +148,5 @@ _DRIFT = 0.03
 
 
 def way_of(step: Floats) -> float:
-    """Return how far a step (3,) is, m, a turn counting as a way too."""
+    """Return the length of a step (3,), m, with its turn counted as a distance."""
     return float(np.hypot(step[0], step[1]) + _TURNING * abs(step[2]))
