@@ -1,4 +1,4 @@
-"""Where a sensor sits on the robot, from the transforms (tf) in a bag."""
+"""Mounting of a sensor on the robot, from the transforms (tf) in a bag."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -29,7 +29,7 @@ class Frames:
             self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
 
     def check(self, frame: str) -> None:
-        """Raise ConfigError where the transforms do not know a frame; without any transform every frame will do."""
+        """Raise ConfigError where a frame is missing in the transforms; without any transform every frame is accepted."""
         names = sorted(set(self._parents) | {parent for parent, _ in self._parents.values()})
         if names and _name(frame) not in names:
             near = get_close_matches(_name(frame), names, n=1)

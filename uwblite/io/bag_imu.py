@@ -1,4 +1,4 @@
-"""The heading of a robot from the messages of an IMU in a bag: what it turns about the vertical.
+"""The heading of a robot from the messages of an IMU in a bag: its rotation about the vertical.
 
 The vertical is measured: an accelerometer feels gravity whatever way it is mounted. Where the messages hold no gravity,
 the transforms say which way is up, and without these the sensor's z axis is taken, as REP-145 has it.

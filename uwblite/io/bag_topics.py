@@ -60,7 +60,7 @@ class TopicPlan:
     """Topics that may hold ranges, with a mapping to begin with."""
 
     def role(self, name: str) -> str:
-        """Return what a topic is read for; '' where it is not read."""
+        """Return the purpose for which a topic is read; '' where it is not read."""
         roles = {self.odometry: "odometry", self.scan: "scans", self.imu: "heading"} | dict.fromkeys(self.uwb, "ranges")
         return roles.get(name, "")
 

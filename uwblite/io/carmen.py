@@ -59,7 +59,7 @@ def read_log(
     """Read one CARMEN log, plain or gzip; ``-`` reads standard input.
 
     A log that was cut into parts by `uwblite record --rotate` is read whole, whichever of its parts is named.
-    Memory grows with what is kept (four bytes a reading), not with the text.
+    Memory grows with the kept readings (four bytes each), not with the text.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class LogReader:
         )
 
     def finish(self, sha256: str, missing: str = "") -> SensorLog:
-        """Return what was collected, sorted by time; `missing` is a part of the log that is not there."""
+        """Return the collected measurements, sorted by time; `missing` is a missing part of the log."""
         # A recorder that is switched off leaves half a line at the end: that one proves nothing about the rest.
         if self.broken - self.ends_broken > self.max_broken_share * self.messages:
             self._refuse()

@@ -18,7 +18,7 @@ from .carmen_readings import Block, Pending
 from .scan_geometry import ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
-"""m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""
+"""m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""
 DEFAULT_RANGE_MAX = 80.0
 """m; reach of the scanners whose logs (FLASER) do not give it. PARAM robot_front_laser_max wins."""
 POSE_TOLERANCE = 0.01
@@ -47,7 +47,7 @@ class LaserMessages:
 
     def __init__(self, every_nth_scan: int, message: str = "") -> None:
         self.kinds = kinds_of(message)
-        """Names of the messages that are read -> what they are read as."""
+        """Names of the messages that are read -> their kind."""
         self.ipc_left_out = False
         """Whether the log leaves out ipc_timestamp; decides where a line alone does not."""
         self._every_nth = every_nth_scan
@@ -231,7 +231,7 @@ class LaserMessages:
 
 
 def _fence_posts(scans: LaserScans) -> list[str]:
-    """Say where an increment looks like the field of view divided by one beam too few, as logs of SICK scanners have it."""
+    """Report an increment that looks like the field of view divided by one beam too few, as in logs of SICK scanners."""
     beams, degrees = scans.ranges.shape[1], math.degrees(abs(scans.angle_increment))
     true = degrees * (beams - 1) / max(beams, 1)
     usual = min(_USUAL_STEPS, key=lambda step: abs(step - true))

@@ -61,7 +61,7 @@ _MOST_PENDING = 1 << 20
 
 
 class LiveReader:
-    """Turn pieces of a log into measurements; what is broken is counted and skipped."""
+    """Turn pieces of a log into measurements; broken lines are counted and skipped."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -73,7 +73,7 @@ class LiveReader:
 
     @property
     def mounting(self) -> SensorMounting:
-        """Where the sensors sit, as far as the log has said it."""
+        """Mounting of the sensors, as far as the log has given it."""
         return self._reader.params.mounting(self._T_base_laser, self._reader.tags)
 
     def feed(self, data: bytes) -> list[Measured]:

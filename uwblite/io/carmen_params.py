@@ -1,4 +1,4 @@
-"""PARAM lines of a CARMEN log: where the sensors sit and what the laser does not say of itself."""
+"""PARAM lines of a CARMEN log: mounting of the sensors, and properties of the laser that its messages do not contain."""
 
 import math
 import re

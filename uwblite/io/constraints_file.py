@@ -1,4 +1,4 @@
-"""Reading what is known beforehand: a TOML file of constraints, and the anchors.csv of an earlier map."""
+"""Reading of prior knowledge: a TOML file of constraints, and the anchors.csv of an earlier map."""
 
 import os
 from collections.abc import Mapping
@@ -86,7 +86,7 @@ def read_anchors(path: str | os.PathLike[str]) -> Constraints:
     """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
 
     Where the map has an anchor at several places (``5C0B``, later ``5C0B@2``), the last one counts. Sigmas are taken as
-    the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
+    the larger of x and y, and at least 2 cm: an earlier map's own frame is not more certain than that.
 
     Raises
     ------

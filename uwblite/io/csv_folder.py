@@ -53,7 +53,7 @@ class ScanGeometry:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Mounting:
-    """Where the sensors sit on the base."""
+    """Mounting of the sensors on the base."""
 
     laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x, y, theta of the laser; m, m, rad."""

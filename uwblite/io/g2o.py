@@ -110,7 +110,7 @@ def write_g2o(
     pose_ids: Sequence[str] = (),
     ranges: bool = False,
 ) -> None:
-    """Write a graph for g2o and its kin: poses, anchors, edges between poses, and what is fixed.
+    """Write a graph for g2o and similar programs: poses, anchors, edges between poses, and the fixed unknowns.
 
     gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
     them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is

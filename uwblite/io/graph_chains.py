@@ -1,4 +1,4 @@
-"""Initial poses of a graph file that has none: along its relative poses, from what is given or fixed."""
+"""Initial poses of a graph file that has none: along its relative poses, from given or fixed unknowns."""
 
 import math
 from dataclasses import replace
@@ -67,7 +67,7 @@ def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
         return poses
     if not known.any():
         known[0], poses = True, np.zeros((n, 3))
-    # One more node stands for everything known; its links are the shortest.
+    # One further node represents everything known; its links are the shortest.
     given = np.flatnonzero(known)
     rows = np.concatenate([i, np.full(len(given), n)])
     cols = np.concatenate([j, given])

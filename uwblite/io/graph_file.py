@@ -24,7 +24,7 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphFile:
-    """A graph as a file holds it."""
+    """The content of a graph file."""
 
     graph: Graph
     pose_ids: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""A log that somebody is writing, read as it grows, over all its parts."""
+"""A log that is being written, read as it grows, over all its parts."""
 
 import os
 import re
@@ -47,7 +47,7 @@ class GrowingFile:
         self._end = b""
 
     def read(self) -> bytes:
-        """Return what is new, at most a piece; b"" where nothing is."""
+        """Return new bytes, at most one piece; b"" where there are none."""
         if self._head_left:
             data = self._file.read(self._head_left)
             self._head_left = 0

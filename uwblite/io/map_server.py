@@ -120,7 +120,7 @@ def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
 
 
 def _log_odds(pixels: Image, negate: bool, occupied: float, free: float) -> NDArray[np.float32]:
-    """Return what pixels (rows, cols, channels) say of their cells; transparent ones say nothing."""
+    """Return the states of cells from their pixels (rows, cols, channels); transparent ones are unknown."""
     colours = 3 if pixels.shape[2] >= 3 else 1
     total = pixels[:, :, 0].astype(np.uint16)
     for channel in range(1, colours):

@@ -1,4 +1,4 @@
-"""A graph's measurements as text formats can say them: between poses and landmarks, nothing calibrated."""
+"""A graph's measurements in the form of text formats: between poses and landmarks, without calibration."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -122,7 +122,7 @@ def _unfiltered(rows: Image, channels: int, path: str) -> Image:
 
 
 _BAND = 1024
-"""Rows decoded together, so that what is worked on stays in the processor's cache."""
+"""Rows decoded together, so that they stay in the processor's cache."""
 
 
 def _by_rows(kinds: Image, lines: Image, above: Image, out: Image) -> None:

@@ -1,4 +1,4 @@
-"""ROS 2 messages from arrays: what a bag of a recording and a bag of a map have in common."""
+"""ROS 2 messages from arrays, common to a bag of a recording and a bag of a map."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -73,7 +73,7 @@ class Messages:
         return self.make("tf2_msgs/TFMessage", transforms=[self.transform(stamp, parent, child, (x, y, 0.0), self.turn(theta))])
 
     def mounting(self, stamp: float, mounting: SensorMounting, prefix: str = "") -> Any:
-        """Return where laser and tag sit on the base, as a tf2_msgs/TFMessage."""
+        """Return the mounting of laser and tag on the base, as a tf2_msgs/TFMessage."""
         x, y, theta = mounting.T_base_laser.tolist()
         laser = self.transform(stamp, prefix + BASE, prefix + LASER, (x, y, 0.0), self.turn(theta, mounting.laser_flipped))
         tag = self.transform(stamp, prefix + BASE, prefix + TAG, mounting.tag_position.tolist(), self.turn(0.0))

@@ -176,7 +176,7 @@ class _Collector:
         self.scans.append((self._time(message.header.stamp, recorded), readings))
 
     def log(self, path: str, sha256: str) -> SensorLog:
-        """Return what was gathered as a recording."""
+        """Return the collected messages as a recording."""
         if not self.odometry:
             raise FormatError(f"the bag has no odometry ({short_type(ODOMETRY)}); name its topic with --odometry-topic", path)
         table = np.array(self.odometry)

@@ -27,7 +27,7 @@ _BOMB_BYTES, _BOMB_RATIO = 1 << 24, 100
 the memory."""
 
 _PIPE_PATIENCE = 10.0
-"""s that a named pipe may take before somebody writes into it."""
+"""s to wait until data are written into a named pipe."""
 
 _GZIP = b"\x1f\x8b"
 _OTHER_FORMATS = (
@@ -76,12 +76,12 @@ class TextSource:
         self._text: BinaryIO = gzip.GzipFile(fileobj=self._buffered) if packed else self._buffered  # type: ignore[assignment]
 
     def read_rest(self) -> None:
-        """Read what is left, so that the hash is that of the whole file."""
+        """Read the rest, so that the hash is that of the whole file."""
         while self._buffered.read(BLOCK_BYTES):
             pass
 
     def sha256(self) -> str:
-        """Read what is left and return the hash of all bytes of the file, hexadecimal."""
+        """Read the rest and return the hash of all bytes of the file, hexadecimal."""
         self.read_rest()
         return self._hashing.hash.hexdigest()
 

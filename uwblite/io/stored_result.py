@@ -32,9 +32,9 @@ class StoredAnchor:
     status: str
     """'ok', 'mirror-ambiguous', 'unplaced' or 'distrusted'."""
     bias: float = float("nan")
-    """m, added to every range; nan where the table does not say it."""
+    """m, added to every range; nan where the table does not contain it."""
     residual_rms: float = float("nan")
-    """m, spread of its range residuals; nan where the table does not say it."""
+    """m, spread of its range residuals; nan where the table does not contain it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

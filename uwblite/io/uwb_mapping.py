@@ -25,7 +25,7 @@ from ..errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class UwbMapping:
-    """Where the ranges stand in one kind of message."""
+    """Places of the ranges in one kind of message."""
 
     topic: str = "*"
     """Pattern of the topic's name, * and ? as in file names."""

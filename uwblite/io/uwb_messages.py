@@ -1,4 +1,4 @@
-"""Where the ranges stand in published kinds of ROS messages, tried where the user gives no mapping.
+"""Places of the ranges in published kinds of ROS messages, tried where the user gives no mapping.
 
 Each line was written from the message's published definition, which is named beside it; a test makes bags from these
 definitions. A kind whose fields were renamed has a line for each form.
