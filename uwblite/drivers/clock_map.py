@@ -42,7 +42,7 @@ class ClockMap:
 
     @property
     def full(self) -> bool:
-        """The envelope begins to forget."""
+        """The envelope begins to drop old frames."""
         return len(self._minima) == self._minima.maxlen
 
     def add(self, device: float, host: float) -> None:

@@ -1,4 +1,4 @@
-"""What stands in for a check sum: a reading that goes on from the one before passes, one that leaps waits for others.
+"""Replacement for a check sum: a reading that continues the one before is accepted, one that jumps waits for others.
 
 A changed bit makes another digit of a digit, and nothing in a line without a sum shows it. Two readings that agree by
 chance are rare, so a leap counts only when the next readings go on from it; a leap away and back is damage. What is left is

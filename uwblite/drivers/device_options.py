@@ -1,4 +1,4 @@
-"""What a user writes behind a port, and what a driver gets besides."""
+"""Options that a user writes behind a port, and further input of a driver."""
 
 from dataclasses import dataclass, field
 
@@ -51,7 +51,7 @@ class Options:
         return int(value)
 
     def finish(self) -> None:
-        """Refuse what nobody asked for."""
+        """Refuse unknown options."""
         unknown = [name for name in self.values if name not in self.known]
         if unknown:
             known = f"known are {', '.join(self.known)}" if self.known else "it has none"

@@ -12,7 +12,7 @@ from .events import Corrupt, RangeReading, corrupt
 MAX_RANGE_MM = 200_000
 """mm; the radio reaches 60 m, anything above this is a damaged frame."""
 MAX_PLACE_MM = 10_000_000
-"""mm; nobody sets up anchors further than this from the origin."""
+"""mm; largest plausible distance of an anchor from the origin."""
 
 ERRORS = {
     0: "ok", 1: "unknown command or broken request", 2: "internal error", 3: "invalid parameter", 4: "busy",

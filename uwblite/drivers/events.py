@@ -1,4 +1,4 @@
-"""What drivers say. Events are frozen and compared by ``==``; noise is an event, misuse is an exception.
+"""Events of drivers. They are frozen and compared by ``==``; noise is an event, misuse is an exception.
 
 A *protocol* turns bytes into events (``feed(data, stamp)``). A *session* drives a protocol through the start-up and
 recovery of one device: it turns bytes and time into *actions*, that is measurements to log and bytes to send.
@@ -63,7 +63,7 @@ class Param:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something a person must know; becomes a COMMENT in the log and a line on the terminal."""
+    """A message for people; becomes a COMMENT in the log and a line on the terminal."""
 
     level: str
     """"info", "warning" or "error"."""

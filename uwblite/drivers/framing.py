@@ -98,7 +98,7 @@ class FrameReader(ABC):
         return events
 
     def reset(self) -> None:
-        """Forget what is half received."""
+        """Discard a frame that is only half received."""
         self.pending.clear()
         self.taken = self._told = 0
 

@@ -53,7 +53,7 @@ class GyroLineDriver(LineDriver):
         self._last: tuple[float, float] | None = None
 
     def begin(self) -> None:
-        """Forget half a line, and what the gyro did meanwhile."""
+        """Discard half a line, and the motion of the gyro meanwhile."""
         super().begin()
         self._last = None
 

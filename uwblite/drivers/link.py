@@ -1,4 +1,4 @@
-"""One device of a recording: its port, its session, and what it did."""
+"""One device of a recording: its port, its session, and its record."""
 
 import re
 import threading
@@ -43,7 +43,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Where the sensors sit; written to the log for the mapper."""
+    """Mounting of the sensors; written to the log for mapping."""
 
     laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x, y, theta on the base; m, m, rad."""
@@ -222,7 +222,7 @@ class Link:
             self.quiet, self.last_message = True, max(self.last_message, self.opened)
 
     def param_name(self, name: str) -> str:
-        """Return what a fact about this device is called in the log: ``laser_serial``, ``laser2_serial`` ..."""
+        """Return the name of a fact about this device in the log: ``laser_serial``, ``laser2_serial`` ..."""
         kind, _, rest = name.partition("_")
         return name if self.number == 1 else f"{kind}{self.number}_{rest}"
 

@@ -1,4 +1,4 @@
-"""What a recording says: measurements, parameters and comments, as lines of a log."""
+"""Content of a recording: measurements, parameters and comments, as lines of a log."""
 
 from collections.abc import Callable
 

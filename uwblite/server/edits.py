@@ -75,7 +75,7 @@ def with_anchor(edits: Constraints, name: str, position: tuple[float, float] | N
 
 
 def wish_for(edits: Constraints, closure: StoredClosure) -> str:
-    """Return what the edits say of a closure: 'reject', 'force' or 'leave'."""
+    """Return the edit of a closure: 'reject', 'force' or 'leave'."""
     if any(_same(c, closure) for c in edits.forbidden):
         return "reject"
     return "force" if any(_same(c, closure) for c in edits.closures) else "leave"

@@ -55,7 +55,7 @@ class LivePage:
         self.feed.publish("map", {name: page[name] for name in kept} | {"anchors": anchors, "version": version} | hidden)
 
     def show_status(self, status: Mapping[str, Any]) -> None:
-        """Show what is true now: summary, advice, sensors, pose, trail; see `watch_status`."""
+        """Show the present state: summary, advice, sensors, pose, trail; see `watch_status`."""
         self.feed.publish("status", dict(status))
 
     def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
@@ -73,7 +73,7 @@ class LivePage:
 
 
 def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rounds: str) -> dict[str, Any]:
-    """Return what the page of a log that is being written shows now.
+    """Return the present content of the page of a log that is being written.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the page says of a robot that is being localised."""
+"""Content of the page of a robot that is being localised."""
 
 import math
 from collections import deque

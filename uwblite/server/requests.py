@@ -1,4 +1,4 @@
-"""What every page of the server shares: answers, and the rules of who may ask for them.
+"""Common parts of all pages of the server: answers, and the rules for access.
 
 A page is for this computer alone unless it is opened to the network on purpose. In either case a request must name the
 server as its Host by an address or a name that it has: a page elsewhere whose own name is resolved to this computer cannot
