@@ -28,13 +28,13 @@ class Table:
     __slots__ = ()
 
     def rows(self, which: slice | Ints | Bools) -> Self:
-        """Return some of the entries; what is no array stays."""
+        """Return some of the entries; fields that are no arrays are kept."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
         return replace(self, **{n: c[which] for n, c in columns.items() if isinstance(c, np.ndarray)})  # type: ignore[type-var]
 
 
 def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the values that stand in either of two arrays (e,), (e,), ascending, and where among them those of both stand."""
+    """Return the values of either of two arrays (e,), (e,), ascending, and the positions among them of the values of both."""
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
     where = number.reshape(-1).astype(np.int64)
     return used, where[: len(one)], where[len(one) :]

@@ -54,7 +54,7 @@ class GivenDistance:
 
 @dataclass(frozen=True, slots=True)
 class GivenLandmark:
-    """A landmark in the scans, by its place in the map as it comes out without distances to it."""
+    """A landmark in the scans, by its place in the map made without distances to it."""
 
     name: str = ""
     """Any."""
@@ -122,7 +122,7 @@ class Constraints:
 
     @property
     def places(self) -> bool:
-        """Whether they say where the map lies."""
+        """Whether they determine the frame of the map."""
         return bool(self.anchors or self.poses)
 
     def allowed(self, clock: "Clock", i: Ints, j: Ints) -> Bools:

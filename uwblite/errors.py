@@ -1,4 +1,4 @@
-"""Every exception that uwblite raises on purpose. The message says what is wrong, where, and how to fix it."""
+"""Every exception that uwblite raises on purpose. The message contains the fault, its place, and how to fix it."""
 
 
 class UwbliteError(Exception):

@@ -114,13 +114,13 @@ class LoopClosure:
 
     @property
     def accepted(self) -> bool:
-        """Whether it holds the map together."""
+        """Whether it constrains the map."""
         return self.outcome == "accepted"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageSummary:
-    """One stage of the walk: what it was given, what it made of it."""
+    """One stage: its input and its result."""
 
     name: str
     seconds: float
@@ -159,6 +159,6 @@ class MapResult:
     """None without lidar."""
     stages: tuple[StageSummary, ...]
     warnings: tuple[Notice, ...]
-    """Things the user should know."""
+    """Warnings for the user."""
     doubts: tuple[Notice, ...]
     """Reasons not to trust the result; non-empty means exit code 3."""

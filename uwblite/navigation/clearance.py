@@ -1,4 +1,4 @@
-"""How far every place of a map is from the nearest obstacle, and what it costs to drive there.
+"""Distance of every place of a map from the nearest obstacle, and the cost of driving there.
 
 An obstacle is a whole cell, a square with the edge h. The exact Euclidean distance transform (Felzenszwalb and
 Huttenlocher 2012; scipy.ndimage) gives the distance of every cell's centre from the nearest obstacle's centre; h / sqrt(2)

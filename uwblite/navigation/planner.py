@@ -17,7 +17,7 @@ from .smoothing import along_lines, sampled, smoothed, walk_back
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
 _NOTHING = 1e-9
-"""m; what a straight way through open space may cost more than its length, by rounding. No other way costs as little."""
+"""m; additional cost of a straight path through open space by rounding. No other path costs as little."""
 _DETOUR = 1.5, 1.0
 """A path is looked for first among those that cost so many times the straight way, and so many metres more."""
 _NEARBY = 0.25

@@ -1,4 +1,4 @@
-"""The colours of what is drawn, the same in the picture, the report, the local page and the markers of a bag."""
+"""Colours of drawn objects, the same in the picture, the report, the local page and the markers of a bag."""
 
 Colour = tuple[int, int, int]
 

@@ -147,7 +147,7 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 
 
 def shaded(grid: OccupancyGrid) -> Image:
-    """Return the colours (rows, cols, 3) of the cells: the surer a cell, the clearer its white or black."""
+    """Return the colours (rows, cols, 3) of the cells: the more certain a cell, the closer to white or black."""
     image = np.empty((*grid.log_odds.shape, 3), dtype=np.uint8)
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
     for rows in grid.geometry.strips():

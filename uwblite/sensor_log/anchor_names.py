@@ -35,7 +35,7 @@ def first_place(anchor: str) -> str:
 
 
 def radio_name(anchor: str) -> str:
-    """Return what the radio calls an anchor, given the name of one of its places, as ``5C0B@2#3``."""
+    """Return the radio's name of an anchor, given the name of one of its places, such as ``5C0B@2#3``."""
     return re.sub(r"(@\d+)?(#\d+)?$", "", anchor)
 
 

@@ -45,9 +45,9 @@ class Remark:
     stretches: tuple[tuple[float, float], ...] = ()
     """First and last time, s, of each stretch in which it was so; empty where it is no matter of stretches."""
     place: str = ""
-    """Name of the place of an anchor that it speaks of; empty where it speaks of none."""
+    """Name of the place of an anchor that it concerns; empty where it concerns none."""
     without_place: str = ""
-    """What is left to say where a map does not have that place; empty: nothing."""
+    """The text that remains where a map does not have that place; empty: none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""What each sensor measured, and where it sits on the base."""
+"""Measurements of each sensor, and its mounting on the base."""
 
 from dataclasses import dataclass, field
 
@@ -137,7 +137,7 @@ class LaserScans(Table):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMounting:
-    """Where the sensors sit on the base."""
+    """Mounting of the sensors on the base."""
 
     T_base_laser: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) x, y, theta of the laser on the base."""
