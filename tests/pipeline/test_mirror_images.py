@@ -94,6 +94,15 @@ def test_a_path_that_bent_to_suit_one_place_bends_to_suit_the_other(bend, ambigu
             assert np.hypot(*(done.bootstrap.hypotheses[0][1].position - ANCHOR * (1, -1))) < 1.0
 
 
+def test_a_path_that_the_lidar_holds_suits_no_other_place_by_ranges_that_weigh_little():
+    """With all ranges from one direction taken as one they prefer no place; the comparison at given poses has decided."""
+    before = estimate(2.0)
+    weak = replace(before.ranges, sigma=20.0 * before.ranges.sigma)
+    held = replace(before, graph=replace(before.graph, edges=(weak,)))
+    assert not find_mirror_images(held, TASK).bootstrap.ambiguous.any()
+    assert find_mirror_images(held, WITHOUT_LIDAR).bootstrap.ambiguous.all()
+
+
 def test_a_bend_seen_by_ranges_that_err_alike_decides_nothing():
     """As many ranges, all worth two of them: what the bend says is within their common errors."""
     before = estimate(0.5)

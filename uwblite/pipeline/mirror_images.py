@@ -44,11 +44,10 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     each, together = (_costs(there, ranges, w) - _costs(here, ranges, w) for w in (ranges.alive, ranges.own_weights))
     as_well = (apart > _APART) & ((each < _CLEAR) | (together < _LIKELIER))
     others = there.anchors
-    best = np.inf
+    best: Graph | None = None
     for k in np.flatnonzero(free & ~as_well & _straight(estimate, ranges)).tolist():
-        # With a lidar, anchors were estimated last and alone: all together they may be better yet.
-        best = best if np.isfinite(best) else _least_cost(estimate, task)
-        other = _along_another_path(estimate, k, starts[1][k], best, task)
+        best = best or _optimum(estimate, task)
+        other = _along_another_path(best, ranges, k, starts[1][k], task)
         if other is not None:
             as_well[k], others[k] = True, other
     ambiguous = np.where(free, as_well, found.ambiguous)
@@ -66,30 +65,31 @@ def _straight(estimate: Estimate, ranges: RangeEdges) -> Bools:
     return np.array([len(t) > 2 and bool(np.linalg.eigvalsh(np.cov(t.T))[0] <= _STRAIGHT**2) for t in own], dtype=bool)
 
 
-def _least_cost(estimate: Estimate, task: Task) -> float:
-    """Return chi2 of all measurements at the optimum."""
-    if not task.recordings.have_scans:
-        return estimate.graph.chi2()
-    return float(optimize(estimate.graph, task.config.solver)[0].chi2())
+def _optimum(estimate: Estimate, task: Task) -> Graph:
+    """Return the graph at its optimum: with a lidar, anchors were estimated last and alone, and all together may be better."""
+    return optimize(estimate.graph, task.config.solver)[0] if task.recordings.have_scans else estimate.graph
 
 
-def _along_another_path(estimate: Estimate, k: int, image: Floats, best: float, task: Task) -> Floats | None:
+def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, task: Task) -> Floats | None:
     """Return the other place (2,) that an anchor has where the path bends with it, None where there is none or it is excluded.
 
     Parameters
     ----------
-    image : (2,) where it is looked for, m. best : chi2 at the optimum.
+    best : the graph at its optimum. image : (2,) where it is looked for, m.
     """
-    graph = estimate.graph
-    if np.hypot(*(image - graph.anchors[k])) < _APART:
+    if np.hypot(*(image - best.anchors[k])) < _APART:
         return None
-    anchors = graph.anchors.copy()
+    anchors = best.anchors.copy()
     anchors[k] = image
-    found = optimize(replace(graph, anchors=anchors), task.config.solver)[0]
-    excluded = found.chi2() - best >= (_LIKELIER if task.recordings.have_scans else _CLEAR)
-    return None if excluded or np.hypot(*(found.anchors[k] - graph.anchors[k])) < _APART else found.anchors[k]
+    found = optimize(replace(best, anchors=anchors), task.config.solver)[0]
+    excluded = found.chi2() - best.chi2() >= (_LIKELIER if task.recordings.have_scans else _CLEAR)
+    own = ranges.pose[ranges.alive & (ranges.anchor == k)]
+    held = task.recordings.have_scans and np.hypot(*(found.poses - best.poses)[own, :2].T).max(initial=0.0) < _BENDS
+    return None if excluded or held or np.hypot(*(found.anchors[k] - best.anchors[k])) < _APART else found.anchors[k]
 
 
+_BENDS = 0.05
+"""m, the noise of ranges; a path that a lidar holds to less suits no other place than the comparison at given poses allows."""
 _STRAIGHT = 1.0
 """m across a path, rms, beyond which no odometry lets it bend into its mirror image."""
 
