@@ -12,7 +12,6 @@ from uwblite.assessment import plausibility
 from uwblite.assessment.plausibility import (
     check_anchors,
     check_calibration,
-    check_certainty,
     check_closures,
     check_fit,
     check_handedness,
@@ -186,16 +185,6 @@ def test_an_anchor_whose_ranges_agree_on_one_side_of_a_move_counts_as_moved(unti
 
 def test_anchors_that_changed_places_were_only_renamed():
     assert not moved_together([[A, B], [B, C], [C, A]])
-
-
-_ROUGH = [(50.0, 0.39, False), (50.0, 0.41, True), (4.0, 0.19, False), (4.0, 0.21, True)]
-
-
-@pytest.mark.parametrize(("across", "sigma", "doubted"), _ROUGH)
-def test_a_path_whose_shape_is_known_roughly_only_is_doubted(across, sigma, doubted):
-    stages, poses = Stages(None, None), across * np.array([[0.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
-    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), sigma, SimpleNamespace(stages=stages))
-    assert bool(stages.doubts) == doubted
 
 
 def test_a_value_far_from_usual_is_reported():

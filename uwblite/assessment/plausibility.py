@@ -17,6 +17,7 @@ from ..pipeline.other_minima import check_other_minimum
 from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
+from .certainty import check_certainty
 from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
@@ -61,7 +62,7 @@ def judge(
         check_displaced_stretches(table, anchors, task)
     check_residuals(estimate, table["residual"] if table else np.zeros(0), grid, task)
     check_unit(anchors, task)
-    check_short_ranges(anchors, estimate, task)
+    check_short_ranges(anchors, estimate, sigma, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)
@@ -71,27 +72,6 @@ def judge(
     check_turn_scales(estimate, task)
     check_fit(task)
     check_wheels_against_lidar(table, anchors, task)
-
-
-def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
-    """Doubt a map whose own uncertainties are so large that its shape is not known well.
-
-    Parameters
-    ----------
-    sigma : m, rms of the places' expected errors after alignment, the unit of length apart.
-    """
-    extent = float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
-    if sigma > min(_UNCERTAIN, _UNCERTAIN_SHARE * extent):
-        text = (
-            f"the shape of the path is known to {sigma:.1f} m (rms) only, in an area {extent:.0f} m across: too few ranges and "
-            "scans constrain the trajectory; add anchors, or drive where the lidar sees walls"
-        )
-        task.stages.doubt("uncertain", text, sigma=sigma, extent=extent)
-
-
-_UNCERTAIN, _UNCERTAIN_SHARE = 0.4, 0.05
-"""Expected error of places, m and as a share of the area's diameter. Of maps at this limit one in five is off by more than
-half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:

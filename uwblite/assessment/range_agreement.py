@@ -8,6 +8,7 @@ from ..arrays import Bools, Floats, runs_of
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Estimate, Task
 from ..sensor_log.anchor_names import first_place, name_and_number
+from .certainty import allowed_error
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -107,14 +108,18 @@ _MOST_NEAR, _MANY_NEAR = 0.85, 0.6
 0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
 
 
-def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, task: Task) -> None:
+def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, sigma: float, task: Task) -> None:
     """Doubt a map that rests on ranges of which many to one anchor are shorter than the distance.
 
-    Obstacles and radios make ranges longer. Where the lidar holds the trajectory, the anchor stood elsewhere for a time; where
-    ranges do, a wrong trajectory has pulled its place along.
+    Obstacles and radios make ranges longer. Where the lidar determines the trajectory, or other anchors do so well, the anchor
+    stood elsewhere for a time; where ranges determine it poorly, a wrong trajectory may have pulled its place along.
+
+    Parameters
+    ----------
+    sigma : m, expected error of the places, see check_certainty.
     """
     short = [a for a in anchors if many_short(a.short, a.ranges)]
-    if not short or not estimate.rests_on_ranges:
+    if not short or not estimate.rests_on_ranges or sigma < 0.5 * allowed_error(estimate):
         return
     names, count, measured = ", ".join(a.id for a in short), sum(a.short for a in short), sum(a.ranges for a in short)
     text = (

@@ -1,0 +1,18 @@
+"""Whether a map states that it knows the shape of the path."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uwblite.assessment.certainty import check_certainty
+from uwblite.pipeline.progress import Stages
+
+
+@pytest.mark.parametrize(
+    ("across", "sigma", "doubted"), [(50.0, 0.39, False), (50.0, 0.41, True), (4.0, 0.19, False), (4.0, 0.21, True)]
+)
+def test_a_path_whose_shape_is_known_roughly_only_is_doubted(across, sigma, doubted):
+    stages, poses = Stages(None, None), across * np.array([[0.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
+    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), sigma, SimpleNamespace(stages=stages))
+    assert bool(stages.doubts) == doubted
