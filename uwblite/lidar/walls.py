@@ -138,7 +138,7 @@ def _halved(number: Ints, stretch: Ints, at: Floats, owner: Ints) -> Ints:
     for _ in range(_HALVINGS):
         if not bent.any():
             break
-        centre, direction, _ = principal_axes(own, at, len(bent))
+        centre, direction, _ = _lines(own, at)
         beyond = bent[own] & (dots(middle - centre[own], direction[own]) > 0.0)
         halves, own = np.unique(2 * own + beyond, return_inverse=True)
         bent = bent[halves // 2] & _bent(own, at)
@@ -151,12 +151,16 @@ _HALVINGS = 6
 """Most times that a bent set of stretches is halved."""
 
 
+def _lines(own: Ints, at: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return centre, direction and normal (w, 2) of the line that fits each set of places (m, 2), numbered (m,)."""
+    centre, direction, _ = principal_axes(own, at, int(own.max(initial=-1)) + 1)
+    return centre, direction, np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+
+
 def _bent(own: Ints, at: Floats) -> Bools:
     """Return which sets of places (m, 2), numbered (m,), reach too far off their line."""
-    many = int(own.max(initial=-1)) + 1
-    centre, direction, _ = principal_axes(own, at, many)
-    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    return np.asarray(extent(own, np.abs(dots(at - centre[own], across[own])), many)[1] >= _BENT)
+    centre, _, across = _lines(own, at)
+    return np.asarray(extent(own, np.abs(dots(at - centre[own], across[own])), len(centre))[1] >= _BENT)
 
 
 def _curved(own: Ints, at: Floats, owner: Ints) -> Bools:
@@ -172,9 +176,9 @@ _ROUND = 0.02
 
 def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
     """Fit a line to each set (s,) of stretches, see _halved, by their places (m,), and keep those that are walls."""
-    many, own = int(number.max(initial=-1)) + 1, number[stretch]
-    centre, direction, _ = principal_axes(own, at, many)
-    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    own = number[stretch]
+    centre, _, across = _lines(own, at)
+    many = len(centre)
     across *= np.where(np.bincount(own, dots(normal, across[own]), many) < 0.0, -1.0, 1.0)[:, None]
     stretches_of = np.bincount(number[np.unique(stretch)], minlength=many)
     good = (stretches_of >= _STRETCHES) & ~_bent(own, at)

@@ -25,9 +25,6 @@ from .estimate import Estimate, Task
 from .recordings import Recording, Recordings
 from .shared_anchors import Pairs, Places, agreement, other_place, places_of, together
 
-_FIRST_TOLERANCE = 0.5
-"""How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
-
 
 def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
@@ -41,7 +38,7 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
 
     Raises
     ------
-    DataError : a recording shares fewer than two placed anchors with the others.
+    DataError : a recording shares fewer than two placed anchors with the others, or no two have places that agree.
     """
     recordings = task.recordings
     found = [places_of(estimate) for estimate in estimates]
@@ -73,11 +70,6 @@ def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: in
         f"anchor {anchor} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {new_id}",
         anchor=anchor, distance=round(distance, 4), recording=recording + 1, new_id=new_id,
     )  # fmt: skip
-
-
-def tolerance(one: float, other: float) -> float:
-    """Return how far two first places of one anchor with these standard deviations may lie apart, m."""
-    return _FIRST_TOLERANCE + 2.0 * float(np.hypot(one, other))
 
 
 def _laid_on(found: Places, placed: Places, recording: Recording) -> tuple[Floats, Pairs]:

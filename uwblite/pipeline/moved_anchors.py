@@ -16,12 +16,14 @@ from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from ..sensor_log.anchor_names import first_place, numbered, radio_name
 from .estimate import Estimate, Task
-from .joining import tolerance, warn_of_moved_anchor
+from .joining import warn_of_moved_anchor
 from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
 _LEAST_MOVE = 0.25
 """An anchor whose places in two recordings are nearer to each other than this was not moved, m."""
+_TOLERANCE = 0.5
+"""How far places of one anchor with two names may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
 _MOVED = 20.0
 """Squared Mahalanobis distance between two recordings' places of an anchor from which on it was moved (2 degrees of
 freedom; 5e-5 by chance, the rest for errors that the sigmas leave out)."""
@@ -32,7 +34,7 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
 
     With the poses fixed, every recording's ranges determine where each anchor stood then; places are different where their
     uncertainty does not explain their distance. Before joining, one recording may have had an anchor's mirror image: such
-    an anchor was not moved, if its places are now within the tolerance of joining. Ranges have little weight so far beside the
+    an anchor was not moved, if its places are now within a tolerance. Ranges have little weight so far beside the
     lidar: a wrong anchor does not bend the trajectory yet, and all is solved once, with the resulting names.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
@@ -52,7 +54,7 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
             named, recording = pairs[row].tolist()
             same = [
                 n for r, n in number_of.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])
-                and (pairs[r, 0] == named or np.hypot(*(place[row] - place[r])) <= tolerance(sigma[row], sigma[r]))
+                and (pairs[r, 0] == named or np.hypot(*(place[row] - place[r])) <= _tolerance(sigma[row], sigma[r]))
             ]  # fmt: skip
             number = same[0] if same else named if number_of else k
             if not same and number in number_of.values():
@@ -95,6 +97,11 @@ def _solved_again(estimate: Estimate, task: Task) -> Estimate:
     estimate = replace(estimate, graph=replace(estimate.graph, anchors=anchors))
     # After a joint refinement all is solved in any case.
     return solved(with_range_noise(estimate, task.config), task.config.solver) if estimate.joint is None else estimate
+
+
+def _tolerance(one: float, other: float) -> float:
+    """Return how far two places of one anchor with these standard deviations may lie apart, m."""
+    return _TOLERANCE + 2.0 * float(np.hypot(one, other))
 
 
 def _first_of(ids: Sequence[str], task: Task) -> Callable[[str], str]:

@@ -9,7 +9,7 @@ _LEAST = 12
 
 
 def ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
-    """Return the pairs with a clear motion by either, and the ratio of lidar to wheels along the larger of the two."""
+    """Return the pairs whose motion by the wheels (e, d) is clear, and the ratio of the lidar's motion to it, along it."""
     size = np.sqrt(np.sum(wheels**2, axis=1))
     rows = np.flatnonzero(size > clear)
     return rows, np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
