@@ -55,8 +55,9 @@ def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
 
 def test_a_calibration_with_a_direction_that_nothing_measures_has_no_covariance(monkeypatch):
     graph, _ = calibrated_loop()
-    ends = joint_covariance._end(graph, None)
-    monkeypatch.setattr(joint_covariance, "_end", lambda *given: (*ends[:3], 0.0 * ends[3], ends[4]))
+    normal = joint_covariance.filled(graph)
+    normal.values = -normal.values
+    monkeypatch.setattr(joint_covariance, "filled", lambda graph: normal)
     with pytest.raises(SolverError, match="singular"):
         calibration_covariance(graph)
 

@@ -1,5 +1,7 @@
 """Parts of a graph: every edge and unknown is in one of them or shared, and what they hold is what the graph held."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.planted_graphs import every_kind
@@ -26,7 +28,8 @@ def with_every_kind(seed):
 
 def touched_by(edges, graph):
     """Return for each edge the set of (block, number) that it touches."""
-    blocks = edges.linearize(graph).blocks
+    # Of fixed calibration values as well, which have no Jacobian.
+    blocks = edges.linearize(replace(graph, fixed_calibration=np.zeros_like(graph.fixed_calibration))).blocks
     return [{(name, int(index[e])) for name, index, _ in blocks if index[e] >= 0} for e in range(len(edges))]
 
 

@@ -35,12 +35,16 @@ _REACH = 100.0
 def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
     """Optimise with a Geman-McClure kernel on chosen kinds of edges that is tightened, scale by scale, standard deviations.
 
+    A scale that no residual exceeds would reject nothing: it is left out, but for the last.
+
     Parameters
     ----------
     chosen : their positions in ``graph.edges``.
     """
     optimizer = Optimizer()
     for scale in scales:
+        if scale != scales[-1] and _worst(graph, dict.fromkeys(chosen, scale)) <= 1.0:
+            continue
         kernel = Kernel("geman-mcclure", scale)
         edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
         graph = optimizer.optimize(replace(graph, edges=edges), solver)[0]
@@ -78,8 +82,7 @@ def optimize_gnc(
     plain = replace(graph, edges=edges)
     linearized = linearize(plain)
     normal = NormalEquations(plain, linearized)
-    worst = max((float(np.max(s)) for s in _squared(plain, thresholds).values() if len(s)), default=0.0)
-    mu = 1.0 / max(2.0 * min(worst, _REACH**2) - 1.0, 1e-3)
+    mu = 1.0 / max(2.0 * min(_worst(plain, thresholds), _REACH**2) - 1.0, 1e-3)
     few = replace(solver, max_iterations=1)
     most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(_MU_FACTOR))))
     current, spent = plain, 0.0
@@ -119,6 +122,11 @@ def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]
     """Return the squared residuals of the chosen kinds in units of their squared thresholds."""
     residuals = {k: graph.edges[k].residuals(graph) for k in thresholds}
     return {k: np.einsum("ed,ed->e", r, r) / thresholds[k] ** 2 for k, r in residuals.items()}
+
+
+def _worst(graph: Graph, thresholds: Mapping[int, float]) -> float:
+    """Return the largest of the same, 0 without any."""
+    return max((float(np.max(s)) for s in _squared(graph, thresholds).values() if len(s)), default=0.0)
 
 
 def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tuple[Graph, list[Linearization]]:

@@ -183,6 +183,10 @@ class Graph:
         """Priors of the calibration among the edges."""
         return tuple(e for e in self.edges if isinstance(e, PriorEdges) and e.block == "calibration")
 
+    def has_free(self, index: Ints) -> Bools:
+        """Return which columns of indices (e, k) of calibration values, -1 = none, hold a free one."""
+        return np.any(np.append(~self.fixed_calibration, False)[index], axis=0)
+
     def with_edges(self, *edges: Edges) -> "Graph":
         """Return the graph with further edges; empty ones are left out."""
         return replace(self, edges=self.edges + tuple(e for e in edges if len(e)))

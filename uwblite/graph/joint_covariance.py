@@ -26,8 +26,7 @@ class JointCovariance:
 
     def __init__(self, graph: Graph, poses: Ints) -> None:
         """Eliminate all other unknowns; the rest of the factor is that of the poses' own information matrix."""
-        numbers, first, lower, pivots, place = _end(graph, poses)
-        number = numbers["poses"]
+        number, first, lower, pivots, place = _end(graph, poses)
         self._graph = graph
         self._lower = _inverse(lower, pivots)
         self._row = np.where(number >= first, place[np.maximum(number - first, 0)], -1)
@@ -57,14 +56,16 @@ def calibration_covariance(graph: Graph) -> Floats:
     ------
     SolverError : the measurements leave a direction open.
     """
-    numbers, first, lower, pivots, place = _end(graph, None)
-    if not np.all(pivots > 0.0):
-        raise SolverError(SINGULAR)
-    number = numbers["calibration"][:, 0]
+    normal = filled(graph)
+    number = normal.unknowns.number["calibration"][:, 0]
     free, covariance = np.flatnonzero(number >= 0), np.zeros((len(number), len(number)))
-    if len(free):
-        inverse, row = _inverse(lower, pivots), place[number[free] - first]
-        covariance[np.ix_(free, free)] = inverse[np.maximum(row[:, None], row), np.minimum(row[:, None], row)]
+    right = np.zeros((normal.unknowns.size, len(free)))
+    right[number[free], np.arange(len(free))] = 1.0
+    found = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)[number[free]]
+    # SuperLU accepts negative pivots.
+    if not np.all(np.diagonal(found) > 0.0):
+        raise SolverError(SINGULAR)
+    covariance[np.ix_(free, free)] = 0.5 * (found + found.T)
     return covariance
 
 
@@ -84,25 +85,18 @@ _OPEN = 1e12
 """m^2; of what no edge touches."""
 
 
-def _end(graph: Graph, poses: Ints | None) -> tuple[dict[str, Ints], int, Floats, Floats, Ints]:
-    """Return the end of a graph's factor H = L D L^T: the part after all other unknowns are eliminated.
-
-    Parameters
-    ----------
-    poses : to begin with, behind which only anchors and calibration stand; None: the calibration alone.
+def _end(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
+    """Return the end of a graph's factor H = L D L^T: the part after all poses but some, behind which anchors and calibration
+    stand, are eliminated.
 
     Returns
     -------
-    Places of the unknowns, -1 = fixed; the first of the end; L2 (n, n), D2 (n,) and each unknown's row in them (n,).
+    Places of the poses' scalars (n, 3), -1 = fixed; the first of the end; L2 (m, m), D2 (m,) and each unknown's row in them.
     """
-    normal = filled(graph, subtrees=poses is None, last=poses)
-    number, size = normal.unknowns.number, normal.unknowns.size
-    if poses is None:
-        first, undamped = size - int(np.sum(number["calibration"] >= 0)), np.where(normal.diagonal > 0, 0.0, 1.0)
-        factor = cast(SuperLU, normal.factor(undamped))
-    else:
-        first = int(np.sum(number["poses"] >= 0)) - int(np.sum(number["poses"][poses] >= 0))
-        factor = factor_of(normal)
+    normal = filled(graph, last=poses)
+    number = normal.unknowns.number["poses"]
+    first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
+    factor = cast(SuperLU, factor_of(normal))
     place = factor.perm_c[first:].astype(np.int64)
     inside = np.sort(place)
     lower, pivots = factor.L, factor.U.diagonal()[inside]

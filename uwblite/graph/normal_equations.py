@@ -16,7 +16,7 @@ from scipy import sparse
 
 from ..arrays import Floats, Ints
 from .factorization import Factor, choose_ordering
-from .graph import Graph, Linearization, edge_weights, linearize
+from .graph import Graph, Linearization, kernel_weights, linearize
 from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
 from .schwarz_cg import chains, cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
@@ -259,7 +259,7 @@ def filled(
     """
     linearized = linearize(graph)
     normal = NormalEquations(graph, linearized, subtrees, last) if like is None else like
-    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+    normal.fill(linearized, [kernel_weights(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
     return normal
 
 

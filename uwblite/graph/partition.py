@@ -30,7 +30,9 @@ def split(graph: Graph, part_of: Ints) -> tuple[Graph, tuple[Part, ...]]:
     ----------
     part_of : (n,) part 0, 1, ... of each pose.
     """
-    touched = [[(name, index) for name, index, _ in lin.blocks] for lin in linearize(graph)]
+    # Of fixed values too: only what is free has a Jacobian.
+    every = replace(graph, fixed_calibration=np.zeros_like(graph.fixed_calibration))
+    touched = [[(name, index) for name, index, _ in lin.blocks] for lin in linearize(every)]
     counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}
     owner = {name: np.full(count, _UNTOUCHED) for name, count in counts.items()} | {"poses": part_of}
     for blocks in touched:

@@ -4,6 +4,7 @@ Residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 """
 
 from dataclasses import dataclass
+from itertools import compress
 from typing import ClassVar
 
 import numpy as np
@@ -155,7 +156,7 @@ class OdometryEdges(EdgeTable):
         return whiten(self.end_sqrt_information, se2.between(self._corrected(graph)[0], d) / self.own_scale(graph))
 
     def linearize(self, graph: Graph) -> Linearization:
-        """Return whitened residuals and Jacobians by both poses and the calibration in use."""
+        """Return whitened residuals and Jacobians by both poses and the calibration that is free."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
         turning = self._turning_point(graph)
         si, sj = (se2.compose(graph.poses[k], turning).T for k in (self.i, self.j))
@@ -166,7 +167,8 @@ class OdometryEdges(EdgeTable):
         by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
         by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
-        if np.any(self.calibration >= 0):
+        used = graph.has_free(self.calibration)
+        if used.any():
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
             shift = axes[0] * m[0] + axes[1] * m[1]
@@ -176,7 +178,7 @@ class OdometryEdges(EdgeTable):
             by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
             by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * around
             columns = [by_scale, by_turn, by_delta * self.length, by_delta * self.duration]
-            if np.any(self.calibration[:, 4:] >= 0):
+            if used[4:].any():
                 cos, sin = (before - after for before, after in zip(se2.cos_sin(xi[2]), se2.cos_sin(xj[2]), strict=True))
                 columns.append(axes[0] * cos + axes[1] * sin)
                 # The middle of the step is turned by (delta + dtheta) / 2.
@@ -184,9 +186,8 @@ class OdometryEdges(EdgeTable):
                 left, ahead = (1.0 + s) * self._ways()
                 to_left, to_ahead = axes[0] * sin - axes[1] * cos, -axes[0] * cos - axes[1] * sin
                 columns += [to_left * left, to_left * ahead, to_ahead * left]
-            for index, column in zip(self.calibration.T, columns, strict=False):
-                if np.any(index >= 0):
-                    blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
+            for index, column in compress(zip(self.calibration.T, columns, strict=False), used):
+                blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
         return Linearization(residuals.T, tuple(blocks))
 
 
@@ -231,7 +232,8 @@ class ScanEdges(EdgeTable):
         if not np.any(self.calibration >= 0):
             return base, se2.cos_sin(base[:, 2])
         x, y, turn, delay = np.append(graph.calibration.values, 0.0)[self.calibration]
-        base = se2.compose(base, se2.exp(twist * (delay - self.made_with)))
+        if delay != self.made_with:
+            base = se2.compose(base, se2.exp(twist * (delay - self.made_with)))
         c, s = se2.cos_sin(base[:, 2])
         sensor = np.stack([base[:, 0] + (c * x - s * y), base[:, 1] + (s * x + c * y), se2.wrap_angle(base[:, 2] + turn)])
         return sensor.T, (c, s)
@@ -246,7 +248,7 @@ class ScanEdges(EdgeTable):
         return whiten(self.sqrt_information, se2.between(self.T_i_j, self.relative(graph)))
 
     def linearize(self, graph: Graph) -> Linearization:
-        """Return whitened residuals and Jacobians by both poses and the calibration in use."""
+        """Return whitened residuals and Jacobians by both poses and the calibration that is free."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
         from_pose, heading_i = self.sensor_poses(graph, self.i, self.twist_i)
         to_pose, heading_j = self.sensor_poses(graph, self.j, self.twist_j)
@@ -256,15 +258,15 @@ class ScanEdges(EdgeTable):
         by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
         by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
-        if np.any(self.calibration >= 0):
+        used = graph.has_free(self.calibration[None])
+        if used.any():
             c, s = (to - at for at, to in zip(heading_i, heading_j, strict=True))
             by_turn = axes[2] + _turned_about(axes, si, sj)
             by_delay = self._along(axes, graph, heading_j, self.twist_j) - self._along(axes, graph, heading_i, self.twist_i)
             by_delay += by_turn * self.twist_i[:, 2]
             columns = (axes[0] * c + axes[1] * s, axes[1] * c - axes[0] * s, by_turn, by_delay)
-            for index, column in zip(self.calibration, columns, strict=True):
-                if index >= 0:
-                    blocks.append(("calibration", np.full(len(self), index), _by_pose(column)))
+            for index, column in compress(zip(self.calibration, columns, strict=True), used):
+                blocks.append(("calibration", np.full(len(self), index), _by_pose(column)))
         return Linearization(residuals.T, tuple(blocks))
 
     def _along(

@@ -1,6 +1,7 @@
 """Edges between a pose and an anchor: UWB ranges."""
 
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import ClassVar
 
 import numpy as np
@@ -74,16 +75,20 @@ class RangeEdges(EdgeTable):
     def _geometry(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""
         cal = np.append(graph.calibration.values, 0.0)[self.calibration.T]
-        pose, anchor = graph.poses[self.pose].T, graph.anchors[self.anchor].T
         c, s = se2.cos_sin(self.turn)
         tx, ty = self.tag[0] + cal[3], self.tag[1] + cal[4]
         ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * cal[5]
         uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * cal[5]
-        c, s = se2.cos_sin(pose[2])
+        c, s = self._heading(graph)
         arm = np.stack([c * ux - s * uy, s * ux + c * uy])
-        offset = pose[:2] + arm - anchor
+        offset = graph.poses[:, :2].T.take(self.pose, axis=1) + arm - graph.anchors.T.take(self.anchor, axis=1)
         squared = offset[0] ** 2 + offset[1] ** 2 + self.height**2
         return arm, offset, np.sqrt(np.maximum(np.stack([squared, squared + np.abs(cal[2])]), _NEAREST**2)), cal
+
+    def _heading(self, graph: Graph) -> tuple[Floats, Floats]:
+        """Return cosine and sine (e,) of the poses' headings; most poses have several ranges."""
+        c, s = se2.cos_sin(graph.poses[:, 2])
+        return c.take(self.pose), s.take(self.pose)
 
     def distances(self, graph: Graph) -> Floats:
         """Return the expected slant distances (e,), m, before scale and bias."""
@@ -96,28 +101,28 @@ class RangeEdges(EdgeTable):
         return (((1.0 + cal[0]) * _slant(reach, cal) + cal[1] - self.corrected) / self.sigma)[:, None]
 
     def linearize(self, graph: Graph) -> Linearization:
-        """Return whitened residuals and Jacobians by pose, anchor and the calibration in use."""
+        """Return whitened residuals and Jacobians by pose, anchor and the calibration that is free."""
         arm, offset, reach, cal = self._geometry(graph)
         distance, scale = _slant(reach, cal), (1.0 + cal[0]) / self.sigma
         direction = offset * (scale * np.where(cal[2] < 0.0, 2.0 / reach[0] - 1.0 / reach[1], 1.0 / reach[1]))
         by_theta = direction[1] * arm[0] - direction[0] * arm[1]
         by_pose = np.stack([direction[0], direction[1], by_theta])[None].transpose(2, 0, 1)
         blocks: list[Block] = [("poses", self.pose, by_pose), ("anchors", self.anchor, -direction[None].transpose(2, 0, 1))]
-        if np.any(self.calibration >= 0):
-            columns = self._by_calibration(graph.poses[self.pose, 2], direction, distance, scale / (2.0 * reach[1]))
-            for index, column in zip(self.calibration.T, columns, strict=True):
-                if np.any(index >= 0):
-                    blocks.append(("calibration", np.maximum(index, 0), np.where(index >= 0, column, 0.0)[:, None, None]))
+        used = graph.has_free(self.calibration)
+        columns = [distance / self.sigma, 1.0 / self.sigma, scale / (2.0 * reach[1])]
+        if used[3:].any():
+            columns += self._by_tag_and_delay(graph, direction)
+        for index, column in compress(zip(self.calibration.T, columns, strict=False), used):
+            blocks.append(("calibration", np.maximum(index, 0), np.where(index >= 0, column, 0.0)[:, None, None]))
         residuals = (((1.0 + cal[0]) * distance + cal[1] - self.corrected) / self.sigma)[:, None]
         return Linearization(residuals, tuple(blocks))
 
-    def _by_calibration(self, theta: Floats, direction: Floats, distance: Floats, by_q: Floats) -> tuple[Floats, ...]:
-        """Return the derivatives (e,) by scale, bias, q, tag x, tag y and delay."""
+    def _by_tag_and_delay(self, graph: Graph, direction: Floats) -> tuple[Floats, ...]:
+        """Return the derivatives (e,) by tag x, tag y and delay."""
         (x, y), (vx, vy) = direction, self.velocity.T
-        c, s = se2.cos_sin(theta)
-        ct, st = se2.cos_sin(theta + self.turn)
-        by_delay = (c * x + s * y) * vx + (c * y - s * x) * vy
-        return distance / self.sigma, 1.0 / self.sigma, by_q, ct * x + st * y, ct * y - st * x, by_delay
+        c, s = self._heading(graph)
+        ct, st = se2.cos_sin(graph.poses[self.pose, 2] + self.turn)
+        return ct * x + st * y, ct * y - st * x, (c * x + s * y) * vx + (c * y - s * x) * vy
 
 
 def _slant(reach: Floats, calibration: Floats) -> Floats:
