@@ -24,6 +24,7 @@ from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
 _AT_ONCE = 1 << 15
 """Edges whose products are in memory at once; a bound on the memory."""
 _NONE = np.zeros(0, dtype=np.int64)
+_Small = NDArray[np.int32]
 _Touched = tuple[Ints, bool]
 """Node (e,) touched by each edge, -1 = fixed; and whether it is a calibration value."""
 _Block = tuple[str, Ints, tuple[int, ...]]
@@ -34,11 +35,11 @@ _Block = tuple[str, Ints, tuple[int, ...]]
 class _Places:
     """Places of the products of some edges of one kind."""
 
-    products: NDArray[np.int32]
+    products: _Small
     """Place of every product of two Jacobian columns among the values."""
     twice: Ints
     """Which of them count twice."""
-    rows: NDArray[np.int32]
+    rows: _Small
     """Row of the gradient of every product of a column with the residual."""
 
 
@@ -135,7 +136,8 @@ class NormalEquations:
         height, across = width[lower], width[left]
         ends = np.cumsum(height * across)
         blocks = Blocks(corner[lower], corner[left], height, across, ends - height * across, int(width.sum()))
-        self._base, self._stride = blocks.start - blocks.row * blocks.width - blocks.column, blocks.width
+        base = blocks.start - blocks.row * blocks.width - blocks.column
+        self._base, self._stride = base.astype(np.int32), blocks.width.astype(np.int32)
         self._trash = blocks.places
         each = np.repeat(np.arange(len(width)), width)
         scalar = np.repeat(corner[:-1] - np.cumsum(width) + width, width) + np.arange(blocks.size)
@@ -152,7 +154,7 @@ class NormalEquations:
         block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
         Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
-        following = iter(which)
+        following, corner = iter(which), corner.astype(np.int32)
         self._places: list[list[_Places]] = []
         for lin, nodes, free in zip(linearized, touched, self._free, strict=True):
             widths = [jac.shape[2] for _, _, jac in compress(lin.blocks, free)]
@@ -166,14 +168,14 @@ class NormalEquations:
 
     def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> _Places:
         """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
-        rows: list[NDArray[np.int32]] = []
-        products: list[NDArray[np.int32]] = []
+        rows: list[_Small] = []
+        products: list[_Small] = []
         twice, count = [_NONE], 0
         for p, a in enumerate(nodes):
             steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes[: p + 1], blocks[p], strict=True)]
             equal = [np.flatnonzero((a == b) & (a >= 0)) for b in nodes[:p]] + [_NONE]
             for i in range(widths[p]):
-                rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size).astype(np.int32))
+                rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size))
                 for q, ((start, by_a, by_b), same) in enumerate(zip(steps, equal, strict=True)):
                     for j in range(widths[q] if q < p else i + 1):
                         place = start + i * by_a + j * by_b
@@ -181,11 +183,11 @@ class NormalEquations:
                             place[same] = (start + j * by_a + i * by_b)[same]
                         if len(same) and i == j:
                             twice.append(same + count)
-                        products.append(place.astype(np.int32))
+                        products.append(place)
                         count += len(place)
         return _Places(np.concatenate(products), np.concatenate(twice), np.concatenate(rows))
 
-    def _steps(self, a: Ints, b: Ints, block: Ints) -> tuple[Ints, Ints, Ints]:
+    def _steps(self, a: _Small, b: _Small, block: Ints) -> tuple[_Small, _Small, _Small]:
         """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
         low, high, stride = np.minimum(a, b), np.maximum(a, b), self._stride[block]
         free = low >= 0
