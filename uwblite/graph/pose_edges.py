@@ -228,7 +228,16 @@ class ScanEdges(EdgeTable):
 
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""
-        base = graph.poses[poses]
+        # A pose has one cloud, and many edges: what they have in common is computed once.
+        row = np.zeros(len(graph.poses), dtype=np.int64)
+        row[poses] = np.arange(len(poses))
+        if len(poses) > len(row) and np.array_equal(twist[row].take(poses, axis=0), twist):
+            sensor, heading = self._moved(graph, graph.poses, twist[row])
+            return sensor.take(poses, axis=0), (heading[0].take(poses), heading[1].take(poses))
+        return self._moved(graph, graph.poses[poses], twist)
+
+    def _moved(self, graph: Graph, base: Floats, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+        """Return the same of given poses (e, 3) and their velocities (e, 3)."""
         if not np.any(self.calibration >= 0):
             return base, se2.cos_sin(base[:, 2])
         x, y, turn, delay = np.append(graph.calibration.values, 0.0)[self.calibration]
