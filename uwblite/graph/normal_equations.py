@@ -154,19 +154,19 @@ class NormalEquations:
         block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
         Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
-        following, corner = iter(which), corner.astype(np.int32)
+        following, first = iter(which), corner.astype(np.int32)
         self._places: list[list[_Places]] = []
         for lin, nodes, free in zip(linearized, touched, self._free, strict=True):
             widths = [jac.shape[2] for _, _, jac in compress(lin.blocks, free)]
             blocks = [[*(np.where(a == b, a, next(following)) for b, _ in nodes[:p]), a] for p, (a, _) in enumerate(nodes)]
             self._places.append(
                 [
-                    self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], corner)
+                    self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], first)
                     for part in (_parts(len(lin.residuals)) if nodes else ())
                 ]
             )
 
-    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> _Places:
+    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: _Small) -> _Places:
         """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
         rows: list[_Small] = []
         products: list[_Small] = []
