@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from ..errors import SolverError
 from .covariances import Covariances
 from .eliminated import Blocks, WithBlocks
@@ -60,18 +61,25 @@ class Marginals:
     ) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal, further)
-        unseen = np.append(normal.diagonal <= 0, False)
-        blocks = self._block_diagonal(unseen)
-        chosen = np.asarray(among, dtype=np.int64)
-        self._chosen = self.unknowns.number["poses"][chosen].ravel()
-        parts = [self._chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(self._chosen), 1), _COLUMNS_AT_ONCE)]
-        self._among = np.concatenate([self.columns(part)[self._chosen] for part in parts], axis=1)
-        self._correction = np.zeros(self.unknowns.size)
-        for errors in common:
-            self._add_common(errors, blocks)
+        self._unseen, self._common = np.append(normal.diagonal <= 0, False), common
+        self._among = np.asarray(among, dtype=np.int64)
+
+    @property
+    def covariances(self) -> Covariances:
+        """Covariances of single unknowns, and among the chosen poses, including common errors."""
+        return self._described[0]
+
+    @cached_property
+    def _described(self) -> tuple[Covariances, Floats]:
+        """The same, and the effect of the estimated common errors on the unknowns (size,)."""
+        blocks, correction = self._block_diagonal(), np.zeros(self.unknowns.size)
+        chosen = self.unknowns.number["poses"][self._among].ravel()
+        parts = [chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(chosen), 1), _COLUMNS_AT_ONCE)]
+        among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
+        for errors in self._common:
+            self._add_common(errors, blocks, among, chosen, correction)
         sigmas = np.sqrt(blocks["calibration"][:, 0, 0])
-        self.covariances = Covariances(blocks["poses"], blocks["anchors"], sigmas, chosen, self._among)
-        """Including common errors."""
+        return Covariances(blocks["poses"], blocks["anchors"], sigmas, self._among, among), correction
 
     def corrected(self) -> Graph:
         """Return the optimised graph at the optimum with its common errors estimated together with all other unknowns.
@@ -79,17 +87,19 @@ class Marginals:
         To first order, which is enough for errors of a centimetre; common errors change no other weight. (Best linear
         unbiased prediction: C. R. Henderson, Biometrics 31, 1975.)
         """
-        return moved(self._graph, self.unknowns, self._correction)
+        return moved(self._graph, self.unknowns, self._described[1])
 
     def estimated(self, common: CommonErrors) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns."""
         return self._estimated(common)[1]
 
-    def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
-        """Add the effect of estimated common errors u: H^-1 J^T W S times u to the estimates, times their covariance to
-        these."""
+    def _add_common(
+        self, common: CommonErrors, blocks: dict[str, Floats], among: Floats, chosen: Ints, correction: Floats
+    ) -> None:
+        """Add the effect of estimated common errors u: H^-1 J^T W S times u to the correction, times their covariance to the
+        block diagonal and to the covariance among chosen scalars."""
         times, errors, covariance = self._estimated(common)
-        self._correction -= times(errors)
+        correction -= times(errors)
         root = np.asarray(np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance))), dtype=np.float64)
         for first in range(0, len(root), _COMMON_AT_ONCE):
             moves = times(root[:, first : first + _COMMON_AT_ONCE])
@@ -97,7 +107,7 @@ class Marginals:
             for name, number in self.unknowns.number.items():
                 own = moves[number]
                 blocks[name] += own @ own.transpose(0, 2, 1)
-            self._among += moves[self._chosen] @ moves[self._chosen].T
+            among += moves[chosen] @ moves[chosen].T
 
     def _estimated(self, common: CommonErrors) -> tuple[Callable[[Floats], Floats], Floats, Floats]:
         """Estimate errors that edges have in common: return H^-1 J^T W S as what multiplies by it, values (k,) and covariance
@@ -154,7 +164,7 @@ class Marginals:
             right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
         return right
 
-    def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
+    def _block_diagonal(self) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
         numbers = self.unknowns.number
         rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}
@@ -163,7 +173,7 @@ class Marginals:
         free = row >= 0
         values = np.zeros(len(row))
         values[free] = selected_inverse(self._factor, row[free], column[free])
-        values[unseen[row] & (row == column)] = np.inf
+        values[self._unseen[row] & (row == column)] = np.inf
         ends = np.cumsum([part.size for part in rows.values()])[:-1]
         return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
 
