@@ -27,7 +27,7 @@ from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
-from .plain_edges import ENDS, measured, plain_edges, upper_triangle
+from .plain_edges import ENDS, Measured, measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -109,6 +109,7 @@ def write_g2o(
     *,
     pose_ids: Sequence[str] = (),
     ranges: bool = False,
+    plain: dict[str, Measured] | None = None,
 ) -> None:
     """Write a graph for g2o and similar programs: poses, anchors, edges between poses, and the fixed unknowns.
 
@@ -125,6 +126,7 @@ def write_g2o(
     pose_ids : (n,) names of the poses; vertices bear these names and the anchors' where all of them are numbers, else the
         numbers of their order, and comments give the names.
     ranges : also write EDGE_RANGE_SE2_XY and EDGE_RANGE_SE2, which stock g2o does not know.
+    plain : the graph's plain_edges, where they are known.
 
     Raises
     ------
@@ -135,38 +137,36 @@ def write_g2o(
         kept = bool(pose_ids) and len(set(names)) == len(names) == len(graph.poses) + len(graph.anchors)
         kept = kept and all(_ID.fullmatch(name.encode()) for name in names)
         number = np.array([int(name) for name in names]) if kept else np.arange(len(graph.poses) + len(graph.anchors))
-        for line in _lines(graph, ranges, number):
-            stream.write(line.encode())
+        for lines in _lines(graph, plain or plain_edges(graph), ranges, number):
+            stream.write(lines.encode())
         if not kept:
             first = 0 if pose_ids else len(graph.poses)
             for vertex, name in enumerate(names[first:], first):
                 stream.write(f"# vertex {vertex} is {'anchor ' if vertex >= len(graph.poses) else ''}{name}\n".encode())
 
 
-def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
-    """Yield the lines; `number` (poses + anchors,) is the id of each vertex."""
-    plain, n = plain_edges(graph), len(graph.poses)
-    placed = np.isfinite(graph.anchors).all(axis=1)
-    yield from _rows("VERTEX_SE2", [number[:n]], graph.poses)
+def _lines(graph: Graph, plain: dict[str, Measured], ranges: bool, number: Ints) -> Iterator[str]:
+    """Yield the lines of each tag; `number` (poses + anchors,) is the id of each vertex."""
+    n, placed = len(graph.poses), np.isfinite(graph.anchors).all(axis=1)
+    yield _rows("VERTEX_SE2", [number[:n]], graph.poses)
     first = {"pose": 0, "landmark": n}
     for kind, tag in _TAGS.items():
         if kind == "observation":
-            yield from _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
+            yield _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
         if ranges or "range" not in kind:
             m = plain[kind]
             ends = [number[first[end] + index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
-            yield from _rows(tag, ends, m.value, upper_triangle(m.information))
+            yield _rows(tag, ends, m.value, upper_triangle(m.information))
     fixed = np.flatnonzero(np.append(graph.fixed_poses, graph.fixed_anchors & placed))
     if fixed.tolist() != [0] or len(plain["pose_prior"].value):
-        yield from _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
+        yield _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
 
 
-def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> Iterator[str]:
-    """Yield lines of one tag: whole numbers, then numbers, written so that they read back as they were."""
+def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> str:
+    """Return the lines of one tag: whole numbers, then numbers, written so that they read back as they were."""
     numbers = np.concatenate(columns, axis=1) + 0.0
-    names = zip(*(column.tolist() for column in ids), strict=True)
-    for vertex, row in zip(names, numbers.tolist(), strict=True):
-        yield " ".join([tag, *map(str, vertex), *map(repr, row)]) + "\n"
+    line = tag + " %d" * len(ids) + " %r" * numbers.shape[1] + "\n"
+    return "".join(map(line.__mod__, zip(*(column.tolist() for column in (*ids, *numbers.T)), strict=True)))
 
 
 def _together(a: Records, b: Records) -> Records:

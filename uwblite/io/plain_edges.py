@@ -121,11 +121,15 @@ def definite(information: Floats) -> Floats:
     """Return information matrices (e, k, k), those that are singular to working precision made positive definite."""
     if len(information) == 0:
         return information
-    values, vectors = np.linalg.eigh(information)
+    # The trace is at least the largest eigenvalue, so that the determinant is at most the least one times its powers.
+    size, found = np.trace(information, axis1=1, axis2=2), information.copy()
+    doubtful = np.flatnonzero(~(np.linalg.det(information) > 2.0 * _FLATTEST * size**information.shape[1]))
+    values, vectors = np.linalg.eigh(information[doubtful])
     least = np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny)
-    flat = values[:, 0] < least[:, 0]
     raised = (vectors * np.maximum(values, least)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return np.where(flat[:, None, None], raised, information)
+    flat = values[:, 0] < least[:, 0]
+    found[doubtful[flat]] = raised[flat]
+    return found
 
 
 def root(information: Floats) -> Floats:

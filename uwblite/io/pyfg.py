@@ -25,7 +25,7 @@ from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
-from .plain_edges import ENDS, plain_edges, upper_triangle
+from .plain_edges import ENDS, Measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -107,6 +107,7 @@ def write_pyfg(
     stamps: Floats | None = None,
     *,
     pose_ids: Sequence[str] = (),
+    plain: dict[str, Measured] | None = None,
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
@@ -121,6 +122,7 @@ def write_pyfg(
     stamps : (n,) s, time of each pose; None = its number.
     pose_ids : (n,) names of the poses, kept where all are such as the format knows: another letter and a number. Plain
         numbers get the letter A.
+    plain : the graph's plain_edges, where they are known.
 
     Raises
     ------
@@ -130,8 +132,8 @@ def write_pyfg(
     with replacing(path) as stream:
         poses = _names("A", pose_ids, len(graph.poses), b"[A-KM-Za-z]")
         anchors = _names("L", anchor_ids, len(graph.anchors), b"L")
-        for line in _lines(graph, stamps, poses, anchors):
-            stream.write(line.encode())
+        for lines in _lines(graph, plain or plain_edges(graph), stamps, poses, anchors):
+            stream.write(lines.encode())
 
 
 def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDArray[np.str_]:
@@ -143,12 +145,14 @@ def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDA
     return np.array([f"{letter}{number}" for number in range(count)], dtype=np.str_)
 
 
-def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]) -> Iterator[str]:
-    plain = plain_edges(graph)
+def _lines(
+    graph: Graph, plain: dict[str, Measured], stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]
+) -> Iterator[str]:
+    """Yield the lines of each tag."""
     first = int(np.argmax(graph.fixed_poses)) if len(graph.poses) else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
-    yield from _rows("VERTEX_SE2", stamps, [poses], graph.poses)
-    yield from _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])
+    yield _rows("VERTEX_SE2", stamps, [poses], graph.poses)
+    yield _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])
     names = {"pose": poses, "landmark": anchors}
     for kind, tag in _TAGS.items():
         m = plain[kind]
@@ -156,16 +160,14 @@ def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArr
         # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
         at = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
         when = stamps[at[-1 if kind == "relative" else 0]] if at else np.full(len(m.value), stamps[first])
-        yield from _rows(tag, when, ends, m.value, _covariances(m.information))
+        yield _rows(tag, when, ends, m.value, _covariances(m.information))
 
 
-def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> Iterator[str]:
-    """Yield lines of one tag; numbers are written so that they read back as they were."""
-    numbers = (np.concatenate(columns, axis=1) + 0.0).tolist()
-    times = [""] * len(numbers) if stamps is None else [f" {stamp:.6f}" for stamp in stamps.tolist()]
-    ends = zip(*(column.tolist() for column in names), strict=True)
-    for time, name, row in zip(times, ends, numbers, strict=True):
-        yield f"{tag}{time} {' '.join(name)} {' '.join(map(repr, row))}\n"
+def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> str:
+    """Return the lines of one tag; numbers are written so that they read back as they were."""
+    numbers, times = np.concatenate(columns, axis=1) + 0.0, [] if stamps is None else [stamps]
+    line = tag + " %.6f" * len(times) + " %s" * len(names) + " %r" * numbers.shape[1] + "\n"
+    return "".join(map(line.__mod__, zip(*(column.tolist() for column in (*times, *names, *numbers.T)), strict=True)))
 
 
 def _covariances(information: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -111,10 +112,10 @@ def range_errors_csv(result: MapResult) -> str:
     """
     lines, table = ["stamp,anchor,range,error,weight,x,y,theta,recording"], result.range_table
     columns = [np.asarray(table[name]).tolist() for name in _RANGE_COLUMNS] if table else []
+    names = [csv_field(a.id) if np.isfinite(a.position).all() else None for a in result.anchors]
     for stamp, anchor, metres, residual, weight, x, y, theta, recording in zip(*columns, strict=True):
-        of = result.anchors[int(anchor)]
-        if np.isfinite(residual) and np.isfinite(of.position).all():
-            name = csv_field(of.id)
+        name = names[int(anchor)]
+        if name is not None and math.isfinite(residual):
             values = f"{metres:.4f},{-residual:.4f},{weight:.4f},{x:.4f},{y:.4f},{theta:.5f},{int(recording) + 1}"
             lines.append(f"{stamp:.6f},{name},{values}")
     return "\n".join(lines) + "\n"
@@ -218,15 +219,15 @@ def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:
 
 def _ready(value: Any) -> Any:
     """Return a value as JSON has it: nine significant digits, six decimals of large numbers, null where it is not finite."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
     if isinstance(value, dict):
         return {encodable(str(k)): _ready(v) for k, v in value.items()}
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_ready(v) for v in value]
     if isinstance(value, str):
         return encodable(value)
     if isinstance(value, float):
         # Nine digits of a measurement; of a time since 1970 a microsecond.
-        return (round(value, 6) if abs(value) > 1e3 else float(f"{value:.9g}")) if np.isfinite(value) else None
+        return (round(value, 6) if abs(value) > 1e3 else float(f"{value:.9g}")) if math.isfinite(value) else None
     return value

@@ -37,6 +37,7 @@ from .files import write_text
 from .folders import check_free, mend, replacing_folder
 from .g2o import write_g2o
 from .map_server import trinary_image, write_map
+from .plain_edges import plain_edges
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
 from .result_text import (
@@ -160,9 +161,9 @@ def _write_trajectories(folder: Path, result: MapResult) -> None:
 
 
 def _write_graphs(folder: Path, result: MapResult) -> None:
-    write_g2o(folder / "graph.g2o", result.graph)
-    ids = tuple(a.id for a in result.anchors)
-    write_pyfg(folder / "graph.pyfg", result.graph, ids, result.keyframe_stamps)
+    ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
+    write_g2o(folder / "graph.g2o", result.graph, plain=plain)
+    write_pyfg(folder / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
     write_text(folder / "graph_stamps.csv", stamps_csv(result))
 
 

@@ -19,11 +19,10 @@ def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> No
     poses : (n, 3) x, y, theta; m, rad; written to the micrometre and 1e-9 of the quaternion.
     """
     half = 0.5 * poses[:, 2]
-    columns = (stamps, poses[:, 0], poses[:, 1], np.sin(half), np.cos(half))
-    rows = zip(*(c.tolist() for c in columns), strict=True)
     # + 0.0 turns a negative zero into zero, so that equal poses look equal.
-    text = "".join(f"{t:.6f} {x + 0.0:.6f} {y + 0.0:.6f} 0 0 0 {s + 0.0:.9f} {c:.9f}\n" for t, x, y, s, c in rows)
-    write_bytes(path, text.encode())
+    columns = (stamps, poses[:, 0] + 0.0, poses[:, 1] + 0.0, np.sin(half) + 0.0, np.cos(half))
+    rows = zip(*(c.tolist() for c in columns), strict=True)
+    write_bytes(path, b"".join(map(b"%.6f %.6f %.6f 0 0 0 %.9f %.9f\n".__mod__, rows)))
 
 
 def write_kitti(path: str | os.PathLike[str], poses: Floats) -> None:

@@ -106,23 +106,20 @@ class Canvas:
         """Average fine ink to pixels and blend it in with its first pixel at (x, y)."""
         rows, columns = ink.shape[0] // _FINE, ink.shape[1] // _FINE
         fine = ink.view(np.uint8).reshape(rows, _FINE, columns, _FINE)
-        cover = np.zeros((rows, columns), dtype=np.float32)
-        for a in range(_FINE):
-            for b in range(_FINE):
-                cover += fine[:, a, :, b]
-        cover /= _FINE * _FINE
-        self._ink(cover, x, y, colour, opacity)
+        by_row, cover = fine.sum(axis=1, dtype=np.uint8), np.zeros((rows, columns), dtype=np.uint8)
+        for k in range(_FINE):
+            cover += by_row[:, :, k]
+        self._ink(np.divide(cover, _FINE * _FINE, dtype=np.float32), x, y, colour, opacity)
 
     def _ink(self, cover: NDArray[np.float32], x: int, y: int, colour: Colour, opacity: float) -> None:
         """Blend a colour in where cover (rows, columns) is not 0; what lies outside the picture is dropped."""
         height, width = self.image.shape[:2]
         top, left = max(-y, 0), max(-x, 0)
         part = cover[top : max(height - y, 0), left : max(width - x, 0)]
-        if part.size == 0:
-            return
-        area = self.image[y + top : y + top + part.shape[0], x + left : x + left + part.shape[1]]
-        share = (part * np.float32(opacity))[:, :, None]
-        area[:] = np.rint(area + share * (np.array(colour, dtype=np.float32) - area)).astype(np.uint8)
+        row, column = np.nonzero(part)
+        share, where = (part[row, column] * np.float32(opacity))[:, None], (row + y + top, column + x + left)
+        area = self.image[where]
+        self.image[where] = np.rint(area + share * (np.array(colour, dtype=np.float32) - area)).astype(np.uint8)
 
 
 def _span(points: Floats, rows: Floats) -> tuple[Floats, Floats]:

@@ -148,14 +148,14 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 
 def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the more certain a cell, the closer to white or black."""
-    image = np.empty((*grid.log_odds.shape, 3), dtype=np.uint8)
+    image = np.full((*grid.log_odds.shape, 3), PAPER, dtype=np.uint8)
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
     for rows in grid.geometry.strips():
-        p = grid.probability(rows)
-        free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, :, None]
-        wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, :, None]
-        colours = paper + free * (floor - paper) + wall * (ink - paper)
-        image[rows] = np.rint(np.where(grid.log_odds[rows, :, None] != 0.0, colours, paper))
+        known = grid.log_odds[rows] != 0.0
+        p = grid.probability(rows)[known]
+        free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, None]
+        wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, None]
+        image[rows][known] = np.rint(paper + free * (floor - paper) + wall * (ink - paper))
     return image
 
 
