@@ -45,27 +45,24 @@ def bresenham(row, col, row_end, col_end):
     return cells
 
 
-def counted(geometry, origins, endpoints, hit, scan, weak, walls):
-    """Hits and misses by looping over scans, rays and cells."""
+def counted(geometry, origins, endpoints, scan, weak, walls):
+    """Hits and misses by looping over scans, rays and cells; where walls are given, the rays saw nothing."""
     hits = np.zeros((geometry.rows, geometry.cols), int)
     misses = np.zeros_like(hits)
     for number in sorted(set(scan.tolist())):
-        stated = {}
+        passed, ended = set(), set()
         for ray in np.flatnonzero(scan == number):
             begin, end = geometry.cell_of(origins[ray]), geometry.cell_of(endpoints[ray])
-            weight = WEIGHT_UNIT if hit[ray] else weak
             for cell in bresenham(*map(int, begin), *map(int, end)):
-                if not hit[ray] and geometry.inside(*cell) and walls[cell]:
+                if walls is not None and geometry.inside(*cell) and walls[cell]:
                     break
-                stated[cell] = max(stated.get(cell, 0), weight)
-        for ray in np.flatnonzero((scan == number) & hit):
-            stated[tuple(map(int, geometry.cell_of(endpoints[ray])))] = "hit"
-        for (row, col), what in stated.items():
-            if 0 <= row < geometry.rows and 0 <= col < geometry.cols:
-                if what == "hit":
-                    hits[row, col] += 1
-                else:
-                    misses[row, col] += what
+                passed.add(cell)
+            if walls is None:
+                ended.add(tuple(map(int, end)))
+        for counts, weight, cells in ((hits, 1, ended), (misses, WEIGHT_UNIT if walls is None else weak, passed - ended)):
+            for cell in cells:
+                if geometry.inside(*cell):
+                    counts[cell] += weight
     return hits, misses
 
 
@@ -88,7 +85,7 @@ def test_lines_are_bresenhams_in_every_direction(reach):
             np.testing.assert_array_equal(marks[slot], expected)
 
 
-def test_long_lines_round_exactly_in_both_precisions():
+def test_long_lines_round_exactly():
     rng = np.random.default_rng(1)
     for n in (255, 256, 257, 2000, 5000):
         d = np.unique(np.concatenate([[0, 1, n // 2, n - 1, n], rng.integers(0, n, 3)]))
@@ -110,25 +107,32 @@ def test_counts_equal_a_loop_over_cells(seed, rays, scans):
     # Some rays leave the grid and come back to it; some end where they begin.
     origins = rng.uniform(-2.0, 2.0, (rays, 2))
     endpoints = origins + rng.choice([0.0, 0.3, 2.0], (rays, 1)) * rng.normal(size=(rays, 2))
-    hit = rng.random(rays) < 0.7
     scan = np.sort(rng.integers(0, scans, rays))
-    counter = RayCounter(geometry, 0.25)
-    walls = rng.random((geometry.rows, geometry.cols)) < rng.choice([0.0, 0.05, 0.5])
-    counter.insert_rays(origins, endpoints, hit, scan, walls)
-    hits, misses = counted(geometry, origins, endpoints, hit, scan, 4, walls)
-    np.testing.assert_array_equal(counter.hits, hits)
-    np.testing.assert_array_equal(counter.misses, misses)
+    for walls in (None, rng.random((geometry.rows, geometry.cols)) < rng.choice([0.0, 0.05, 0.5])):
+        counter = RayCounter(geometry, 0.25)
+        counter.insert_rays(origins, endpoints, scan, walls)
+        hits, misses = counted(geometry, origins, endpoints, scan, 4, walls)
+        np.testing.assert_array_equal(counter.hits, hits)
+        np.testing.assert_array_equal(counter.misses, misses)
+
+
+def test_a_cell_that_more_scans_see_than_are_traced_at_once_counts_them_all():
+    counter = RayCounter(geometry_of(18))
+    counter.insert_rays(np.zeros((600, 2)), np.tile([0.35, 0.0], (600, 1)), np.arange(600))
+    row, col = counter.geometry.cell_of(np.array([[0.0, 0.0], [0.35, 0.0]]))
+    assert counter.misses[row[0], col[0]] == 600 * WEIGHT_UNIT
+    assert counter.hits[row[1], col[1]] == counter.hits.sum() == 600
 
 
 def test_counts_do_not_depend_on_working_memory(monkeypatch):
     rng = np.random.default_rng(2)
     origins = rng.uniform(0, 1, (400, 2))
-    endpoints, hit, scan = origins + rng.normal(size=(400, 2)), rng.random(400) < 0.8, np.arange(400) // 7
+    endpoints, scan = origins + rng.normal(size=(400, 2)), np.arange(400) // 7
     results = []
     for cells in (1, 3000, 1 << 22):
         monkeypatch.setattr("uwblite.grid.ray_counter._SCRATCH_CELLS", cells)
         counter = RayCounter(geometry_of(30), 0.25)
-        counter.insert_rays(origins, endpoints, hit, scan)
+        counter.insert_rays(origins, endpoints, scan)
         results.append((counter.hits, counter.misses))
     for hits, misses in results[1:]:
         np.testing.assert_array_equal(hits, results[0][0])
@@ -411,7 +415,7 @@ def test_scan_by_scan_insertion_makes_the_same_map():
     counter = RayCounter(whole.geometry, config.clear_weight)
     for k in range(30):
         rays = scan_rays(scans, seen_reach(scans, np.array([k])), poses[k : k + 1])
-        counter.insert_rays(rays.origins, rays.endpoints, np.ones(len(rays.scan), bool))
+        counter.insert_rays(rays.origins, rays.endpoints)
     assert from_counts(counter, config).log_odds.tobytes() == whole.log_odds.tobytes()
 
 
@@ -449,12 +453,12 @@ def test_misuse_is_named():
     with pytest.raises(DataError, match="no scans"):
         from_scans(np.zeros((0, 3)), LaserScans(np.zeros(0), np.zeros((0, 4), np.float32), 0.0, 0.1, 0.0, 0.02, 5.0))
     with pytest.raises(DataError, match="belong together"):
-        RayCounter(geometry_of(5)).insert_rays(np.zeros((2, 2)), np.zeros((3, 2)), np.ones(2, bool))
-    one = np.zeros((1, 2)), np.ones((1, 2)), np.ones(1, bool)
+        RayCounter(geometry_of(5)).insert_rays(np.zeros((2, 2)), np.zeros((3, 2)))
+    one = np.zeros((1, 2)), np.ones((1, 2))
     with pytest.raises(DataError, match="walls"):
         RayCounter(geometry_of(5)).insert_rays(*one, None, np.zeros((5, 5), bool))
     with pytest.raises(DataError, match="too long"):
-        RayCounter(geometry_of(5)).insert_rays(np.zeros((1, 2)), np.full((1, 2), 1e6), np.ones(1, bool))
+        RayCounter(geometry_of(5)).insert_rays(np.zeros((1, 2)), np.full((1, 2), 1e6))
 
 
 @pytest.mark.parametrize("wrong", [

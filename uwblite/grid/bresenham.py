@@ -12,11 +12,13 @@ sorted by length, the unfinished ones are a prefix of the array.
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Ints
+from ..arrays import Bools, Floats, Ints
 
-_SINGLE_UP_TO = 256
-"""Steps up to which every rounding is right in single precision: values k d / n that are no ties are at least 1 / (2 n) from
-a tie, more than the rounding errors, and ties are raised by the nudge."""
+_Places = NDArray[np.int32]
+
+_HALF = 0.5 + 1e-7
+"""Values k d / n that are no ties are at least 1 / (2 n) from a tie, more than the rounding errors of their sum for rays of
+thousands of steps, and ties are raised."""
 
 
 def mark_rays(
@@ -27,10 +29,9 @@ def mark_rays(
     Parameters
     ----------
     marks : (cells,) flat image, or several; changed in place.
-    start : (r,) flat index of each ray's first cell.
+    start : (r,) flat index of each ray's first cell; indices of less than 32 bits.
     d_row, d_col : (r,) rows and columns from the first to the last cell.
     stride : flat distance between rows.
-    value : 0..255.
     walls : (cells,) a ray ends before the first of its cells that is a wall.
     """
     steps = np.maximum(np.abs(d_row), np.abs(d_col))
@@ -42,26 +43,25 @@ def mark_rays(
     if len(order) == 0 or shorter_by[0] == 0:
         return
     here, along, across, slope = _strides(start[order], d_row[order], d_col[order], -shorter_by, stride)
-    half = slope.dtype.type(0.5 + (5e-4 if slope.dtype == np.float32 else 1e-7))
-    moved, cell = np.empty_like(slope), np.empty_like(here)
-    for k in range(-int(shorter_by[0])):
-        r = int(np.searchsorted(shorter_by, -k))
-        np.multiply(slope[:r], slope.dtype.type(k), out=moved[:r])
-        moved[:r] += half
-        cell[:r] = moved[:r]
-        cell[:r] *= across[:r]
-        cell[:r] += here[:r]
+    moved, aside, cell = np.full(len(order), _HALF), np.empty_like(here), np.empty(len(order), dtype=np.int64)
+    for r in np.searchsorted(shorter_by, -np.arange(-shorter_by[0])).tolist():
+        aside[:r] = moved[:r]
+        aside[:r] *= across[:r]
+        aside[:r] += here[:r]
+        # Numbers of 64 bits, as indexing needs them.
+        cell[:r] = aside[:r]
         if walls is not None and len(stopped := np.flatnonzero(walls[cell[:r]])):
             # A ray that has ended stays in its last cell, which is written already: cheaper than leaving it out.
-            last = (slope[stopped] * slope.dtype.type(k - 1) + half).astype(across.dtype)
+            last = (moved[stopped] - slope[stopped]).astype(np.int32)
             here[stopped] += last * across[stopped] - along[stopped]
             along[stopped] = across[stopped] = 0
             cell[stopped] = here[stopped]
         marks[cell[:r]] = value
+        moved[:r] += slope[:r]
         here[:r] += along[:r]
 
 
-def _strides(start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int) -> tuple[Ints, Ints, Ints, NDArray[np.floating]]:
+def _strides(start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int) -> tuple[_Places, _Places, _Places, Floats]:
     """Return the first cell, the flat steps along the longer and across to the shorter axis, and the slope d / n."""
     steep = np.abs(d_row) > np.abs(d_col)
     row_step, col_step = np.sign(d_row) * stride, np.sign(d_col)
@@ -69,4 +69,4 @@ def _strides(start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int) ->
     across = np.where(steep, col_step, row_step)
     shorter = np.abs(np.where(steep, d_col, d_row))
     slope = shorter / np.maximum(steps, 1)
-    return start.copy(), along, across, slope.astype(np.float32 if steps[0] <= _SINGLE_UP_TO else np.float64)
+    return start.astype(np.int32), along.astype(np.int32), across.astype(np.int32), slope

@@ -1,7 +1,6 @@
 """Hits and misses: counts of the cells in which rays end and through which they pass, scan by scan."""
 
 from copy import copy
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,10 @@ Counts = NDArray[np.int32]
 WEIGHT_UNIT = 16
 """Misses are counted in sixteenths, so that weak ones stay integers."""
 _SCRATCH_CELLS = 1 << 22
-"""Cells of working memory: scans are traced in batches whose windows fit into it."""
+"""Cells of working memory: scans are traced in batches whose windows fit into it, and so does the area around all of these."""
+_HIT = 128
+"""Mark of a cell in which a ray of a scan ended, 1 = through which one passed; those of up to _MOST_SCANS add up in 16 bits."""
+_MOST_SCANS = _HIT - 1
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
 
@@ -37,96 +39,80 @@ class RayCounter:
         self.misses: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
         self._scratch = np.zeros(0, dtype=np.uint8)
 
-    def insert_rays(
-        self, origins: Floats, endpoints: Floats, hit: Bools, scan: Ints | None = None, walls: Bools | None = None
-    ) -> None:
-        """Trace rays; within one scan every cell counts once.
+    def insert_rays(self, origins: Floats, endpoints: Floats, scan: Ints | None = None, walls: Bools | None = None) -> None:
+        """Trace rays; within one scan every cell counts once, as a hit if a ray ended there.
 
         Parameters
         ----------
         origins : (r, 2) where the laser was, m, map frame.
         endpoints : (r, 2) where the rays end, m, map frame.
-        hit : (r,) whether something is there; a ray without a hit clears with clear_weight.
         scan : (r,) number of the scan of each ray, non-decreasing; None = all rays are of one scan.
-        walls : (rows, cols) cells before which rays without a hit end.
+        walls : (rows, cols) the rays saw nothing: they clear with clear_weight, and end before these cells. None = something
+            is where they end.
         """
-        if origins.shape != endpoints.shape or hit.shape != origins.shape[:1]:
-            raise DataError(f"rays of shapes {origins.shape}, {endpoints.shape} and {hit.shape} do not belong together")
-        if len(hit) == 0:
+        if origins.shape != endpoints.shape or (scan is not None and scan.shape != origins.shape[:1]):
+            raise DataError(f"rays from {origins.shape} to {endpoints.shape} do not belong together, or not to their scans")
+        if len(origins) == 0:
             return
         if walls is not None and walls.shape != self.hits.shape:
             raise DataError(f"walls of shape {walls.shape} do not fit a grid of {self.hits.shape}")
-        slot = np.zeros(len(hit), dtype=np.int64)
+        slot = np.zeros(len(origins), dtype=np.int64)
         if scan is not None:
             slot[1:] = np.cumsum(np.diff(scan) != 0)
         cells = np.stack([*self.geometry.cell_of(origins), *self.geometry.cell_of(endpoints)])
-        changed = np.empty(len(hit), dtype=np.bool_)
-        changed[0] = True
-        changed[1:] = slot[1:] != slot[:-1]
-        for column in (hit, *cells):
-            changed[1:] |= column[1:] != column[:-1]
-        slot, hit, cells = slot[changed], hit[changed], cells[:, changed]
-        self._trace(slot, hit, cells, walls)
+        changed = np.ones(len(slot), dtype=np.bool_)
+        changed[1:] = (np.diff(cells) != 0).any(axis=0) | (np.diff(slot) != 0)
+        rows = np.flatnonzero(changed)
+        self._trace(slot[rows], cells.take(rows, axis=1), walls)
 
-    def _trace(self, slot: Ints, hit: Bools, cells: Ints, walls: Bools | None) -> None:
+    def _trace(self, slot: Ints, cells: Ints, walls: Bools | None) -> None:
         """Trace the rays of scans 0..n-1, as many scans at a time as working memory allows."""
         starts = np.searchsorted(slot, np.arange(slot[-1] + 2))
-        rows, cols = np.minimum(cells[0], cells[2]), np.minimum(cells[1], cells[3])
-        low = np.stack([np.minimum.reduceat(rows, starts[:-1]), np.minimum.reduceat(cols, starts[:-1])], axis=1)
-        rows, cols = np.maximum(cells[0], cells[2]), np.maximum(cells[1], cells[3])
-        high = np.stack([np.maximum.reduceat(rows, starts[:-1]), np.maximum.reduceat(cols, starts[:-1])], axis=1)
+        low, high = (
+            np.stack([ends.reduceat(ends(cells[k], cells[k + 2]), starts[:-1]) for k in range(2)], axis=1)
+            for ends in (np.minimum, np.maximum)
+        )
         size = high - low + 1
         if size.max() > _LONGEST_RAY:
             raise DataError(f"a ray of {size.max()} cells is too long to trace; set a smaller max_range")
         first = 0
         while first < len(low):
-            area = np.maximum.accumulate(size[first:], axis=0).prod(axis=1) * np.arange(1, len(low) - first + 1)
-            last = first + max(1, int(np.searchsorted(area, _SCRATCH_CELLS, "right")))
+            some = slice(first, first + _MOST_SCANS)
+            windows = np.maximum.accumulate(size[some], axis=0).prod(axis=1)
+            around = np.maximum.accumulate(high[some], axis=0) - np.minimum.accumulate(low[some], axis=0) + 1
+            cells_of = np.maximum(windows * np.arange(1, len(windows) + 1), around.prod(axis=1, dtype=np.float64))
+            last = first + max(1, int(np.searchsorted(cells_of, _SCRATCH_CELLS, "right")))
             rays = slice(starts[first], starts[last])
-            self._trace_batch(slot[rays] - first, hit[rays], cells[:, rays], low[first:last], size[first:last], walls)
+            self._trace_batch(slot[rays] - first, cells[:, rays], low[first:last], size[first:last], walls)
             first = last
 
-    def _trace_batch(self, slot: Ints, hit: Bools, cells: Ints, low: Ints, size: Ints, walls: Bools | None) -> None:
-        """Trace each scan into a window of its own, then add the windows to the grid."""
+    def _trace_batch(self, slot: Ints, cells: Ints, low: Ints, size: Ints, walls: Bools | None) -> None:
+        """Trace each scan into a window of its own, add the windows up, and their sum to the grid."""
         height, width = size.max(axis=0).tolist()
         window = height * width
         if len(self._scratch) < len(low) * window:
             self._scratch = np.empty(len(low) * window, dtype=np.uint8)
         marks = self._scratch[: len(low) * window]
         marks[:] = 0
-        begin, end = cells[:2] - low[slot].T, cells[2:] - low[slot].T
-        start = slot * window + begin[0] * width + begin[1]
-        step = end - begin
-        stops = None if walls is None else self._windows_of(walls, low, height, width)
-        # Stronger observations are written later and overwrite weaker ones.
-        for rays, weight, stop in ((~hit, self._weak, stops), (hit, WEIGHT_UNIT, None)):
-            if weight:
-                mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight, stop)
-        ends = np.sort((slot * window + end[0] * width + end[1])[hit])
-        ends = ends[np.diff(ends, prepend=-1) > 0]
-        marks[ends] = 0
-        self._add_hits(ends, low, window, width)
-        for scan, (row, col) in enumerate(low.tolist()):
-            rows, cols = size[scan].tolist()
-            self._add_window(marks[scan * window : (scan + 1) * window].reshape(height, width)[:rows, :cols], row, col)
+        start = (np.arange(len(low)) * window - low[:, 0] * width - low[:, 1]).take(slot) + cells[0] * width + cells[1]
+        rows, cols = cells[2:] - cells[:2]
+        mark_rays(marks, start, rows, cols, width, 1, None if walls is None else self._windows_of(walls, low, height, width))
+        if walls is None:
+            marks[start + rows * width + cols] = _HIT
+        first = low.min(axis=0)
+        total = np.zeros((low + size).max(axis=0) - first, dtype=np.uint16)
+        places = zip(marks.reshape(-1, height, width), (low - first).tolist(), size.tolist(), strict=True)
+        for marked, (row, col), (tall, wide) in places:
+            total[row : row + tall, col : col + wide] += marked[:tall, :wide]
+        self._add_window(total, *first.tolist(), WEIGHT_UNIT if walls is None else self._weak)
 
-    def _add_hits(self, ends: Ints, low: Ints, window: int, width: int) -> None:
-        """Count the cells in which rays ended, sorted and each once per scan, given by place in the scans' windows."""
-        scan, cell = np.divmod(ends, window)
-        row, col = low[scan, 0] + cell // width, low[scan, 1] + cell % width
-        inside = self.geometry.inside(row, col)
-        flat, cell = self.hits.reshape(-1), (row * self.geometry.cols + col)[inside]
-        bounds = np.searchsorted(scan[inside], np.arange(len(low) + 1)).tolist()
-        for begin, end in pairwise(bounds):
-            flat[cell[begin:end]] += 1
-
-    def _add_window(self, marks: NDArray[np.uint8], row: int, col: int) -> None:
-        """Add the misses of one scan, its window's first cell at (row, col); cells outside the grid are dropped."""
+    def _add_window(self, total: NDArray[np.uint16], row: int, col: int, weight: int) -> None:
+        """Add hits and misses in a window whose first cell is (row, col); cells outside the grid are dropped."""
         top, left = max(-row, 0), max(-col, 0)
-        part = marks[top : max(self.geometry.rows - row, 0), left : max(self.geometry.cols - col, 0)]
-        if part.size:
-            rows, cols = part.shape
-            self.misses[row + top : row + top + rows, col + left : col + left + cols] += part
+        part = total[top : max(self.geometry.rows - row, 0), left : max(self.geometry.cols - col, 0)]
+        window = slice(row + top, row + top + part.shape[0]), slice(col + left, col + left + part.shape[1])
+        self.hits[window] += part // _HIT
+        self.misses[window] += part % _HIT * weight
 
     def _windows_of(self, cells: Bools, low: Ints, height: int, width: int) -> Bools:
         """Return the scans' windows (flat) onto a grid of flags; outside the grid nothing is set."""

@@ -71,20 +71,19 @@ def scan_rays(
     last : (s, 3) T_map_laser at the last ray; in between the laser moves evenly. None = it stood still.
     flipped : the laser is mounted upside down; its rays run clockwise.
     """
-    used = reach > 0
+    rows = np.flatnonzero(reach > 0)
     beams = reach.shape[1]
     moved = np.zeros_like(first) if last is None else last - first
     moved[:, 2] = se2.wrap_angle(moved[:, 2])
     fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
     bearing = (first[:, 2:] + (-scans.angles if flipped else scans.angles)) + moved[:, 2:] * fraction
     # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
-    bearing = bearing.astype(np.float32)
-    origins, ends = np.empty((2, 2, int(np.count_nonzero(used))))
+    bearing, length = bearing.astype(np.float32).take(rows), reach.take(rows)
+    origins, ends = np.empty((2, 2, len(rows)))
     for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
-        start = first[:, axis, None] + moved[:, axis, None] * fraction
-        origins[axis] = start[used]
-        ends[axis] = (start + reach * direction)[used]
-    return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(used, axis=1)))
+        origins[axis] = (first[:, axis, None] + moved[:, axis, None] * fraction).take(rows)
+        ends[axis] = origins[axis] + length * direction
+    return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(reach > 0, axis=1)))
 
 
 def extent(

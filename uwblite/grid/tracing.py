@@ -193,4 +193,4 @@ def _count(task: _Task, geometry: GridGeometry, walls: Bools | None) -> tuple[Co
 
 
 def _insert(counter: RayCounter, rays: ScanRays, walls: Bools | None) -> None:
-    counter.insert_rays(rays.origins, rays.endpoints, np.full(len(rays.scan), walls is None), rays.scan, walls)
+    counter.insert_rays(rays.origins, rays.endpoints, rays.scan, walls)
