@@ -74,13 +74,10 @@ def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
     on one line and face the same way."""
     one, other = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for rows in _strips(at):
-        a, b = _together(at[rows], normal[rows])
         of_place = stretch[rows]
         # Linking each place with its first neighbour joins the same sets as all of its links, of which there may be thousands.
-        own = connected(a, b, len(rows))
-        first = np.unique(own, return_index=True)[1]
         one.append(of_place)
-        other.append(of_place[first[own]])
+        other.append(of_place[_together(at[rows], normal[rows])])
     return connected(np.concatenate(one), np.concatenate(other), many)
 
 
@@ -97,16 +94,27 @@ _AT_ONCE = 1 << 13
 """Places of a strip; bounds the memory."""
 
 
-def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
-    """Return pairs of places (m, 2) with normals (m, 2) that lie on one line and face the same way."""
+def _together(at: Floats, normal: Floats) -> Ints:
+    """Return for each place (m, 2) with a normal (m, 2) the first one of its set; places that lie on one line and face the same
+    way are of one set."""
     pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray")
     columns = [np.ascontiguousarray(column) for column in (*at.T, *normal.T)]
-    parts = (pairs[first : first + _PAIRS_AT_ONCE].T for first in range(0, len(pairs), _PAIRS_AT_ONCE))
-    good = [_on_one_line(one, other, *columns) for one, other in parts]
-    one, other = pairs[np.concatenate([np.zeros(0, dtype=bool), *good])].T
-    return one, other
+    first = each = np.arange(len(at))
+    # Some of the pairs link most of the places, and few others remain to be tested.
+    for tested in (pairs[::_SOME], pairs):
+        links = [np.stack([each, first])]
+        for begin in range(0, len(tested), _PAIRS_AT_ONCE):
+            one, other = tested[begin : begin + _PAIRS_AT_ONCE].T
+            apart = np.flatnonzero(first.take(one) != first.take(other))
+            one, other = one[apart], other[apart]
+            links.append(np.stack([one, other])[:, _on_one_line(one, other, *columns)])
+        own = connected(*np.concatenate(links, axis=1), len(at))
+        first = np.unique(own, return_index=True)[1][own]
+    return first
 
 
+_SOME = 16
+"""One in so many pairs is tested first."""
 _PAIRS_AT_ONCE = 1 << 15
 """Pairs that are processed together, so that they fit into the processor's cache."""
 
