@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from ..arrays import Floats, Ints
-from .elimination import pairs_of, with_subtrees_contiguous
+from .elimination import order_of_columns
 from .factorization import superlu
 from .graph import Linearization
 from .normal_equations import NormalEquations
@@ -111,7 +111,8 @@ class WithBlocks:
         own.eliminate_zeros()
         whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
         self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
-        self.order = with_subtrees_contiguous(pairs_of(whole), whole.shape[0]) if order is None else order
+        whole.sort_indices()
+        self.order = order_of_columns(whole) if order is None else order
         self._place = np.argsort(self.order)
         self._lu = superlu(sparse.csc_matrix(whole[self.order][:, self.order]), "NATURAL")
         self.perm_r, self.perm_c = self._lu.perm_r[self._place], self._lu.perm_c[self._place]

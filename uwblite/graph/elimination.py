@@ -34,6 +34,20 @@ def pairs_of(matrix: sparse.csc_matrix) -> Ints:
     return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.int64)
 
 
+def alike_columns(matrix: sparse.csc_matrix) -> tuple[Ints, Ints]:
+    """Return the number (n,) of the group of each column of a symmetric matrix, and the pairs (b, 2) of groups with an entry.
+
+    Neighbouring columns with the same pattern, as those of one pose, are one group.
+    """
+    n, count, row = matrix.shape[0], np.diff(matrix.indptr), matrix.indices
+    column = np.repeat(np.arange(n), count)
+    in_next = np.minimum(np.arange(len(row)) + np.repeat(count, count), len(row) - 1)
+    first = np.ones(n, dtype=bool)
+    first[1:] = (np.diff(count) != 0) | (np.bincount(column, row != row[in_next], n)[:-1] > 0)
+    group, kept = np.cumsum(first) - 1, first[column] & first[row] & (row > column)
+    return group, np.stack([group[column[kept]], group[row[kept]]], axis=1)
+
+
 def narrow_order(pairs: Ints, nodes: int) -> tuple[Ints, Ints]:
     """Return the order (nodes,) of a narrow band, by reverse Cuthill-McKee, and how far (nodes,) each row reaches in it."""
     order = reverse_cuthill_mckee(adjacency(pairs, nodes).tocsr(), symmetric_mode=True).astype(np.int64)
@@ -105,6 +119,14 @@ def with_subtrees_contiguous(pairs: Ints, nodes: int) -> Ints:
     """Return the order (nodes,) of elimination by minimum degree in which every subtree is contiguous."""
     order = minimum_degree(pairs, nodes)
     return order[postorder(elimination_tree(pairs, order))]
+
+
+def order_of_columns(matrix: sparse.csc_matrix) -> Ints:
+    """Return the order (n,) of elimination of the columns of a symmetric matrix, whose rows ascend in each of them: by minimum
+    degree of groups that are alike, with every subtree contiguous."""
+    group, pairs = alike_columns(matrix)
+    place = np.argsort(with_subtrees_contiguous(pairs, int(group.max(initial=-1)) + 1))
+    return np.argsort(place[group], kind="stable")
 
 
 def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
