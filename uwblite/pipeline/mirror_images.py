@@ -14,7 +14,7 @@ from ..arrays import Bools, Floats
 from ..graph.calibration import BIAS, HEIGHT
 from ..graph.graph import Graph, PriorEdges
 from ..graph.range_edges import RangeEdges
-from ..graph.solver import optimize
+from ..graph.solver import SolverConfig, optimize
 from .estimate import Estimate, Task
 
 _CLEAR = 30.0
@@ -25,6 +25,9 @@ _LIKELIER = 10.0
 prefer the wrong side of it by 34, and by 1.3 as what they are worth. Where neither place was right it was 9, and the mirror
 images of right places had 10 to 125. With poses free as well and a lidar that sees little, a wrong place was preferred by 6.9,
 and right ones by 0.3, 5.3 and 13."""
+_SLOW = 0.01 * _LIKELIER
+"""Decrease of chi2 by a step that ends the search for other places once they are about as likely; where they cost more, in
+proportion more: at this pace none of them becomes likely in a hundred steps."""
 _APART = 0.5
 """Places nearer to each other than this are the same, m."""
 
@@ -38,8 +41,10 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     free &= ~estimate.graph.fixed_anchors
     if not free.any():
         return estimate
-    starts = (estimate.graph.anchors, _images(estimate, ranges))
-    here, there = (_minimum(estimate, ranges, free, start, task) for start in starts)
+    images, config = _images(estimate, ranges), task.config.solver
+    here = _minimum(estimate, ranges, free, estimate.graph.anchors, config)
+    slow = max(config.relative_decrease, _SLOW / (here.chi2() + _CLEAR))
+    there = _minimum(estimate, ranges, free, images, replace(config, relative_decrease=slow))
     apart = np.hypot(*(there.anchors - here.anchors).T)
     each, together = (_costs(there, ranges, w) - _costs(here, ranges, w) for w in (ranges.alive, ranges.own_weights))
     as_well = (apart > _APART) & ((each < _CLEAR) | (together < _LIKELIER))
@@ -47,7 +52,7 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     best: Graph | None = None
     for k in np.flatnonzero(free & ~as_well & _straight(estimate, ranges)).tolist():
         best = best or _optimum(estimate, task)
-        other = _along_another_path(best, ranges, k, starts[1][k], task)
+        other = _along_another_path(best, ranges, k, images[k], task)
         if other is not None:
             as_well[k], others[k] = True, other
     ambiguous = np.where(free, as_well, found.ambiguous)
@@ -109,13 +114,13 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
     return anchors
 
 
-def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, task: Task) -> Graph:
+def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, config: SolverConfig) -> Graph:
     """Return the graph with the free anchors (a,), biases and heights at their best near a start (a, 2), the poses fixed."""
     graph = estimate.graph
     fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS, HEIGHT)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block != "poses")
     alone = Graph(graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed)
-    return optimize(alone.with_edges(ranges), task.config.solver)[0]
+    return optimize(alone.with_edges(ranges), config)[0]
 
 
 def _costs(graph: Graph, ranges: RangeEdges, worth: Floats | Bools) -> Floats:
