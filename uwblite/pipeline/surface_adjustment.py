@@ -35,7 +35,7 @@ from .lidar_stages import solved
 from .surface_search import FoundSurfaces, find_surfaces
 
 _ROUNDS, _STILL = 6, 1e-3
-"""Most Gauss-Newton steps; the change of the poses, rms, m, that ends them once noise and pairs have settled."""
+"""Most Gauss-Newton steps; the next change of the poses, rms, m, that ends them once noise and pairs have settled."""
 _SETTLING = 2
 """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
 _KERNEL, _WIDER = 3.0, 4.0
@@ -139,6 +139,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
     assert first is not None
     found, kind = first.measured, first.kind
     others = () if estimate.ranges is None else (estimate.ranges,)
+    step = np.inf
     for turn in range(_ROUNDS):
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
@@ -165,7 +166,9 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
         many = len(found.surfaces.facing)
         graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
         found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
-        if turn >= _SETTLING and rms_length((graph.poses - poses)[:, :2]) < _STILL:
+        before, step = step, rms_length((graph.poses - poses)[:, :2])
+        # Steps get smaller by the same factor each.
+        if turn >= _SETTLING and step * min(step, before) <= _STILL * before:
             break
     return graph, found
 
