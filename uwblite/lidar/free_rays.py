@@ -28,7 +28,7 @@ def rays_near(free: SurfaceRays, known: SurfaceRays, poses: Floats) -> SurfaceRa
     """Return those of the free rays that end near known ones, at poses (k, 3)."""
     centres = np.column_stack([se2.transform_each(poses, known.keyframe, known.points), np.zeros(len(known.keyframe))])
     cells = np.unique(np.round(centres / _NEAR), axis=0) * _NEAR
-    return free.rows(surroundings(cells, _NEAR).nearest(se2.transform_each(poses, free.keyframe, free.points))[0])
+    return free.rows(surroundings(cells, _NEAR).inside(se2.transform_each(poses, free.keyframe, free.points)))
 
 
 def with_free_rays(found: MeasuredSurfaces, short: Bools, free: SurfaceRays, sensors: Floats) -> MeasuredSurfaces:

@@ -145,13 +145,17 @@ class Surroundings:
     near: Bools
     """(x, y) whether a square is near a column; the outermost ones are not."""
 
-    def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
-        """Return the rows (n,) of points (p, 2) on such squares, the column nearest to each, and how far its centre is, m."""
+    def inside(self, at: Floats) -> Ints:
+        """Return the rows (n,) of points (p, 2) on such squares."""
         x, y = (
             np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.int64)
             for k in range(2)
         )
-        rows = np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
+        return np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
+
+    def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
+        """Return the rows (n,) of points (p, 2) on such squares, the column nearest to each, and how far its centre is, m."""
+        rows = self.inside(at)
         if not len(rows):
             return rows, rows, np.zeros(0)
         away, which = cKDTree(self.columns[:, :2]).query(at[rows])
