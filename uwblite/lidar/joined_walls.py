@@ -69,7 +69,8 @@ def _gaps(surfaces: Surfaces, rays: SurfaceRays, sensors: Floats) -> _Gaps:
     """Return the pairs of walls that lie and face about alike and are not far apart."""
     normal, way = surfaces.normal, surfaces.tangent
     ended = se2.transform_each(sensors, rays.keyframe, rays.points)
-    first, last = extent(rays.surface, dots(ended - surfaces.place[rays.surface], way[rays.surface]), len(normal))
+    along = dots(ended - surfaces.place.take(rays.surface, axis=0), way.take(rays.surface, axis=0))
+    first, last = extent(rays.surface, along, len(normal))
     walls = np.flatnonzero(~surfaces.round & (last > first))
     found = [_Gaps(walls[:0], walls[:0], np.zeros(0), np.zeros(0))]
     for k, one in enumerate(walls.tolist()):

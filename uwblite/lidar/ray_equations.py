@@ -44,8 +44,8 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     """
     at, direction = in_map(rays, sensors)
     at -= surfaces.offset[rays.surface, None] * direction
-    away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]
-    normal, shift = surfaces.normal[rays.surface], np.zeros(len(away))
+    away, curved = at - surfaces.place.take(rays.surface, axis=0), surfaces.round[rays.surface]
+    normal, shift = surfaces.normal.take(rays.surface, axis=0), np.zeros(len(away))
     round_ones = np.flatnonzero(curved)
     if len(round_ones):
         radius = surfaces.radius[rays.surface[round_ones]]
@@ -54,7 +54,7 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     incidence = np.where(np.abs(incidence) > _LEAST, incidence, -_LEAST)
     residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
     ahead = -(residual / incidence)[:, None] * direction
-    arm, away = at + ahead - poses[rays.keyframe, :2], away + ahead
+    arm, away = at + ahead - poses[:, :2].take(rays.keyframe, axis=0), away + ahead
     root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
     by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
     turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]

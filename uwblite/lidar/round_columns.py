@@ -55,12 +55,12 @@ def fitted_circles(rays: ScanPoints) -> Circles:
         return np.asarray(np.bincount(number, values, many) / count)
 
     middle = np.stack([mean(rays.points[:, 0]), mean(rays.points[:, 1])], axis=1)
-    x, y = (rays.points - middle[number]).T
+    x, y = (rays.points - middle.take(number, axis=0)).T
     square = x * x + y * y
     xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
     centre = 0.5 * _solved(xx, xy, yy, mean(x * square), mean(y * square))
     radius = np.sqrt(xx + yy + (centre**2).sum(axis=1))
-    off = np.sqrt(mean((np.hypot(x - centre[number, 0], y - centre[number, 1]) - radius[number]) ** 2))
+    off = np.sqrt(mean((np.hypot(x - centre[:, 0].take(number), y - centre[:, 1].take(number)) - radius.take(number)) ** 2))
     flat = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy))
     sigma = mean(range_sigma(reach))
     origin = np.stack([mean(rays.origins[:, 0]), mean(rays.origins[:, 1])], axis=1) - middle
@@ -158,7 +158,7 @@ class Surroundings:
         rows = self.inside(at)
         if not len(rows):
             return rows, rows, np.zeros(0)
-        away, which = cKDTree(self.columns[:, :2]).query(at[rows])
+        away, which = cKDTree(self.columns[:, :2]).query(at.take(rows, axis=0))
         return rows, which, away
 
 
@@ -205,12 +205,14 @@ def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Float
     own = cKDTree(columns[:, :2]).query(at)[1]
     weight = 1.0 / sigma**2
     for turn in range(_ROUNDS):
-        shift, normal, incidence = to_circle(at - columns[own, :2], direction, columns[own, 2])
+        centre, radius = columns[:, :2].take(own, axis=0), columns[:, 2].take(own)
+        shift, normal, incidence = to_circle(at - centre, direction, radius)
         gate = _WIDE if turn < _WIDE_ROUNDS else _GATE * sigma + _SLACK
         near = (incidence < _FACING) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
         rows = np.flatnonzero(robust)
-        whole, right = _summed(own[rows], robust[rows], normal[rows], (-shift * incidence)[rows], len(columns))
+        some = (v.take(rows, axis=0) for v in (own, robust, normal, -shift * incidence))
+        whole, right = _summed(*some, len(columns))
         columns = columns + np.linalg.solve(whole + np.eye(3), right[:, :, None])[:, :, 0]
         columns[:, 2] = np.clip(columns[:, 2], *_RADII)
     ended = (incidence < _FACING) & (np.abs(shift) < _AROUND)

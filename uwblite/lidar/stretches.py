@@ -122,12 +122,12 @@ def _fitted(number: Ints, points: Floats, normals: Floats, variance: Floats) -> 
     count = np.bincount(number, minlength=many)
     centre, direction, across = principal_axes(number, points, many)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    facing = np.bincount(number, dots(normals, normal[number]), many)
+    facing = np.bincount(number, dots(normals, normal.take(number, axis=0)), many)
     normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
-    tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
-    along = dots(points - centre[number], tangent[number])
+    off, own = points - centre.take(number, axis=0), normal.take(number, axis=0)
+    along = off[:, 0] * own[:, 1] - off[:, 1] * own[:, 0]
     first, last = extent(number, along, many)
-    unlike = 1.0 - dots(normals, normal[number]) ** 2 - variance
+    unlike = 1.0 - dots(normals, own) ** 2 - variance
     straight = (count >= _FEWEST) & (last - first >= _SHORTEST) & (across < _STRAIGHT)
     found = Stretches(number, along, centre, normal, first, last, straight)
     inner = found.inside(number, along)
@@ -143,7 +143,7 @@ def principal_axes(number: Ints, points: Floats, many: int) -> tuple[Floats, Flo
         return np.asarray(np.bincount(number, values, many) / count)
 
     centre = np.stack([mean(points[:, 0]), mean(points[:, 1])], axis=1)
-    x, y = (points - centre[number]).T
+    x, y = (points - centre.take(number, axis=0)).T
     a, b, c = mean(x * x), mean(x * y), mean(y * y)
     angle = 0.5 * np.arctan2(2.0 * b, a - c)
     across = np.sqrt(np.maximum(0.5 * (a + c - np.hypot(a - c, 2.0 * b)), 0.0))

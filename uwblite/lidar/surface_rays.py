@@ -183,7 +183,7 @@ def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: S
 
 def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     """Return which rays (m,) end on these stretches (m,), tested where ray and line intersect, without noise along the ray."""
-    normal, off = found.normal[stretch], rays.points - found.centre[stretch]
+    normal, off = found.normal.take(stretch, axis=0), rays.points - found.centre.take(stretch, axis=0)
     residual, incidence = dots(off, normal), -dots(rays.directions, normal)
     oblique = np.maximum(incidence, INCIDENCE)
     end = off + (residual / oblique)[:, None] * rays.directions
@@ -198,7 +198,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
         return rays.rows(np.zeros(0, dtype=np.int64))
     at, direction = in_map(rays, poses)
     nearest = cKDTree(columns[:, :2]).query(at)[1]
-    shift, _, incidence = to_circle(at - columns[nearest, :2], direction, columns[nearest, 2])
+    shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
     good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE * rays.sigma + _SLACK)
     return replace(rays, surface=nearest + first).rows(good).bundled()
 
