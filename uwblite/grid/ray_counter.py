@@ -104,7 +104,8 @@ class RayCounter:
         places = zip(marks.reshape(-1, height, width), (low - first).tolist(), size.tolist(), strict=True)
         for marked, (row, col), (tall, wide) in places:
             total[row : row + tall, col : col + wide] += marked[:tall, :wide]
-        self._add_window(total, *first.tolist(), WEIGHT_UNIT if walls is None else self._weak)
+        row, col = first.tolist()
+        self._add_window(total, row, col, WEIGHT_UNIT if walls is None else self._weak)
 
     def _add_window(self, total: NDArray[np.uint16], row: int, col: int, weight: int) -> None:
         """Add hits and misses in a window whose first cell is (row, col); cells outside the grid are dropped."""

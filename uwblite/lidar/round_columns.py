@@ -211,8 +211,8 @@ def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Float
         near = (incidence < _FACING) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
         rows = np.flatnonzero(robust)
-        some = (v.take(rows, axis=0) for v in (own, robust, normal, -shift * incidence))
-        whole, right = _summed(*some, len(columns))
+        residual = (-shift * incidence).take(rows)
+        whole, right = _summed(own.take(rows), robust.take(rows), normal.take(rows, axis=0), residual, len(columns))
         columns = columns + np.linalg.solve(whole + np.eye(3), right[:, :, None])[:, :, 0]
         columns[:, 2] = np.clip(columns[:, 2], *_RADII)
     ended = (incidence < _FACING) & (np.abs(shift) < _AROUND)

@@ -108,7 +108,8 @@ def _together(at: Floats, normal: Floats) -> Ints:
             apart = np.flatnonzero(first.take(one) != first.take(other))
             one, other = one[apart], other[apart]
             links.append(np.stack([one, other])[:, _on_one_line(one, other, *columns)])
-        own = connected(*np.concatenate(links, axis=1), len(at))
+        one, other = np.concatenate(links, axis=1)
+        own = connected(one, other, len(at))
         first = np.unique(own, return_index=True)[1][own]
     return first
 
