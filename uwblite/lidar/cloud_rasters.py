@@ -114,6 +114,10 @@ def _claim_cells(
     stride = -(-shape[owner, 1] // _RUN) * _RUN
     cx, cy = ((x - low[owner, 0]) / cell).astype(np.int64), ((y - low[owner, 1]) / cell).astype(np.int64)
     base = cx * stride + cy + start[owner - some.start]
+    # Of points in one cell, the last one counts in every cell.
+    cells[base] = rows
+    last = cells[base] == rows
+    base, stride, rows = base[last], stride[last], rows[last]
     for dx, dy in offsets:
         cells[base + (dx * stride + dy)] = rows
 

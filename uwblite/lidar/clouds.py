@@ -19,6 +19,8 @@ from ..odometry.attached import ScanPoints
 from . import beam_gaps
 from .point_cloud import Lines, estimate_normals, make_tree
 
+_TURN = 8.0
+"""rad; more than all bearings differ by."""
 _BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
 
@@ -73,13 +75,14 @@ class Clouds:
 
     def chosen(self, which: Ints) -> "Clouds":
         """Return some clouds (s,), in this order."""
-        counts = self.counts[which]
-        first = np.cumsum(counts) - counts
-        rows = np.repeat(self.offsets[which] - first, counts) + np.arange(int(counts.sum()))
-        owner = np.repeat(np.arange(len(which), dtype=np.int32), counts)
-        offsets = np.append(first, counts.sum()).astype(np.int64)
-        points, normals = (np.asfortranarray(column[rows]) for column in (self.points, self.normals))
-        return Clouds(offsets, points, normals, owner, self.normal_variance[rows])
+        runs = np.split(which, np.flatnonzero(np.diff(which) != 1) + 1) if len(which) else []
+        return joined([self._run(int(run[0]), int(run[-1]) + 1) for run in runs], self.points.dtype.type)
+
+    def _run(self, first: int, end: int) -> "Clouds":
+        """Return the clouds from one to another, without copying their points."""
+        rows = slice(self.offsets[first], self.offsets[end])
+        offsets, owner = self.offsets[first : end + 1] - self.offsets[first], self.owner[rows] - first
+        return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
 
     def only(self, kept: Bools) -> "Clouds":
         """Return the clouds with some of their points (p,) alone."""
@@ -97,8 +100,8 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     keyframes : k, number of keyframes.
     """
     owner, points, origins = _average_cells(beam_gaps.filled(rays), config.voxel)
-    bearing = se2.bearing(points)
-    order = np.lexsort((bearing, owner))
+    # Points come by owner: to sort one number in runs takes a tenth of the time of two keys.
+    order = np.argsort(_TURN * owner + se2.bearing(points), kind="stable")
     owner, points, origins = owner[order], points[order], origins[order]
     lines, normals = _lines(owner, points, origins, config)
     straight = lines.linearity >= config.linearity
@@ -165,10 +168,10 @@ def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]
 
 def cell_number(owner: Ints, points: Floats, size: float) -> Ints:
     """Return a number (p,) that points (p, 2) have in common which have one owner (p,) and lie in one square."""
-    cell = np.floor(points / size).astype(np.int64)
-    cell -= cell.min(axis=0, initial=0)
-    wide, high = cell.max(axis=0, initial=0) + 1
-    return (owner * wide + cell[:, 0]) * high + cell[:, 1]
+    x, y = np.floor(np.ascontiguousarray(points.T) / size).astype(np.int64)
+    x -= x.min(initial=0)
+    y -= y.min(initial=0)
+    return np.asarray((owner * (x.max(initial=0) + 1) + x) * (y.max(initial=0) + 1) + y)
 
 
 def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
@@ -183,7 +186,7 @@ def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
     if not len(first):
         return first, values
     count = np.diff(np.append(first, len(key)))[:, None]
-    return order[first], np.add.reduceat(values[order], first, axis=0) / count
+    return order[first], np.add.reduceat(values.take(order, axis=0), first, axis=0) / count
 
 
 def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:

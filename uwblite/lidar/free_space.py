@@ -53,13 +53,14 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
     through (m,), in_view (m,) : the latter within the seen free space or up to margin behind it.
     """
     back, parts = se2.inverse(free.poses)[:, :, None], free.ranges.shape[1]
-    (c, s), (px, py) = se2.cos_sin(back[:, 2]), points.T
+    (c, s), (px, py) = se2.cos_sin(back[:, 2]), np.ascontiguousarray(points.T)
     x, y = c * px - s * py + back[:, 0], s * px + c * py + back[:, 1]
     distance = np.sqrt(x * x + y * y)
-    bins = ((np.arctan2(y, x) + np.pi) / (2.0 * np.pi / parts)).astype(np.int64) % parts
+    bins = ((np.arctan2(y, x) + np.pi) * (parts / (2.0 * np.pi))).astype(np.int64)
+    bins *= bins < parts  # Straight behind is one direction; a remainder takes longer.
     until = free.ranges.take(bins + parts * np.arange(len(free.poses))[:, None])
     reach = until > 0.0
-    return (reach & (distance < until - margin)).sum(axis=0), (reach & (distance < until + margin)).sum(axis=0)
+    return (distance < until - margin).sum(axis=0), (reach & (distance < until + margin)).sum(axis=0)
 
 
 def contradiction(free: FreeSpace, points: Floats, margin: float) -> tuple[float, float]:

@@ -125,11 +125,8 @@ def _seen_cells(
     for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         key = (cell[part, 0].astype(np.int64) * wide + cell[part, 1]) * 8 + facing[part]
-        order = np.lexsort((key, owner[part]))
-        row, key = owner[part][order], key[order]
-        fresh = np.ones(len(key), dtype=bool)
-        fresh[1:] = (row[1:] != row[:-1]) | (key[1:] != key[:-1])
-        yield row[fresh].astype(np.int64), key[fresh]
+        many = int(key.max(initial=0)) + 1
+        yield np.divmod(np.unique(owner[part].astype(np.int64) * many + key), many)
 
 
 def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
@@ -144,9 +141,11 @@ def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, c
     near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
     joined = (recording[near_i] == recording[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
-    i, j = _best_views(surface_cells(clouds, poses), path, recording, config)
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
+    pairs = near_i * k + near_j
+    if config.partners:
+        i, j = _best_views(surface_cells(clouds, poses), path, recording, config)
+        pairs = np.concatenate([np.minimum(i, j) * k + np.maximum(i, j), pairs])
+    pairs = np.unique(pairs)
     return pairs // k, pairs % k
 
 
@@ -154,19 +153,24 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
     """Return for every cloud i the clouds j from other times that share most with it, one of each epoch."""
     size = np.maximum(np.diff(seen.indptr), 1)
     epoch = (path / config.epoch).astype(np.int64)
+    visit = recording * (int(epoch.max(initial=0)) + 1) + epoch
+    visits = int(visit.max(initial=0)) + 1
     across, found = seen.T.tocsr(), []
     partners = min(config.partners, max(2, config.most // seen.shape[0]))
     for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
-        common = (seen[first : first + _CLOUDS_AT_ONCE] @ across).tocoo()
+        common = seen[first : first + _CLOUDS_AT_ONCE] @ across
+        common.sort_indices()
+        common = common.tocoo()
         i, j = common.row.astype(np.int64) + first, common.col.astype(np.int64)
         share = common.data / np.minimum(size[i], size[j])
         kept = np.flatnonzero((np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= 4))
         i, j, share = i[kept], j[kept], share[kept]
-        order = np.lexsort((j, -share, epoch[j], recording[j], i))
+        own = i * visits + visit[j]
+        # Numbers of which the whole part comes first, then the larger share, then the earlier cloud.
+        order = np.argsort(own - 0.5 * share, kind="stable")
+        order = order[np.diff(own[order], prepend=-1) != 0]
         i, j, share = i[order], j[order], share[order]
-        fresh = np.flatnonzero(np.diff(np.stack([i, epoch[j], recording[j]]), axis=1, prepend=-1).any(axis=0))
-        i, j, share = i[fresh], j[fresh], share[fresh]
-        order = np.lexsort((j, -share, i))
+        order = np.argsort(i - 0.5 * share, kind="stable")
         i, j = i[order], j[order]
         best = np.arange(len(i)) - np.searchsorted(i, i) < partners
         found.append((i[best], j[best]))

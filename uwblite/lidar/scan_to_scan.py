@@ -121,11 +121,12 @@ def follow(
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
-    learnt = reestimate_wheel_noise(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
-    miss = _miss(clouds, learnt)
+    certain = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
+    miss = _miss(clouds, reestimate_wheel_noise(wheels, certain, graph))
     pose, lost, searched = _searched(clouds, i, steps, steps.enough & ~good, config)
-    kept = steps.enough & ~lost
-    measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
+    further = steps.enough & ~lost & ~good
+    measured_steps = certain.followed_by(_edges(clouds, raster, i[further], pose[further], tight, config))
+    measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
     learnt = with_uncounted_ways(reestimate_wheel_noise(wheels, measured_steps, graph), measured_steps, graph)
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 

@@ -38,9 +38,9 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
     """Return how far (k, bearings), m, the nearest point of each cloud is in every direction; inf where there is none."""
     distance, bearing = np.hypot(clouds.points[:, 0], clouds.points[:, 1]), se2.bearing(clouds.points)
     bins = np.clip(((bearing + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.int64), 0, _BEARINGS - 1)
-    nearest = np.full((len(clouds), _BEARINGS), np.inf)
-    np.minimum.at(nearest, (clouds.owner, bins), distance)
-    return nearest
+    nearest = np.full(len(clouds) * _BEARINGS, np.inf)
+    np.minimum.at(nearest, clouds.owner.astype(np.int64) * _BEARINGS + bins, distance)
+    return nearest.reshape(-1, _BEARINGS)
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:

@@ -152,13 +152,13 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     row : (g,) candidate of each try. pose : (g, 3). share : (g,) that matches.
     """
     best, second = np.full(candidates, -1, dtype=np.int64), np.zeros(candidates)
-    for k in np.unique(row):
-        own = np.flatnonzero(row == k)
-        first = own[np.argmax(share[own])]
-        best[k] = first
-        apart = se2.between(pose[first], pose[own])
-        other = own[(np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)]
-        second[k] = share[other].max(initial=0.0) / max(share[first], 1e-9)
+    order = np.lexsort((-share, row))
+    tried, first = np.unique(row[order], return_index=True)
+    best[tried] = order[first]
+    apart = se2.between(pose[best[row]], pose)
+    other = (np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)
+    np.maximum.at(second, row[other], share[other])
+    second[tried] /= np.maximum(share[best[tried]], 1e-9)
     return best, second
 
 

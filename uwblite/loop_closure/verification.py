@@ -67,6 +67,7 @@ def _judge(
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
     distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
+    share, rms = result.share, result.rms
     most = config.consistency if candidates.constrained else np.inf
     verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
@@ -76,10 +77,10 @@ def _judge(
         elif fits.net[k] < config.net_overlap:
             text = f"only {fits.net[k]:.1f} m of surface speak for it in one direction (least {config.net_overlap:g} m)"
             verdict = "few-matches", text
-        elif result.share[k] < least and not wide[k]:
-            verdict = "few-matches", f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
-        elif result.rms[k] > config.sigma:
-            verdict = "far-matches", f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
+        elif share[k] < least and not wide[k]:
+            verdict = "few-matches", f"only {share[k]:.0%} of its points match (least {least:.0%})"
+        elif rms[k] > config.sigma:
+            verdict = "far-matches", f"matches lie {rms[k]:.3f} m apart (most {config.sigma:g} m)"
         elif fits.through[k] > config.through:
             text = f"{fits.through[k]:.0%} of its points would stand where free space was seen (most {config.through:.0%})"
             verdict = "free-space-violation", text
@@ -91,7 +92,7 @@ def _judge(
             text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
             verdict = "contradicts-graph", text
         else:
-            verdict = "accepted", f"{result.share[k]:.0%} of its points match within {result.rms[k]:.3f} m"
+            verdict = "accepted", f"{share[k]:.0%} of its points match within {rms[k]:.3f} m"
         verdicts.append(verdict)
     return verdicts
 
@@ -103,8 +104,9 @@ def _collect(
     """Return every candidate with its outcome, and the accepted ones as edges between the sub-maps' keyframes."""
     i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    share, rms = result.share, result.rms
     records = [
-        LoopClosure(int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason)
+        LoopClosure(int(i[k]), int(j[k]), z[k], information[k], float(rms[k]), float(share[k]), outcome, reason)
         for k, (outcome, reason) in enumerate(verdicts)
     ]
     return collected(records, sqrt_information)
