@@ -139,3 +139,20 @@ def test_a_pair_ends_where_it_ends_alone(world):
         row = slice(k, k + 1)
         alone = align_pairs(clouds, raster, I[row], guess[row], pair_points(clouds, J[row], 200), 0.5, 0.15)
         np.testing.assert_allclose(alone.pose[0], together.pose[k], atol=1e-9)
+
+
+def test_a_gate_shrinks_with_the_steps_of_its_pair(world, monkeypatch):
+    """One pair begins where it belongs and comes to the last gate at once, the others 0.25 m off and do not."""
+    clouds, raster, points, exact = world
+    guess = exact + np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.0], [0.0, 0.25, 0.0]])
+    gates = []
+
+    def noted(clouds, raster, i, pose, points, gate, scale):
+        gates.append(np.broadcast_to(gate, len(i)))
+        return match(clouds, raster, i, pose, points, gate, scale)
+
+    monkeypatch.setattr(pair_alignment, "match", noted)
+    found = align_pairs(clouds, raster, I, guess, points, 0.5, 0.12)
+    np.testing.assert_array_equal(gates[0], 0.5)
+    np.testing.assert_allclose(gates[1], [0.12, 0.4, 0.4])
+    np.testing.assert_allclose(se2.between(exact, found.pose), 0.0, atol=0.01)

@@ -105,6 +105,22 @@ def test_a_point_of_weight_two_counts_as_two_and_one_of_none_not_at_all():
     assert whole.asked[0] == len(rows)
 
 
+def test_each_pair_may_have_its_own_gate_and_kernel():
+    """More pairs than are looked up at once."""
+    rng = np.random.default_rng(4)
+    truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
+    clouds = scanned(truth, ROOM, 0.01, 3)
+    raster, i, j = rasterize(clouds, 0.05, 0.4), rng.integers(0, 3, 200), rng.integers(0, 3, 200)
+    pose, points = se2.between(truth[i], truth[j]) + 0.02, pair_points(clouds, j, 120)
+    gate, scale = rng.choice([0.05, 0.1, 0.3], 200), rng.choice([0.02, 0.1], 200)
+    together = match(clouds, raster, i, pose, points, gate, scale)
+    for one, width in ((0.05, 0.02), (0.1, 0.1), (0.3, 0.02)):
+        own = np.flatnonzero((gate == one) & (scale == width))
+        alone = match(clouds, raster, i[own], pose[own], PairPoints(points.row[own]), one, width)
+        for name in ("hessian", "spurious", "gradient", "matched", "squared", "weight"):
+            np.testing.assert_allclose(getattr(together, name)[own], getattr(alone, name), rtol=1e-12, atol=1e-12)
+
+
 def converged(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):
     """Return the poses after rounds of matching and stepping, and the last factors and measurement."""
     points, pose = pair_points(clouds, j, 200), guess.copy()

@@ -12,6 +12,8 @@ from .scan_matching import PairFactors, PairPoints, match, nondegenerate_step
 
 _FARTHEST, _WIDEST = 0.3, 0.15
 """Longest step of one iteration, m and rad."""
+_GATE_PER_STEP = 10.0
+"""Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
 _CONVERGED = 1e-4
 """Steps below this end the descent, m or rad."""
 
@@ -40,7 +42,7 @@ def align_pairs(
     clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, points: PairPoints, first_gate: float, last_gate: float,
     iterations: int = 20,
 ) -> Aligned:
-    """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
+    """Align many pairs of clouds at once, each on its own: point-to-line ICP with a gate that shrinks with its steps.
 
     A pair that no longer moves at the last gate is finished.
 
@@ -49,16 +51,17 @@ def align_pairs(
     i : (e,) target clouds. guess : (e, 3) start poses of the source clouds.
     points : of the source clouds, see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
     """
-    pose, gate, moving = guess.copy(), first_gate, np.arange(len(guess))
+    pose, gate, moving = guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
     for _ in range(iterations):
         some = PairPoints(points.row[moving])
         step = nondegenerate_step(match(clouds, raster, i[moving], pose[moving], some, gate, gate / 2.0))[0]
+        length = np.abs(step).max(axis=1)
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
         pose[moving] += step / np.maximum(reach, 1.0)[:, None]
-        if gate <= last_gate:
-            moving = moving[np.abs(step).max(axis=1) >= _CONVERGED]
-            if not len(moving):
-                break
-        gate = max(0.8 * gate, last_gate)
+        left = (length >= _CONVERGED) | (gate > last_gate)
+        if not left.any():
+            break
+        gate = np.maximum(np.minimum(0.8 * gate, _GATE_PER_STEP * length), last_gate)[left]
+        moving = moving[left]
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     return Aligned(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))

@@ -75,8 +75,8 @@ def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
 
 
 def match(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float,
-    weight: Floats | None = None,
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float | Floats,
+    scale: float | Floats, weight: Floats | None = None,
 ) -> PairFactors:
     """Match the listed points of each pair's source cloud to lines of its target cloud i.
 
@@ -84,8 +84,8 @@ def match(
     ----------
     i : (e,) target clouds. T_i_j : (e, 3) present relative poses.
     points : what to look up, see pair_points.
-    gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m.
-    scale : width of the Geman-McClure kernel on the point-to-line distance, m.
+    gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m; of all pairs or each (e,).
+    scale : width of the Geman-McClure kernel on the point-to-line distance, m; of all pairs or each (e,).
     weight : (p,) of the clouds' points as source points; None = 1 each.
 
     Returns
@@ -94,7 +94,8 @@ def match(
     """
     root = None if weight is None else np.sqrt(weight)
     found = correspondences(clouds, raster, i, T_i_j, points, gate)
-    return concatenated([_condensed(clouds, some, scale, root) for some in found])
+    scale = np.broadcast_to(scale, len(i))
+    return concatenated([_condensed(clouds, some, scale[some.pairs, None], root) for some in found])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +104,7 @@ class Correspondences:
 
     pairs: slice
     """Which of the pairs these are."""
-    row: NDArray[np.int32]
+    row: Ints
     """Rows of the points in the clouds' arrays; -1 where there is none."""
     target: Ints
     """Rows of their matches; arbitrary where there is none."""
@@ -118,24 +119,26 @@ class Correspondences:
 
 
 def correspondences(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float | Floats
 ) -> Iterator[Correspondences]:
     """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
     # Each coordinate of points and normals in one piece.
     surface = [np.ascontiguousarray(column) for column in (*clouds.points.T, *clouds.normals.T)]
     at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
+    square = np.broadcast_to(np.square(gate), len(i))[:, None]
     for first in range(0, max(len(i), 1), at_once):
         part = slice(first, first + at_once)
-        yield _looked_up(clouds, surface, raster, part, i[part], T_i_j[part], points.row[part], gate)
+        yield _looked_up(clouds, surface, raster, part, i[part], T_i_j[part], points.row[part], square[part])
 
 
 def _looked_up(
     clouds: Clouds, surface: Sequence[Floats], raster: CloudRasters, pairs: slice, i: Ints, T_i_j: Floats,
-    row: NDArray[np.int32], gate: float,
+    row: NDArray[np.int32], square: Floats,
 ) -> Correspondences:
-    """Look up the points of some pairs (e,): per-pair values are columns (e, 1)."""
+    """Look up the points of some pairs (e,), whose squared gates are columns (e, 1) as other per-pair values are."""
+    rows = row.astype(np.int64)  # Once, and not at every use.
     c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
-    px, py, sx, sy = (column.take(row) for column in surface)
+    px, py, sx, sy = (column.take(rows) for column in surface)
     rx, ry = c * px - s * py, s * px + c * py
     x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
     found = look_up(raster, i, x, y)
@@ -145,11 +148,13 @@ def _looked_up(
     qx, qy, nx, ny = (column.take(target) for column in surface)
     dx, dy = x - qx, y - qy
     facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
-    good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
-    return Correspondences(pairs, row, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
+    good = near & (dx * dx + dy * dy <= square) & (facing > _SAME_FACING) & (rows >= 0)
+    return Correspondences(pairs, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
-def _condensed(clouds: Clouds, found: Correspondences, scale: float, root_weight: Floats | None = None) -> PairFactors:
+def _condensed(
+    clouds: Clouds, found: Correspondences, scale: float | Floats, root_weight: Floats | None = None
+) -> PairFactors:
     """Condense the matches of each pair into the quadratic form of its relative pose; roots of weights are of points (p,)."""
     row, good, r, (nx, ny), (rx, ry) = found.row, found.good, found.distance, found.normal, found.arm
     root = good / (1.0 + np.square(r * (1.0 / scale)))
