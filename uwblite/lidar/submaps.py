@@ -85,7 +85,16 @@ def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: 
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. recording : (k,).
     """
     first, last = cut(path, recording, config.epsilon)
-    return of_pieces(clouds, poses, first, last, (first + last - 1) // 2, config)
+    return of_pieces(clouds, poses, first, last, _middle(first, last), config)
+
+
+def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
+    """Return the reference keyframes (s,) of the sub-maps that are built of such pieces."""
+    return _middle(*cut(path, recording, epsilon))
+
+
+def _middle(first: Ints, last: Ints) -> Ints:
+    return (first + last - 1) // 2
 
 
 def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:

@@ -42,7 +42,12 @@ def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
 def any_uncertain(
     graph: Graph, covariance: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig
 ) -> bool:
-    """Return whether any stretches are too uncertain for a search of sub-maps; see uncertain_pairs, which lists them."""
+    """Return whether any stretches are too uncertain for a search of sub-maps; see uncertain_pairs, which lists them.
+
+    Parameters
+    ----------
+    reference : (s,) keyframes in the middle of stretches or of sub-maps.
+    """
     return uncertain(graph, covariance, reference, recording, _wide(config, FARTHEST), config.search_limit)
 
 

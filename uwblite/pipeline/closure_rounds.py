@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.joint_covariance import JointCovariance
 from ..graph.pose_edges import OdometryEdges
@@ -17,6 +18,7 @@ from ..loop_closure import closures, long_stretches, loose_links, paper_method, 
 from ..loop_closure.candidates import Candidates
 from ..loop_closure.closures import Closures, LoopClosureConfig
 from .estimate import Estimate, Task
+from .mapping_config import MappingConfig
 from .progress import Stage, solver_figures
 
 
@@ -25,26 +27,33 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     config, recordings, scans = task.config, task.recordings, estimate.lidar
     base = estimate.graph.with_edges(*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     base, found, estimate = _with_loose_links_tied(base, estimate, task)
-    base, found, stretches = _with_long_stretches_tied(base, found, estimate, task)
+    reference = submaps.references(recordings.path, recordings.of_keyframe, config.submaps.epsilon)
+    first, stretches = JointCovariance(base.with_edges(found.edges), reference), None
+    covariance: JointCovariance | None = first
+    if long_stretches.any_uncertain(base, first, reference[::_PER_STRETCH], recordings.of_keyframe, config.loop_closure):
+        base, found, stretches = _with_long_stretches_tied(base, found, estimate, task)
+        covariance = None
+    del first
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     with_ranges = estimate.ranges is not None
-    pieces, built = None, base.poses
+    refined = config.refinement.rounds > 0 and not estimate.rests_on_ranges
+    pieces, built, dynamic = None, base.poses, 0.0
     for lap in range(config.loop_closure.rounds):
         if pieces is None or pieces.bent(built, base.poses) > _BENT:
             pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
             (pieces, free), built = _static(pieces, base, estimate), base.poses
-        # No variable refers to the covariance, so that it is freed: for a thousand sub-maps it takes a hundred megabytes.
+            dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
+        covariance = covariance or JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = closure_candidates.propose(
-            base, JointCovariance(base.with_edges(found.edges), pieces.reference), pieces, recordings.of_keyframe,
-            tried, missed, with_ranges, config.loop_closure,
-        )  # fmt: skip
+            base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loop_closure
+        )
+        covariance = None  # For a thousand sub-maps it takes a hundred megabytes.
         tried |= candidates.names(config.loop_closure)
-        dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
         rules = replace(config.loop_closure, through=max(config.loop_closure.through, dynamic))
         new = _verified(candidates, pieces, free, rules, task, task.stages.reporter("loop closure"))
         missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loop_closure)
-        found = closures.merged(found, new)
+        found, before = closures.merged(found, new), base.poses
         if len(new.edges):
             base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
         task.stages.end(
@@ -52,6 +61,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
             accepted=len(new.edges), kept=len(found.edges),
         )  # fmt: skip
         tied = len(found.edges) >= config.loop_closure.enough * len(pieces)
+        tied = tied or (refined and _settled(candidates, before, base, config))
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
@@ -60,6 +70,20 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, closures=found).with_estimates_of(base)
 
 
+def _settled(candidates: Candidates, before: Floats, graph: Graph, config: MappingConfig) -> bool:
+    """Return whether the joint refinement matches from the poses of a graph whatever further closures would connect.
+
+    Parameters
+    ----------
+    before : (k, 3) poses without the closures of these candidates.
+    """
+    moved = np.hypot(*(graph.poses - before)[:, :2].T)
+    certain = candidates.spread <= config.loop_closure.direct
+    return bool(certain.all()) and float(moved.max(initial=0.0)) < config.refinement.first_gate
+
+
+_PER_STRETCH = 3
+"""Sub-maps in half a stretch."""
 _BENT = 0.01
 """How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
 
@@ -76,8 +100,6 @@ def _with_long_stretches_tied(
     recordings, scans, rules = task.recordings, estimate.lidar, task.config.loop_closure
     first, last, reference = long_stretches.cut(recordings.path, recordings.of_keyframe)
     covariance = JointCovariance(base.with_edges(found.edges), reference)
-    if not long_stretches.any_uncertain(base, covariance, reference, recordings.of_keyframe, rules):
-        return base, found, None
     pieces = submaps.of_pieces(scans.clouds, base.poses, first, last, reference, task.config.submaps)
     pieces, free = _static(pieces, base, estimate)
     tried: set[tuple[int, int, bool]] = set()
