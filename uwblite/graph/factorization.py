@@ -35,8 +35,8 @@ MOST_WORK = 4e9
 any poses and any others, however few, fill the whole matrix."""
 
 
-_LONG, _PANEL = 20_000, 8
-"""Rows from which on SuperLU updates so many columns together; one at a time below."""
+_LARGE, _PANEL = 400_000, 8
+"""Entries from which on SuperLU updates so many columns together; one at a time below."""
 
 
 class Factor(Protocol):
@@ -117,7 +117,7 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
     """Factorise without pivoting; panels of few columns suit factors as sparse as these (half the time of the default)."""
-    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.shape[0] < _LONG else _PANEL
+    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.nnz < _LARGE else _PANEL
     try:
         return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=panel, options=options)
     except RuntimeError as problem:
