@@ -127,6 +127,16 @@ def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path()
     assert not find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap.ambiguous.any()
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_an_anchor_that_later_moved_to_its_second_place_is_ambiguous_with_its_first(side):
+    places = (Hypothesis(ANCHOR), Hypothesis(ANCHOR * (1.0, -1.0)))
+    before = estimate(0.0, ANCHOR * (1.0, side))
+    unsure = replace(before.bootstrap, ambiguous=np.array([True]), hypotheses=(places,))
+    done = find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap
+    assert done.ambiguous.all()
+    np.testing.assert_allclose(done.hypotheses[0][1].position, ANCHOR * (1.0, -side), atol=0.3)
+
+
 @pytest.mark.parametrize("fixed", [False, True])
 def test_an_anchor_that_is_fixed_keeps_what_was_said_of_it(fixed):
     """Along a straight line, where one that is free is ambiguous."""

@@ -107,7 +107,8 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
         own = tags[ranges.alive & (ranges.anchor == k)]
         found = estimate.bootstrap.hypotheses[k]
         if estimate.bootstrap.ambiguous[k] and len(found) > 1:
-            anchors[k] = found[1].position
+            # Later measurements may have moved the anchor from the first of the two places to the second.
+            anchors[k] = max((each.position for each in found[:2]), key=lambda place: float(np.hypot(*(place - anchors[k]))))
         elif len(own) > 2:
             across = np.linalg.eigh(np.cov(own.T))[1][:, 0]
             anchors[k] -= 2.0 * across * float(across @ (anchors[k] - own.mean(axis=0)))
