@@ -82,7 +82,7 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     wheels, graph = replace(exact, motion=wrong), Graph(frames.odometry)
     some = np.sort(rng.permutation(len(exact))[: len(exact) // 2])
     steps_measured = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
-    steps = RelativePoseEdges(some, some + 1, steps_measured, np.tile(np.eye(3), (len(some), 1, 1)))
+    steps = RelativePoseEdges(some, some + 1, steps_measured, np.tile(1e4 * np.eye(3), (len(some), 1, 1)))
     learnt = reestimate_wheel_noise(wheels, steps, graph)
     factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
     # Medians of 500 steps are known to 5 %; a tenth of outliers moves them by 12 %.
@@ -106,6 +106,21 @@ def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     learnt = reestimate_wheel_noise(wheels, RelativePoseEdges(exact.i, exact.j, steps_measured, blind), Graph(frames.odometry))
     factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
     assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
+
+
+@pytest.mark.parametrize(("times", "factor"), [(2.0, 4.0), (20.0, 1.0)])
+def test_steps_measured_much_worse_than_by_the_wheels_teach_nothing_about_these(times, factor):
+    """Steps along a wall that ends out of sight differ from the wheels by their own errors."""
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    wheels = wheel_edges(frames, NOISE, Calibration())
+    off = rng.standard_normal((len(wheels), 3)) * 4.0 / np.einsum("eii->ei", wheels.sqrt_information) * [1.0, 0.0, 0.0]
+    root = wheels.end_sqrt_information / times
+    steps = RelativePoseEdges(wheels.i, wheels.j, se2.compose(wheels.motion, off), root)
+    learnt = reestimate_wheel_noise(wheels, steps, Graph(frames.odometry))
+    along = wheels.sqrt_information[0, 0, 0] / learnt.sqrt_information[0, 0, 0]
+    assert along == pytest.approx(factor, rel=0.2)
 
 
 def test_wheels_that_count_nothing_do_not_hold_a_measured_step():

@@ -78,8 +78,8 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count;
-        where fewer than 20 steps see one, its noise stays.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see, or that it measures
+        much worse than the wheels do, do not count; where fewer than 20 steps see one, its noise stays.
     """
     if len(steps) < _ENOUGH_STEPS:
         return wheels
@@ -87,8 +87,10 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
     off = np.abs(np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off))
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
-    onto = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ information
-    seen = np.einsum("eii->ei", onto) > 0.9
+    covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
+    in_wheels = wheels.end_sqrt_information[own]
+    seen &= np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels) < _MUCH_WORSE**2
     factor = np.ones(3)
     for k in np.flatnonzero(seen.sum(axis=0) >= _ENOUGH_STEPS):
         factor[k] = np.clip(spread(off[seen[:, k], k]), 0.3, 10.0)
@@ -97,6 +99,9 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
 
 _ENOUGH_STEPS = 20
 """Least number of measured steps from which the noise of the wheels is learnt."""
+_MUCH_WORSE = 3.0
+"""Ratio of a measured step's standard deviation to the wheels' from which on their difference shows the step's errors: at a wall
+that ends beyond the lidar's reach, or at a few trees, steps are off by decimetres along it."""
 
 
 def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
