@@ -100,8 +100,8 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
 _ENOUGH_STEPS = 20
 """Least number of measured steps from which the noise of the wheels is learnt."""
 _MUCH_WORSE = 3.0
-"""Ratio of a measured step's standard deviation to the wheels' from which on their difference shows the step's errors: at a wall
-that ends beyond the lidar's reach, or at a few trees, steps are off by decimetres along it."""
+"""Ratio of a measured step's standard deviation to the wheels' from which on their difference shows the step's errors: along a
+wall that ends beyond the lidar's reach, or past a few trees, steps are off by decimetres."""
 
 
 def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
