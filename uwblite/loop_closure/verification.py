@@ -137,7 +137,7 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     """Solve the graph with closures under a kernel that tightens; drop those that disagree."""
     if not len(closures.edges):
         return graph, closures
-    quick = replace(solver, relative_decrease=1e-5)
+    quick = replace(solver, relative_decrease=1e-4)
     solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], (30.0, 10.0, 4.0), quick)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)

@@ -235,7 +235,8 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None or estimate.joint is None:
         return estimate
-    before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
+    before, optimizer = estimate.graph.poses, Optimizer()
+    quick = replace(rough(task.config.solver), relative_decrease=_TO_COME)
     estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
         # The analysis of other pairs of clouds cannot be used again, and it is large.
@@ -258,6 +259,8 @@ def _without_pattern(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, ranges=without_pattern(estimate.ranges, graph, marginals(graph)))
 
 
+_TO_COME = 1e-3
+"""Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
 _STILL = 0.001
 """Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
 
