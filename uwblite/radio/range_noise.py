@@ -127,7 +127,7 @@ def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats
     return product / np.maximum(pairs, 1.0), 0.5 * pairs
 
 
-_MOST_PAIRED = 700
+_MOST_PAIRED = 1000
 """Most ranges of an anchor whose pairs are counted; more do not change the correlation, and the cost grows with the square."""
 
 
