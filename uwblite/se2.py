@@ -35,16 +35,17 @@ def wrap_angle(angle: ArrayLike) -> Floats:
 def cos_sin(angle: ArrayLike) -> tuple[Floats, Floats]:
     """Return cosine and sine of angles (...), rad.
 
-    Of a contiguous copy: numpy 1.24 rounds either way on strided input, depending on its address in memory.
+    Of a contiguous copy: numpy 1.24 rounds either way on strided input, depending on its address in memory. A single value
+    counts as contiguous with any stride; so it is always copied.
     """
-    angle = np.asarray(angle, dtype=np.float64, order="C")
+    angle = np.array(angle, dtype=np.float64, order="C")
     return np.cos(angle), np.sin(angle)
 
 
 def bearing(vectors: ArrayLike) -> Floats:
     """Return the direction (...) of vectors (..., 2), rad in (-pi, pi]; of contiguous copies, see cos_sin."""
     vectors = np.asarray(vectors, dtype=np.float64)
-    return np.arctan2(np.ascontiguousarray(vectors[..., 1]), np.ascontiguousarray(vectors[..., 0]))
+    return np.arctan2(np.array(vectors[..., 1], order="C"), np.array(vectors[..., 0], order="C"))
 
 
 def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
@@ -122,7 +123,7 @@ def between(a: ArrayLike, b: ArrayLike) -> Floats:
 
 def _sine_terms(theta: Floats) -> tuple[Floats, Floats]:
     """Return sin(t)/t and (1 - cos t)/t."""
-    theta = np.asarray(theta, order="C")
+    theta = np.array(theta, order="C")
     small = np.abs(theta) < _SERIES_BELOW
     t = np.where(small, 1.0, theta)
     t2 = theta * theta
