@@ -251,4 +251,5 @@ def test_a_single_value_of_a_pose_is_copied_before_its_cosine_is_taken(monkeypat
     monkeypatch.setattr(np, "cos", lambda angle: seen.append(angle) or cosine(angle))
     pose = np.array([[1.0, 2.0, 3.0]])
     se2.cos_sin(pose[:, 2])
-    assert seen[0].strides == (8,) and not np.shares_memory(seen[0], pose)
+    assert seen[0].strides == (8,)
+    assert not np.shares_memory(seen[0], pose)

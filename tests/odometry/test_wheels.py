@@ -123,6 +123,21 @@ def test_steps_measured_much_worse_than_by_the_wheels_teach_nothing_about_these(
     assert along == pytest.approx(factor, rel=0.2)
 
 
+def test_steps_that_differ_more_the_worse_they_are_measured_count_where_they_are_good():
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    wheels = wheel_edges(frames, NOISE, Calibration())
+    good = np.arange(len(wheels)) % 3 == 0
+    times = np.where(good, 4.0, 40.0)[:, None]
+    off = rng.standard_normal((len(wheels), 3)) * times / np.einsum("eii->ei", wheels.sqrt_information) * [1.0, 0.0, 0.0]
+    root = wheels.end_sqrt_information / np.where(good, 2.0, 10.0)[:, None, None]
+    steps = RelativePoseEdges(wheels.i, wheels.j, se2.compose(wheels.motion, off), root)
+    learnt = reestimate_wheel_noise(wheels, steps, Graph(frames.odometry))
+    along = wheels.sqrt_information[0, 0, 0] / learnt.sqrt_information[0, 0, 0]
+    assert along == pytest.approx(4.0, rel=0.2)
+
+
 def test_wheels_that_count_nothing_do_not_hold_a_measured_step():
     """Half a millimetre of a standing robot, from where descent starts, kept it there against 15 sigma of the clouds."""
     rng = np.random.default_rng(4)

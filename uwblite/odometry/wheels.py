@@ -78,8 +78,9 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see, or that it measures
-        much worse than the wheels do, do not count; where fewer than 20 steps see one, its noise stays.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count, nor
+        those that it measures much worse than the wheels do, where these differ by much more; where fewer than 20 steps
+        measure one better, its noise stays.
     """
     if len(steps) < _ENOUGH_STEPS:
         return wheels
@@ -90,18 +91,20 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
     seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
     in_wheels = wheels.end_sqrt_information[own]
-    seen &= np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels) < _MUCH_WORSE**2
-    factor = np.ones(3)
-    for k in np.flatnonzero(seen.sum(axis=0) >= _ENOUGH_STEPS):
-        factor[k] = np.clip(spread(off[seen[:, k], k]), 0.3, 10.0)
+    sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
+    well, factor = seen & (sigma < _MUCH_WORSE), np.ones(3)
+    for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH_STEPS):
+        by_all, by_best = (spread(off[some[:, k], k]) for some in (seen, well))
+        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, 0.3, 10.0)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
 
 _ENOUGH_STEPS = 20
 """Least number of measured steps from which the noise of the wheels is learnt."""
-_MUCH_WORSE = 3.0
-"""Ratio of a measured step's standard deviation to the wheels' from which on their difference shows the step's errors: along a
-wall that ends beyond the lidar's reach, or past a few trees, steps are off by decimetres."""
+_MUCH_WORSE, _ALIKE = 6.0, 2.0
+"""Ratio of a measured step's standard deviation to that of the wheels as assumed, from which on their difference may show the
+step's errors: along a wall that ends beyond the lidar's reach, or past a few trees, steps are off by decimetres. It does
+where the differences of all steps are larger by the second factor than those of the better ones."""
 
 
 def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
