@@ -11,6 +11,7 @@ from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
+from .factorization import Factor
 from .graph import Graph
 from .marginals import factor_of, relative_covariances
 from .normal_equations import filled
@@ -59,9 +60,7 @@ def calibration_covariance(graph: Graph) -> Floats:
     normal = filled(graph)
     number = normal.unknowns.number["calibration"][:, 0]
     free, covariance = np.flatnonzero(number >= 0), np.zeros((len(number), len(number)))
-    right = np.zeros((normal.unknowns.size, len(free)))
-    right[number[free], np.arange(len(free))] = 1.0
-    found = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)[number[free]]
+    found = _inverse_among(normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)), number[free], normal.unknowns.size)
     # SuperLU accepts negative pivots.
     if not np.all(np.diagonal(found) > 0.0):
         raise SolverError(SINGULAR)
@@ -73,9 +72,7 @@ def anchor_covariance(graph: Graph, anchors: Ints) -> Floats:
     """Return the covariance (2a, 2a) of the places of some free anchors (a,); huge in directions that are open."""
     normal = filled(graph, subtrees=True)
     number = normal.unknowns.number["anchors"][anchors].ravel()
-    right = np.zeros((normal.unknowns.size, len(number)))
-    right[number, np.arange(len(number))] = 1.0
-    covariance = factor_of(normal).solve(right)[number]
+    covariance = _inverse_among(factor_of(normal), number, normal.unknowns.size)
     unseen = np.flatnonzero(normal.diagonal[number] <= 0.0)
     covariance[unseen, unseen] = _OPEN
     return np.asarray(covariance)
@@ -103,6 +100,13 @@ def _end(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
     # These contain two further copies of the factor, and the matrix.
     del normal, factor
     return number, first, _dense(lower, inside), pivots, np.searchsorted(inside, place)
+
+
+def _inverse_among(factor: Factor, number: Ints, size: int) -> Floats:
+    """Return the rows and columns (n, n) that belong to unknowns (n,) in the inverse of a factorised matrix of so many rows."""
+    right = np.zeros((size, len(number)))
+    right[number, np.arange(len(number))] = 1.0
+    return factor.solve(right)[number]
 
 
 def _inverse(lower: Floats, pivots: Floats) -> Floats:
