@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import re
-from typing import ClassVar
 
 import pytest
 from helpers.example_settings import Outer
@@ -127,29 +126,21 @@ def test_a_message_that_quotes_a_broken_file_stays_short():
 
 
 @dataclasses.dataclass(frozen=True)
-class Moved:
-    """Settings of which a table and one value have other names now."""
+class Reach:
+    """One setting."""
 
-    RENAMED: ClassVar[dict[str, str]] = {"icp": "matching", "gate": "reach"}
     reach: float = 1.0
     """Farthest match, m."""
 
 
-@pytest.mark.parametrize(("name", "now"), [("icp", "matching"), ("icp.rounds", "matching.rounds"), ("gate", "reach")])
-def test_an_old_name_is_answered_with_the_new_one(name, now):
-    data = {name: 1} if "." not in name else {"icp.rounds": 1}
-    assert f"the setting '{name}' is called '{now}' now" in refused(data)
-    assert "is called" not in refused({"gates": 1})
-
-
 def refused(data):
     with pytest.raises(ConfigError) as error:
-        from_dict(Moved, data)
+        from_dict(Reach, data)
     return str(error.value)
 
 
 @pytest.mark.parametrize(("length", "shown"), [(58, "'" + 58 * "x" + "'"), (59, "'" + 56 * "x" + "...")])
 def test_what_is_not_understood_is_shown_up_to_sixty_characters(length, shown):
     with pytest.raises(ConfigError) as error:
-        from_dict(Moved, {"reach": length * "x"})
+        from_dict(Reach, {"reach": length * "x"})
     assert str(error.value).endswith(f"not {shown}")

@@ -65,9 +65,9 @@ def test_every_command_is_understood(document):
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
 def test_every_setting_that_is_named_exists(document):
-    """By its group, or an earlier name of it, in backticks or behind --set; a star stands for the rest of a name."""
+    """By its group, in backticks or behind --set; a star stands for the rest of a name."""
     known = {name for name, _ in leaves(MappingConfig)}
-    groups = {name.partition(".")[0] for name in known if "." in name} | set(MappingConfig.RENAMED)
+    groups = {name.partition(".")[0] for name in known if "." in name}
     marked = " ".join(re.findall(r"`[^`\n]+`|--set \S+", document.read_text()))
     named = re.findall(r"(?<![/\w.])([a-z_]+)\.([a-z_]+\*?|\*)(?![\w(/.])", marked)
     named = {f"{group}.{rest}" for group, rest in named if group in groups and rest not in ("py", "md", "csv", "yaml")}

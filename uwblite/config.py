@@ -139,12 +139,8 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type, *, sized: 
 
 
 def _unknown(where: tuple[str, ...], cls: type, root: type) -> str:
-    """Return why a name is no setting: it was renamed, is a constant of its class now, or never was one."""
+    """Return why a name is no setting: it is a constant of its class now, or never was one."""
     name = ".".join(where)
-    renamed: Mapping[str, str] = getattr(root, "RENAMED", {})
-    for old, new in renamed.items():
-        if name == old or name.startswith(f"{old}."):
-            return f"the setting {name!r} is called {new + name[len(old) :]!r} now"
     if where[-1] in cls.__annotations__:
         return f"{name!r} is no setting any more: it is now a constant of {cls.__name__}, {getattr(cls, where[-1])!r}"
     return f"unknown setting {name!r}{_did_you_mean(where, root)}"

@@ -1,7 +1,7 @@
 """All settings of the stages from recordings to a map, and presets of them."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 from ..errors import ConfigError
 from ..graph.calibration import CalibrationConfig
@@ -26,12 +26,6 @@ from ..radio.trilateration import TrilaterationConfig
 class MappingConfig:
     """All settings, a group per stage."""
 
-    RENAMED: ClassVar[dict[str, str]] = {
-        "growth": "bootstrap", "anchors": "trilateration", "loops": "loop_closure", "tracking": "scan_to_scan",
-        "search": "correlative",
-        "turn_laser": "detect_laser_flip", "refinement.settled": "refinement.convergence",
-    }
-    """Earlier names, for error messages."""
     use_uwb: bool = True
     """Use the ranges."""
     use_lidar: bool = True
