@@ -17,7 +17,7 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "arrays"),
+    ("errors", "arrays", "findings"),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
     ("constraints", "odometry", "grid"),

@@ -196,7 +196,7 @@ def test_first_screen_of_the_readme():
     assert any("What it is not" in line for line in head)
 
 
-KIND = re.compile(r"""\b(?:warn|doubt|Notice|Remark|add)\(\s*f?"([a-z{}.a-z-]+)",""")
+KIND = re.compile(r"""\b(?:warn|doubt|warning|Finding|add|say)\(\s*f?"([a-z{}.a-z-]+)",""")
 
 
 def test_every_kind_of_warning_and_doubt_is_listed():

@@ -4,23 +4,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .arrays import Floats, Ints
+from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """A warning, or a reason not to trust a result."""
-
-    kind: str
-    """Fixed name for scripts and tests, such as ``mirror-ambiguity``; docs/formats.md lists them."""
-    text: str
-    """For people: what, where, and how to fix it."""
-    figures: dict[str, Any] = field(default_factory=dict)
-    """Named figures behind the text (JSON-ready)."""
-
-    def __str__(self) -> str:
-        return self.text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +144,15 @@ class MapResult:
     grid: OccupancyGrid | None
     """None without lidar."""
     stages: tuple[StageSummary, ...]
-    warnings: tuple[Notice, ...]
-    """Warnings for the user."""
-    doubts: tuple[Notice, ...]
-    """Reasons not to trust the result; non-empty means exit code 3."""
+    findings: tuple[Finding, ...]
+    """What to know about the result, in the order in which it was found."""
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """Warnings for the user."""
+        return of_severity(self.findings, WARNING)
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """Reasons not to trust the result; non-empty means exit code 3."""
+        return of_severity(self.findings, DOUBT)

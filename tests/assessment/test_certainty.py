@@ -14,5 +14,7 @@ from uwblite.pipeline.progress import Stages
 )
 def test_a_path_whose_shape_is_known_roughly_only_is_doubted(across, sigma, doubted):
     stages, poses = Stages(None, None), across * np.array([[0.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
-    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), sigma, SimpleNamespace(stages=stages))
+    stages.findings.extend(
+        check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), sigma, SimpleNamespace(stages=stages))
+    )
     assert bool(stages.doubts) == doubted

@@ -31,8 +31,7 @@ def doubts(errors, beside=(0.0, 0.0), count=4, lidar=True):
     recording = SimpleNamespace(number=0, has_scans=lidar, frames=SimpleNamespace(stamps=np.array([100.0])))
     task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), stages=Stages(None, None))
     anchors = [SimpleNamespace(position=place, status="ok") for place in PLACES[:count]]
-    check_displaced_stretches(table, anchors, task)
-    return task.stages.doubts
+    return list(check_displaced_stretches(table, anchors, task))
 
 
 def nothing(x, numbers):

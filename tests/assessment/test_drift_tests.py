@@ -91,7 +91,7 @@ def test_wheels_that_drift_are_a_doubt_beside_a_lidar_where_they_bend_the_path(m
     graph = SimpleNamespace(poses=np.column_stack([np.tile(np.arange(10.0), 2), np.zeros((20, 2))]))
     stages = Stages(None, None)
     recordings = SimpleNamespace(each=each, stamps=np.zeros(20))
-    _check_scale_beside_lidar(graph, None, recordings, SimpleNamespace(stages=stages))
+    stages.findings.extend(_check_scale_beside_lidar(graph, None, recordings, SimpleNamespace(stages=stages)))
     assert [doubt.kind for doubt in stages.doubts] == ["drift"] * doubted
     np.testing.assert_allclose(asked[0], np.kron(np.eye(2), np.linspace(-0.5, 0.5, 10)))
     assert not doubted or f"by {value:+.0%}" in stages.doubts[0].text

@@ -52,36 +52,13 @@ def test_turns_that_change_their_sign_half_way(sound):
     assert any("mirror images" in text for text in texts)
 
 
-@pytest.mark.parametrize("missing", [None, 0, 1])
-def test_halves_are_compared_where_both_decide(monkeypatch, missing):
-    """Poses 10 to 31 of the second recording: 10 to 20 and 20 to 31; a recording with a lidar is not examined.
-
-    Halves are bootstrapped alone only where the ranges are distances."""
-    asked, compared, alone, stages = [], [], [], Stages(None, None)
-    if missing == 0:
-        stages.doubt("range-scatter", "")
-
-    def calibrated(estimate, recording, rows, task):
-        asked.append((rows.start, rows.stop))
-        return None if missing == len(asked) - 1 else len(asked)
-
-    monkeypatch.setattr(half_tests, "_calibration", calibrated)
-    monkeypatch.setattr(half_tests, "_check_sign_of_turns", lambda recording, task: alone.append(recording))
-    monkeypatch.setattr(half_tests, "_compare", lambda one, other, task: compared.append((one, other)))
-    each = [SimpleNamespace(has_scans=True), SimpleNamespace(has_scans=False, rows=slice(10, 31))]
-    half_tests.check_halves(SimpleNamespace(ranges=1), SimpleNamespace(recordings=SimpleNamespace(each=each), stages=stages))
-    assert alone == ([] if missing == 0 else each[1:])
-    assert asked == [(10, 20), (20, 31)]
-    assert compared == ([(1, 2)] if missing is None else [])
-
-
 @pytest.mark.parametrize(("kind", "limit"), [(0, 0.1), (1, 0.2), (2, 0.05)])
 def test_halves_differ_by_their_limit_and_four_standard_deviations(kind, limit):
     for factor, sigma, doubted in ((1.01, 0.0, True), (0.99, 0.0, False), (1.01, 0.2, True), (1.01, 0.26, False)):
         one, other = np.zeros((3, 2)), np.zeros((3, 2))
         other[kind, 0], one[kind, 1], other[kind, 1] = -factor * limit, 0.6 * sigma * limit, 0.8 * sigma * limit
         stages = Stages(None, None)
-        half_tests._compare(one, other, SimpleNamespace(stages=stages))
+        stages.findings.extend(half_tests._compare(one, other, SimpleNamespace(stages=stages)))
         assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
 
 
@@ -123,9 +100,9 @@ def test_anchors_of_both_halves_that_are_mirror_images_are_a_doubt(monkeypatch, 
     halves = iter([places, other | {"Z": np.zeros(2)}])
     monkeypatch.setattr(half_tests, "_anchors_alone", lambda *args: next(halves))
     stages = Stages(None, None)
-    half_tests._check_sign_of_turns(
+    stages.findings.extend(half_tests._check_sign_of_turns(
         SimpleNamespace(frames=SimpleNamespace(stamps=np.arange(9.0))), SimpleNamespace(stages=stages)
-    )
+    ))
     assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
     assert all(n.figures["apart"] > 1.0 and n.figures["mirrored"] < 1e-9 for n in stages.doubts)
 

@@ -12,8 +12,10 @@ from uwblite.assessment.range_agreement import (
     check_wheels_against_lidar,
     outlier_stretches,
 )
+from uwblite.findings import Finding
 from uwblite.map_result import AnchorEstimate
 from uwblite.pipeline.progress import Stages
+from uwblite.sensor_log import OdometryBreaks, Screening
 
 
 def test_stretches_in_which_most_readings_disagree_are_found():
@@ -53,7 +55,9 @@ def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_o
     for kind in kinds:
         stages.warn(kind, "warned of before")
     anchors = [SimpleNamespace(id=n.split()[-1], status="distrusted" if "bad" in n else "ok") for n in names]
-    check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
+    stages.findings.extend(
+        check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
+    )
     assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 
@@ -78,7 +82,9 @@ def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beg
         "weight": np.where(anchor == 2, 0.0, 1.0), "recording": np.zeros(3000),
     }  # fmt: skip
     stages = Stages(None, None)
-    check_sustained_outliers(table, "ABC", SimpleNamespace(recordings=recordings_from(1000.0), stages=stages))
+    stages.findings.extend(
+        check_sustained_outliers(table, "ABC", SimpleNamespace(recordings=recordings_from(1000.0), stages=stages))
+    )
     (notice,) = stages.warnings
     assert (notice.kind, notice.figures["anchor"], len(notice.figures["stretches"])) == ("sustained-outliers", "B", 5)
     assert notice.text.startswith(
@@ -95,7 +101,9 @@ def test_an_anchor_disagrees_in_one_recording_while_others_whose_clocks_show_the
         "recording": recording,
     }  # fmt: skip
     stages = Stages(None, None)
-    check_sustained_outliers(table, "A", SimpleNamespace(recordings=recordings_from(0.0, 0.0), stages=stages))
+    stages.findings.extend(
+        check_sustained_outliers(table, "A", SimpleNamespace(recordings=recordings_from(0.0, 0.0), stages=stages))
+    )
     (notice,) = stages.warnings
     assert notice.text.startswith("recording 2: anchor A disagrees with the map for long (t = 200 to 299 s)")
 
@@ -112,7 +120,9 @@ def test_half_of_the_anchors_that_disagree_for_long_are_a_doubt_without_a_lidar(
     }  # fmt: skip
     stages = Stages(None, None)
     recordings = recordings_from(0.0, scans=lidar)
-    check_sustained_outliers(table, "ABCDE"[:count], SimpleNamespace(recordings=recordings, stages=stages))
+    stages.findings.extend(
+        check_sustained_outliers(table, "ABCDE"[:count], SimpleNamespace(recordings=recordings, stages=stages))
+    )
     assert [n.kind for n in stages.warnings] == ["sustained-outliers"] * wrong
     assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubts
 
@@ -127,9 +137,12 @@ def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretc
     other = {**table, "residual": np.ones(150), "recording": np.ones(150)}
     table = {name: np.concatenate([table[name], other[name]]) for name in table}
     anchors = [SimpleNamespace(id=name, status=status) for name, status in zip(names, statuses, strict=True)]
+    found = Finding("wheels-against-lidar", "doubt", "they differ", stretches=stretches)
+    logs = [SimpleNamespace(screening=None), SimpleNamespace(screening=None)]
+    logs[whose - 1] = SimpleNamespace(screening=Screening((found,), OdometryBreaks.none()))
+    task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log) for log in logs]))
     stages = Stages(None, None)
-    stages.doubt("wheels-against-lidar", "they differ", recording=whose, stretches=stretches)
-    check_wheels_against_lidar(table, anchors, SimpleNamespace(stages=stages))
+    stages.findings.extend(check_wheels_against_lidar(table, anchors, task))
     return stages
 
 
@@ -138,7 +151,7 @@ def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
     stages = against(lambda s: np.where((s % 10 == 0) | ((s > 60) & (s < 75) & (s % 3 == 1)), 1.0, 0.1))
     assert stages.doubts == []
     (notice,) = stages.warnings
-    assert (notice.kind, notice.text.startswith("they differ; "), len(notice.figures["stretches"])) == (
+    assert (notice.kind, "they differ; " in notice.text, len(notice.stretches)) == (
         "wheels-against-lidar", True, 2)  # fmt: skip
 
 
@@ -175,6 +188,6 @@ def test_ranges_that_are_too_short_are_a_doubt_where_they_alone_and_poorly_deter
     ]
     stages, poses = Stages(None, None), np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 0.0]])
     estimate = SimpleNamespace(rests_on_ranges=alone, graph=SimpleNamespace(poses=poses))
-    check_short_ranges(anchors, estimate, sigma, SimpleNamespace(stages=stages))
+    stages.findings.extend(check_short_ranges(anchors, estimate, sigma, SimpleNamespace(stages=stages)))
     assert [n.kind for n in stages.doubts] == ["short-ranges"] * doubted
     assert not doubted or str(stages.doubts[0]).startswith("78 of 458 ranges to A ")

@@ -21,10 +21,11 @@ from uwblite.assessment.summary import (
     _without_strange_biases,
 )
 from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.findings import doubt
 from uwblite.graph.calibration import CalibrationConfig, Unknown
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
-from uwblite.map_result import AnchorEstimate, Notice
+from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Estimate
@@ -198,7 +199,7 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
     def anchor(status):
         return AnchorEstimate("A", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, status, "" if status == "ok" else "few")
 
-    anchors, part, whole = (anchor("ok"), anchor("unplaced")), Notice("no-closure", "", {}), Notice("halves-disagree", "", {})
+    anchors, part, whole = (anchor("ok"), anchor("unplaced")), doubt("no-closure", ""), doubt("halves-disagree", "")
     assert _distrusted(anchors, []) is anchors
     assert _distrusted(anchors, [part]) is anchors
     found = _distrusted(anchors, [part, whole])

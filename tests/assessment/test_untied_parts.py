@@ -48,7 +48,7 @@ def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
     stages = Stages(None, None)
     graph = Graph(poses, np.zeros((4, 2)), edges=edges)
     task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), stages=stages)
-    check_untied_parts(SimpleNamespace(graph=graph, ranges=ranges), task)
+    stages.findings.extend(check_untied_parts(SimpleNamespace(graph=graph, ranges=ranges), task))
     return [n.figures for n in stages.doubts]
 
 

@@ -23,7 +23,7 @@ def doubted(heard, closures=(), few=()):
     each = [SimpleNamespace(number=n, name=f"recording {n + 1}") for n in range(len(heard))]
     stages = Stages(None, None)
     recordings = SimpleNamespace(each=each, of_keyframe=np.arange(len(heard)))
-    check_untied_recordings(estimate, SimpleNamespace(recordings=recordings, stages=stages))
+    stages.findings.extend(check_untied_recordings(estimate, SimpleNamespace(recordings=recordings, stages=stages)))
     assert all(notice.kind == "untied-parts" for notice in stages.doubts)
     return {notice.figures["recording"]: notice.figures["moved"] for notice in stages.doubts}
 

@@ -8,8 +8,9 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.checks.recording import diagnose
+from uwblite.findings import doubt
 from uwblite.graph.graph import UnknownKey
-from uwblite.map_result import CalibrationEstimate, Notice
+from uwblite.map_result import CalibrationEstimate
 from uwblite.sensor_log import LogNotes, Odometry, SensorLog, SensorMounting
 
 PER_RANGE = ("stamps", "anchor", "ranges", "quality")
@@ -169,14 +170,14 @@ def test_what_the_radio_reports_of_the_wheels(without_scans):
 
 
 def test_what_a_trial_map_doubts_or_refuses_is_serious_and_said_once(without_scans):
-    doubt = Notice("scales", "the ranges are 0.80 times the distances on the map", {})
-    assert_named(without_scans, "serious", doubt.text, doubts=(doubt,))
+    scales = doubt("scales", "the ranges are 0.80 times the distances on the map")
+    assert_named(without_scans, "serious", scales.text, doubts=(scales,))
     assert_named(without_scans, "serious", "nothing to map", refused="nothing to map")
-    for options, advice in (({"doubts": (doubt,)}, "doubted"), ({"refused": "nothing to map"}, "no map is made")):
+    for options, advice in (({"doubts": (scales,)}, "doubted"), ({"refused": "nothing to map"}, "no map is made")):
         assert advice in str([f.advice for f in diagnose(without_scans, **options).findings if f.topic == "map"])
     still = with_poses(without_scans, np.repeat(without_scans.odometry.poses[:1], len(without_scans.odometry.stamps), axis=0))
     (found,) = [f for f in diagnose(still).findings if "hardly moves" in f.what]
-    again = diagnose(still, doubts=(Notice("hardly-moving", found.what, {}),)).findings
+    again = diagnose(still, doubts=(doubt("hardly-moving", found.what),)).findings
     assert sum(f.what == found.what for f in again) == 1
     settled = [f.rank for f in diagnose(still, doubts=()).findings if f.what == found.what]
     assert settled == ["warning"]
@@ -204,6 +205,6 @@ def test_the_shortest_recordings_are_examined_too(sound, samples):
 def test_a_doubt_of_the_screening_is_serious_where_the_map_has_one_of_its_kind(poses):
     """Whatever its words: a map of several recordings puts their number in front."""
     log = recording(poses, flipped=True)
-    kept = Notice("laser-turned-over", "recording 1: laser and wheels turn in opposite directions")
+    kept = doubt("laser-turned-over", "recording 1: laser and wheels turn in opposite directions")
     assert_named(log, "serious", "upside down", doubts=(kept,))
-    assert_named(log, "warning", "upside down", doubts=(Notice("uncertain", "another one"),))
+    assert_named(log, "warning", "upside down", doubts=(doubt("uncertain", "another one"),))

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from uwblite import se2
+from uwblite.findings import doubt, warning
 from uwblite.graph.graph import Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
-from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, Notice, StageSummary
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, StageSummary
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 FILES = {
@@ -101,8 +102,10 @@ def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: 
         },
         OccupancyGrid(geometry, log_odds, 24) if lidar else None,
         (StageSummary("first optimisation", seconds, {"chi2": 40.0, "dof": 50, "iterations": 7, "note": "x" + evil}),),
-        (Notice("anchor-mirror-ambiguous", "anchor 91A3 may be mirrored" + evil, {"anchor": "91A3" + evil}),),
-        (Notice("few-closures" + evil, "few closures" + evil),) if evil else (),
+        (
+            warning("anchor-mirror-ambiguous", "anchor 91A3 may be mirrored" + evil, anchor="91A3" + evil),
+            *([doubt("few-closures" + evil, "few closures" + evil)] if evil else []),
+        ),
     )
 
 

@@ -93,10 +93,10 @@ def test_ranges_have_another_name_from_each_move_on():
     log = four_ranges(A=[moved(1.0, 0.7), moved(3.0)])
     assert names(log) == ["A", "B", "A@2", "B", "A@2", "B", "A@3", "B"]
     assert log.mounting.anchor_heights == {"A": 2.0, "A@2": 2.0, "A@3": 2.0}
-    first, second = log.screening.remarks
+    first, second = log.screening.findings
     assert first.text == "anchor A was moved by 0.7 m at about t = 1 s; from then on it is called A@2"
     assert second.text.endswith("it is called A@3")
-    assert [(remark.place, remark.without_place) for remark in (first, second)] == [("A@2", ""), ("A@3", "")]
+    assert [(remark.anchor, remark.cure) for remark in (first, second)] == [("A@2", ""), ("A@3", "")]
     assert names(four_ranges(B=[moved(2.0)])) == ["A", "B", "A", "B", "A", "B@2", "A", "B@2"]
     assert names(four_ranges()) == ["A", "B"] * 4
 
@@ -106,7 +106,7 @@ def test_readings_of_an_anchor_that_is_carried_are_no_distances():
     assert names(log) == ["A", "B"] * 3 + ["A@2", "B"]
     assert log.ranges.ranges.tolist() == [1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0, 1.0]
     said = "moved by 1.0 m between t = 1 and 3 s (its 2 ranges meanwhile were left out); from then on it is called A@2"
-    assert log.screening.remarks[0].text == f"anchor A was {said}"
+    assert log.screening.findings[0].text == f"anchor A was {said}"
     # Where it was put down is looked for in all ranges again.
     assert not _same(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {})
     assert _same(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {"A": [moved(3.0)]})
@@ -246,9 +246,9 @@ def test_of_places_that_a_map_does_not_have_nothing_is_said_but_what_was_left_ou
     log = four_ranges(A=[moved(1.0, 0.7), moved(3.0, left=2.0)], B=[moved(2.0)])
     task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log)]))
     (whole,) = said_of_places(task, ["A", "A@2#2", "A@3", "B", "B@2"])
-    assert whole.screening.remarks == log.screening.remarks
+    assert whole.screening.findings == log.screening.findings
     (some,) = said_of_places(task, ["A", "A@2", "B"])
-    said = [(remark.kind, remark.text) for remark in some.screening.remarks]
+    said = [(remark.kind, remark.text) for remark in some.screening.findings]
     left_out = "between t = 2 and 3 s (its 1 ranges meanwhile were left out): both places are the same within their uncertainty"
     assert said == [
         ("moved-anchor", "anchor A was moved by 0.7 m at about t = 1 s; from then on it is called A@2"),

@@ -84,5 +84,5 @@ def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, more, off, lidar
     stages = Stages(None, None)
     recordings = type("One", (), {"have_scans": lidar, "__len__": lambda _: 1})()
     task = SimpleNamespace(recordings=recordings, stages=stages, config=MappingConfig())
-    other_minima.check_other_minimum(SimpleNamespace(graph=here, other_minimum=None, placed=None), task)
+    stages.findings.extend(other_minima.check_other_minimum(SimpleNamespace(graph=here, other_minimum=None, placed=None), task))
     assert [d.kind for d in stages.doubts] == ["other-side"] * doubts

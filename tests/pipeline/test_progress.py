@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from uwblite.errors import Cancelled
+from uwblite.findings import doubt, warning
 from uwblite.pipeline.progress import Stages
-from uwblite.sensor_log import OdometryBreaks, Remark, Screening
+from uwblite.sensor_log import OdometryBreaks, Screening
 
 
 def test_stages_take_the_time_since_the_one_before():
@@ -43,7 +44,7 @@ def test_stages_that_run_again_are_forgotten():
 
 @pytest.mark.parametrize(("count", "where"), [(1, ""), (2, "recording 2: ")])
 def test_what_the_screening_found_is_taken_over(count, where):
-    remarks = (Remark("jump", "it jumps"), Remark("gap", "it is silent", doubt=True))
+    remarks = (warning("jump", "it jumps"), doubt("gap", "it is silent"))
     logs = [SimpleNamespace(screening=None)] * (count - 1)
     stages = Stages(None, None)
     stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])

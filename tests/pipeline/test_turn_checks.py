@@ -54,7 +54,7 @@ def judged(true, used):
     stages = Stages(None, None)
     task = SimpleNamespace(stages=stages)
     guarded = with_constant_turn_scales(Estimate(graph, wheels, None, (), steps=steps), task).graph
-    check_turn_scales(Estimate(graph.with_edges(wheels, steps), wheels, None, ()), task)
+    stages.findings.extend(check_turn_scales(Estimate(graph.with_edges(wheels, steps), wheels, None, ()), task))
     return guarded.calibration.values[INDEX], bool(guarded.fixed_calibration[INDEX]), stages
 
 

@@ -119,7 +119,7 @@ def test_same_result_same_bytes_unless_timings_are_asked_for():
 
 
 def test_works_without_lidar_and_without_radio():
-    bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), warnings=())
+    bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), findings=())
     text = render(bare, title="a", command="b")
     assert "No warnings." in text
     assert "<image" not in text

@@ -62,7 +62,7 @@ def test_a_clock_set_back_by_more_than_a_second_is_named_with_its_sensor():
     assert [r.text.split(":")[0] for r in found] == [
         "the clock of the lidar was set back by up to 1.1 s", "the clock of the odometry was set back by up to 30.0 s",
     ]  # fmt: skip
-    assert all(r.doubt for r in found)
+    assert all(r.severity == "doubt" for r in found)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_scans_outside_the_odometry_s_time_are_left_out_and_ranges_counted(outsi
     by_kind = {r.kind: r for r in remarks}
     assert set(by_kind) == ({"ranges-outside-odometry"} if outside else set()) | ({"scans-outside-odometry"} if said else set())
     for name, remark in by_kind.items():
-        assert remark.doubt == doubt
+        assert (remark.severity == "doubt") == doubt
         assert remark.text.startswith(f"{outside} of 100 {name.split('-')[0]} ")
         assert ("clocks differ by about 7 s" in remark.text) == doubt
 

@@ -25,7 +25,7 @@ def with_poses(log, poses):
 
 
 def kinds(log, doubts=False):
-    return {r.kind for r in log.screening.remarks if r.doubt or not doubts}
+    return {r.kind for r in log.screening.findings if r.severity == "doubt" or not doubts}
 
 
 def frozen(log, start, end):
@@ -36,7 +36,7 @@ def frozen(log, start, end):
 
 def test_a_sound_recording_stays_as_it_is(sound):
     done = screen(sound)
-    assert done.screening.remarks == ()
+    assert done.screening.findings == ()
     assert len(done.screening.breaks.stamps) == 0
     assert done.odometry is sound.odometry
     assert screen(done) is done
@@ -85,7 +85,7 @@ def test_a_robot_that_stands_has_no_lost_wheels(sound):
     )
     ranges = replace(sound.ranges, stamps=sound.ranges.stamps + 20.0)
     done = screen(replace(sound, odometry=Odometry(stamps, poses), scans=scans, ranges=ranges))
-    assert done.screening.remarks == ()
+    assert done.screening.findings == ()
 
 
 def test_scans_of_a_single_column_do_not_move_a_robot_that_stands(sound):
@@ -201,7 +201,7 @@ def test_a_value_that_a_lidar_repeats_everywhere_is_no_wall(sound, beyond):
     mark = reach if beyond else np.float32(1.0)
     done = screen(replace(sound, scans=replace(scans, ranges=np.where(marked, mark, scans.ranges))))
     assert kinds(done) == {"repeated-readings"}
-    assert done.screening.remarks[0].text.startswith(f"{marked.sum()} of {marked.size} readings")
+    assert done.screening.findings[0].text.startswith(f"{marked.sum()} of {marked.size} readings")
     np.testing.assert_array_equal(done.scans.ranges[~marked], scans.ranges[~marked])
     assert np.isposinf(done.scans.ranges[marked]).all() if beyond else np.isnan(done.scans.ranges[marked]).all()
     assert done.scans.range_max == (reach if beyond else scans.range_max)
@@ -306,7 +306,7 @@ def test_a_base_that_counts_no_way_while_it_is_unplugged_is_a_doubt_though_its_g
 
 def test_a_clock_that_was_set_back_is_a_doubt(sound):
     done = screen(replace(sound.without(lidar=True), notes=LogNotes(set_back={"radio": 30.0, "odometry": 0.2})))
-    assert [r.kind for r in done.screening.remarks if r.doubt] == ["clock-set-back"]
+    assert [r.kind for r in done.screening.findings if r.severity == "doubt"] == ["clock-set-back"]
 
 
 def test_readings_that_come_in_bursts_are_spread_over_the_time_since_the_burst_before(sound):
@@ -374,11 +374,11 @@ def test_readings_outside_the_time_of_the_odometry_are_counted_and_doubted_where
     log = replace(sound, scans=replace(sound.scans, stamps=sound.scans.stamps + off))
     left, remarks = clocks.within_odometry(log)
     remarks = [r for r in remarks if r.kind == "scans-outside-odometry"]
-    assert [r.doubt for r in remarks] == ([] if said is None else [said])
+    assert [r.severity == "doubt" for r in remarks] == ([] if said is None else [said])
     outside = len(log.scans.stamps) - len(left.scans.stamps)
     assert outside == {0.0: 0, 30.0: 150 - 1, 1e6: len(log.scans.stamps)}[off]
     assert all(f"{outside} of {len(log.scans.stamps)} scans" in r.text for r in remarks)
-    assert all("by about 1000000 s" in r.text for r in remarks if r.doubt)
+    assert all("by about 1000000 s" in r.text for r in remarks if r.severity == "doubt")
 
 
 @pytest.mark.parametrize("turned", [0.0, 2.0])
@@ -400,7 +400,7 @@ def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch, turned)
     done, breaks, remarks = screening._gaps(log)
     np.testing.assert_allclose(breaks.stamps, [70.0, 90.0, 110.0])
     np.testing.assert_allclose(breaks.sigma, [[0.02] * 3, [20.0, 20.0, 3.0], [0.1] * 3])
-    assert [(r.kind, r.doubt) for r in remarks] == [("carried", True), ("odometry-gap", False)]
+    assert [(r.kind, r.severity == "doubt") for r in remarks] == [("carried", True), ("odometry-gap", False)]
     assert "silent for 5 s from t = 40 s" in remarks[0].text
     # What others saw while the robot drove on or was carried is left out, but for what is next to the odometry.
     kept = ((times <= 90.2) | (times >= 94.9)) & ((times <= 110.2) | (times >= 114.9))
@@ -434,7 +434,7 @@ def test_a_robot_that_drives_less_than_two_metres_is_a_doubt(path, said):
         100.0 + np.arange(31.0), np.column_stack([np.linspace(0.0, path, 31), np.zeros(31), np.linspace(3.0, -4.0, 31)])
     )
     found = screening._hardly_moving(odometry)
-    assert [r.doubt for r in found] == [True] * said
+    assert [r.severity == "doubt" for r in found] == [True] * said
     assert all("1.99 m in 30 s (turning 7.0 rad)" in r.text for r in found)
 
 
@@ -447,7 +447,7 @@ def test_cuts_near_other_breaks_are_those(monkeypatch):
     breaks, (remark,) = screening._cuts(log, np.zeros(0), np.array([150.0]))
     np.testing.assert_array_equal(breaks.stamps, [110.0, 146.0, 154.0, 200.0, 250.0, 300.0])
     np.testing.assert_array_equal(breaks.sigma, [[20.0, 20.0, 3.0]] * 6)
-    assert remark.doubt
+    assert remark.severity == "doubt"
     assert "at t = 10 s, t = 47 s, t = 54 s, t = 100 s ... the robot" in remark.text
     times = times[:1]
     assert " ... " not in screening._cuts(log, np.zeros(0), np.zeros(0))[1][0].text
@@ -466,5 +466,5 @@ def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it(monkeypatch
         log, same, breaks, remarks = screening._lost_wheels(sound, pairs)
         assert (log, same) == (sound, pairs)
         assert [r.text.split("t = ")[1].split(" s")[0] for r in remarks] == said
-        assert all(r.doubt and "rests on ranges alone" in r.text for r in remarks)
+        assert all(r.severity == "doubt" and "rests on ranges alone" in r.text for r in remarks)
         assert len(breaks.stamps) == (4 if pairs else 9)

@@ -45,7 +45,7 @@ def test_two_anchors_with_one_name_are_left_out(seed):
     log = renamed(recording(seed))
     done, (remark,) = without_shared_names(log)
     assert remark.kind == "shared-name"
-    assert not remark.doubt
+    assert remark.severity == "warning"
     assert "two anchors seem to have the name A:" in remark.text
     assert done.ranges.anchor_ids == ("C",)
     np.testing.assert_array_equal(done.ranges.ranges, log.ranges.ranges[log.ranges.anchor == 1])

@@ -216,7 +216,7 @@ def test_marks_that_are_most_of_the_ranges_are_a_doubt_without_a_lidar():
     log, values = at_places(30)
     fewer = replace(log, ranges=log.ranges.rows((values > 60.0) | (np.arange(len(values)) % 4 == 0)))
     seen = replace(fewer, scans=scans(np.ones((5, 8))))
-    assert [without_marks(one)[1][0].doubt for one in (log, fewer, seen)] == [False, True, False]
+    assert [without_marks(one)[1][0].severity == "doubt" for one in (log, fewer, seen)] == [False, True, False]
 
 
 def test_a_mark_counts_once_at_each_place_and_of_each_anchor():

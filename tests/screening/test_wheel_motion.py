@@ -203,7 +203,7 @@ def test_a_motion_that_noise_does_not_explain_for_long_is_a_doubt(off, said, fac
         assert disagreeing(found, 0.0) == []
         return
     (remark,) = disagreeing(found, 10.0)
-    assert remark.doubt
+    assert remark.severity == "doubt"
     first, last = (int(word) for word in (remark.text.split("t = ")[1].split()[0], remark.text.split(" to ")[1].split()[0]))
     assert abs(first - 30) <= 2
     assert abs(last - 40) <= 2

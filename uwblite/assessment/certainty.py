@@ -1,11 +1,14 @@
 """How well a map knows the shape of the path, by its own covariances."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from ..findings import Finding, doubt
 from ..pipeline.estimate import Estimate, Task
 
 
-def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
+def check_certainty(estimate: Estimate, sigma: float, task: Task) -> Iterator[Finding]:
     """Doubt a map whose own uncertainties are so large that its shape is not known well.
 
     Parameters
@@ -18,7 +21,7 @@ def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
             f"the shape of the path is known to {sigma:.1f} m (rms) only, in an area {extent:.0f} m across: too few ranges and "
             "scans constrain the trajectory; add anchors, or drive where the lidar sees walls"
         )
-        task.stages.doubt("uncertain", text, sigma=sigma, extent=extent)
+        yield doubt("uncertain", text, sigma=sigma, extent=extent)
 
 
 def allowed_error(estimate: Estimate) -> float:

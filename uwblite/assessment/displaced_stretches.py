@@ -4,11 +4,12 @@ Where a lidar sees bare walls only and the wheels miss some of the distance, sca
 robust kernel treats the ranges of that stretch as outliers. They disagree with the map, and agree with a path beside it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..findings import Finding, doubt
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 
@@ -24,7 +25,7 @@ _MOST = 0.7
 _ROUNDS = 20
 
 
-def check_displaced_stretches(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> None:
+def check_displaced_stretches(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
     """Doubt a map of recordings with lidar in which the ranges of a stretch agree with another path.
 
     Parameters
@@ -50,7 +51,7 @@ def check_displaced_stretches(table: dict[str, Floats], anchors: Sequence[Anchor
             stamps, start = table["stamp"][own], float(recording.frames.stamps[0])
             first, last = min(found)[0], max(last for _, last, _ in found) - 1
             off = float(max(np.hypot(*beside) for *_, beside in found))
-            task.stages.doubt(
+            yield doubt(
                 "ranges-disagree",
                 f"from t = {stamps[first] - start:.0f} to {stamps[last] - start:.0f} s the ranges agree with a path "
                 f"{off:.1f} m beside that of the map: did the wheels slip where the lidar sees bare walls only?",

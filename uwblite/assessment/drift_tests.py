@@ -6,11 +6,13 @@ of these faults would leave: a score test (graph/added_unknown.py) gives the bes
 seconds is hidden in the same way: the error of each step is small, and the calibration of the turns absorbs the rest.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Floats
+from ..findings import Finding, doubt
 from ..graph.added_unknown import added_unknown, added_unknown_and_moves
 from ..graph.graph import Edges, Graph, edge_weights
 from ..graph.pose_edges import OdometryEdges
@@ -34,14 +36,14 @@ _STEP = 1e-4
 """Share of a unit that is the step of numeric derivatives."""
 
 
-def check_drifts(estimate: Estimate, task: Task) -> None:
+def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map of recordings without lidar in which ranges or wheels drift, or the radio's clock is seconds off; with a
     lidar, a map of which drifting wheels have displaced much."""
     graph, ranges, wheels, rec = estimate.graph, estimate.ranges, estimate.odometry, task.recordings
     if ranges is None or not len(wheels) or not estimate.placed.any():
         return
     if rec.have_scans:
-        _check_scale_beside_lidar(graph, wheels, rec, task)
+        yield from _check_scale_beside_lidar(graph, wheels, rec, task)
         return
     for recording in rec.each:
         own = np.zeros(len(rec.stamps))
@@ -61,8 +63,8 @@ def check_drifts(estimate: Estimate, task: Task) -> None:
         ):
             if abs(value) > max(limit, _SIGMAS * sigma):
                 why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
-                task.stages.doubt("drift", why, value=float(value), sigma=float(sigma))
-    _check_turns(graph, wheels, rec.stamps, task)
+                yield doubt("drift", why, value=float(value), sigma=float(sigma))
+    yield from _check_turns(graph, wheels, rec.stamps, task)
 
 
 def _scale_text(by: float) -> str:
@@ -82,7 +84,7 @@ def _growth(graph: Graph, wheels: OdometryEdges, since: Floats) -> Floats:
     return _change(graph, wheels, replace(wheels, motion=motion))
 
 
-def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordings, task: Task) -> None:
+def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordings, task: Task) -> Iterator[Finding]:
     """Doubt a map whose wheels change their scale, where a map without that change has another shape.
 
     A lidar that sees walls determines the map whatever the wheels count. In a large hall it sees none for most of the time.
@@ -97,7 +99,7 @@ def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordin
                 f"{_scale_text(value)}, and the lidar sees too little to hold the path, which that bends by {off:.1f} m (rms): "
                 "drive nearer to walls, or map the parts before and after separately"
             )
-            task.stages.doubt("drift", why, value=value, sigma=sigma, bent=off)
+            yield doubt("drift", why, value=value, sigma=sigma, bent=off)
 
 
 def _bent(places: Floats, moved: Floats) -> float:
@@ -108,7 +110,7 @@ def _bent(places: Floats, moved: Floats) -> float:
     return float(np.sqrt(np.sum(left**2) / len(places)))
 
 
-def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task) -> None:
+def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task) -> Iterator[Finding]:
     """Doubt a map in which, by the ranges, the odometry turns wrongly over a short stretch."""
     steps = np.arange(0, len(wheels) - _WAY + 1, _WAY // 2)[:, None] + np.arange(_WAY)
     # The numerators of the test, with the graph at its optimum: a stretch that fits well needs no other turn.
@@ -122,7 +124,7 @@ def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task
         worst = wrong[np.argmax(np.abs(turns[wrong]) / sigmas[wrong])]
         at, turn = float(stamps[wheels.i[steps[worst, 0]]] - stamps[0]), float(np.abs(turns[worst]))
         why = f"from t = {at:.0f} s the ranges contradict the odometry by {turn:.1f} rad within some metres: did a wheel slip?"
-        task.stages.doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at)
+        yield doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at)
 
 
 def _change(graph: Graph, edges: Edges, changed: Edges) -> Floats:

@@ -9,12 +9,14 @@ Turns whose sign changed (wheels swapped, a gyro turned over) are not near the j
 bootstrapped on its own: their anchors are then mirror images of each other.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats, rms_length
+from ..findings import Finding, doubt, kinds
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
@@ -34,22 +36,22 @@ _FEW = 8
 """Ranges to an anchor with which a half can estimate it."""
 
 
-def check_halves(estimate: Estimate, task: Task) -> None:
+def check_halves(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map of a recording without lidar whose halves need different wheels."""
     for recording in task.recordings.each:
         if recording.has_scans or estimate.ranges is None:
             continue
-        if not any(doubt.kind == "range-scatter" for doubt in task.stages.doubts):
+        if "range-scatter" not in kinds(task.stages.findings):
             # Ranges that are no distances give no anchors by either half; a bootstrap would be useless.
-            _check_sign_of_turns(recording, task)
+            yield from _check_sign_of_turns(recording, task)
         rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
         halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
         if halves[0] is None or halves[1] is None:
             continue
-        _compare(halves[0], halves[1], task)
+        yield from _compare(halves[0], halves[1], task)
 
 
-def _compare(one: Floats, other: Floats, task: Task) -> None:
+def _compare(one: Floats, other: Floats, task: Task) -> Iterator[Finding]:
     """Doubt where values and standard deviations (3, 2) of two halves differ."""
     difference, sigma = np.abs(one[:, 0] - other[:, 0]), np.hypot(one[:, 1], other[:, 1])
     for k, (kind, most) in enumerate(_CHANGES.items()):
@@ -59,7 +61,7 @@ def _compare(one: Floats, other: Floats, task: Task) -> None:
                 f"{other[k, 0]:+.3f}, difference known to {sigma[k]:.3f}): wheels, gyro or ranges changed meanwhile; "
                 "map the halves separately"
             )
-            task.stages.doubt("halves-disagree", text, first=float(one[k, 0]), second=float(other[k, 0]), sigma=float(sigma[k]))
+            yield doubt("halves-disagree", text, first=float(one[k, 0]), second=float(other[k, 0]), sigma=float(sigma[k]))
 
 
 def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Task) -> Floats | None:
@@ -94,7 +96,7 @@ _LOOSER = 20.0
 """Factor on the prior standard deviation of that unit: a change during the recording may have any size."""
 
 
-def _check_sign_of_turns(recording: Recording, task: Task) -> None:
+def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
     """Doubt where anchors by either half alone are mirror images of each other."""
     stamps = recording.frames.stamps
     middle = float(stamps[len(stamps) // 2])
@@ -109,7 +111,7 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> None:
             f"the anchors found from the first and from the second half of the recording are mirror images ({turned:.1f} m "
             f"apart, {mirrored:.1f} m when mirrored): the odometry's turns are wrong in one of the halves"
         )
-        task.stages.doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
+        yield doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
 
 
 _TRIANGLE = 3

@@ -1,13 +1,14 @@
 """Plausibility of a result: warnings and doubts from the estimates themselves.
 
-Each check adds its notices to the task's stages; docs/formats.md lists their kinds.
+Each rule yields findings; docs/findings.md describes their kinds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from ..arrays import Bools, Floats
+from ..findings import Finding, doubt, kinds, warning
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
@@ -51,30 +52,35 @@ def judge(
     anchors, calibrated, grid : see MapResult. table : MapResult.range_table.
     usual : unknowns with their prior standard deviations. sigma : m, see check_certainty.
     """
-    check_certainty(estimate, sigma, task)
-    check_anchors(anchors, task)
-    check_moved_together(anchors, table, task)
-    check_sensors(grid, task)
-    check_closures(estimate, anchors, grid, task)
-    check_calibration(calibrated, usual, task)
-    if table:
-        check_sustained_outliers(table, estimate.anchor_ids, task)
-        check_displaced_stretches(table, anchors, task)
-    check_residuals(estimate, table["residual"] if table else np.zeros(0), grid, task)
-    check_unit(anchors, task)
-    check_short_ranges(anchors, estimate, sigma, task)
-    check_halves(estimate, task)
-    check_drifts(estimate, task)
-    check_untied_parts(estimate, task)
-    check_untied_recordings(estimate, task)
-    check_other_minimum(estimate, task)
-    check_handedness(estimate, task)
-    check_turn_scales(estimate, task)
-    check_fit(task)
-    check_wheels_against_lidar(table, anchors, task)
+    residuals = table["residual"] if table else np.zeros(0)
+    # A rule may look at what those before it found.
+    rules: tuple[Callable[[], Iterable[Finding]], ...] = (
+        lambda: check_certainty(estimate, sigma, task),
+        lambda: check_anchors(anchors, task),
+        lambda: check_moved_together(anchors, table, task),
+        lambda: check_sensors(grid, task),
+        lambda: check_closures(estimate, anchors, grid, task),
+        lambda: check_calibration(calibrated, usual, task),
+        lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
+        lambda: check_displaced_stretches(table, anchors, task) if table else (),
+        lambda: check_residuals(estimate, residuals, grid, task),
+        lambda: check_unit(anchors, task),
+        lambda: check_short_ranges(anchors, estimate, sigma, task),
+        lambda: check_halves(estimate, task),
+        lambda: check_drifts(estimate, task),
+        lambda: check_untied_parts(estimate, task),
+        lambda: check_untied_recordings(estimate, task),
+        lambda: check_other_minimum(estimate, task),
+        lambda: check_handedness(estimate, task),
+        lambda: check_turn_scales(estimate, task),
+        lambda: check_fit(task),
+        lambda: check_wheels_against_lidar(table, anchors, task),
+    )
+    for rule in rules:
+        task.stages.findings.extend(rule())
 
 
-def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
+def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
     """Warn of anchors that are not ok; doubt a map with which most ranges, or without lidar half of the anchors, disagree.
 
     A name with two anchors counts as distrusted. Mirror ambiguity is a doubt where every anchor in reach has it.
@@ -82,12 +88,12 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
         if anchor.status != "ok":
-            add = task.stages.doubt if anchor.status == "mirror-ambiguous" and unclear else task.stages.warn
+            add = doubt if anchor.status == "mirror-ambiguous" and unclear else warning
             text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
-            add(f"anchor-{anchor.status}", text, anchor=anchor.id)
+            yield add(f"anchor-{anchor.status}", text, anchor=anchor.id)
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone; drive curves near the anchors"
-        task.stages.doubt("no-anchor", text)
+        yield doubt("no-anchor", text)
     count = sum(a.ranges for a in anchors if a.status != "unplaced")
     agreeing = sum(a.used_share * a.ranges for a in anchors if a.status != "unplaced")
     if agreeing < _LEAST_AGREEING * count:
@@ -95,10 +101,10 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
             f"only {agreeing / count:.0%} of the ranges agree with the map: they are not distances to stationary anchors, or "
             "the trajectory is wrong; check the anchors' ids, and the unit and the clock of the radio"
         )
-        task.stages.doubt("ranges-disagree", text, share=agreeing / count)
+        yield doubt("ranges-disagree", text, share=agreeing / count)
     if task.recordings.have_scans:
         return
-    left_out = sum(notice.kind == "shared-name" for notice in task.stages.warnings)
+    left_out = sum(finding.kind == "shared-name" for finding in task.stages.findings)
     # An anchor that was moved counts once.
     named = ({name_and_number(a.id)[0] for a in anchors if a.status in kinds} for kinds in (_PLACED, _PLACED[-1:]))
     placed, wrong = (left_out + len(names) for names in named)
@@ -108,7 +114,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
             + ("the others may be too few" if wrong == left_out else "a wrong trajectory is likelier than so many bad anchors")
             + "; check the odometry, or give the anchors' places"
         )
-        task.stages.doubt("ranges-disagree", text, distrusted=wrong, placed=placed)
+        yield doubt("ranges-disagree", text, distrusted=wrong, placed=placed)
 
 
 _PLACED = ("ok", "mirror-ambiguous", "distrusted")
@@ -117,7 +123,7 @@ _LEAST_AGREEING = 0.3
 """Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
 
 
-def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> None:
+def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
     """Doubt a map in which half of the anchors changed at one time, unless they changed places only.
 
     Swapped wheels, a changed radio or clock, or a lidar that displaces the trajectory have the same effect. An
@@ -139,7 +145,7 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
         renamed = _exchanged(these, anchors, names) and not one_sided
         if len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both))) and not renamed:
             when = float(start - task.recordings.stamps[0])
-            task.stages.doubt(
+            yield doubt(
                 "anchors-moved-together",
                 f"{len(changed)} of {len(both | changed)} anchors seem to have moved at about t = {when:.0f} s: "
                 + ("an error of lidar, radio or clocks is likelier" if lidar else
@@ -174,34 +180,38 @@ def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: S
     )
 
 
-def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
+def check_sensors(grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
     """Warn of sensors without data."""
     logs = [recording.log for recording in task.recordings.each]
     if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
-        task.stages.warn("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
+        yield warning("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:
         text = "no lidar in use: no map, and only the odometry's turns show that trajectory and anchors are not mirrored"
-        task.stages.warn("no-lidar", text)
+        yield warning("no-lidar", text)
     elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
-        task.stages.warn("empty-scans", "no scan has a reading: the map is empty")
+        yield warning("empty-scans", "no scan has a reading: the map is empty")
 
 
-def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task) -> None:
+def check_closures(
+    estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task
+) -> Iterator[Finding]:
     """Warn of a map without loop closures; doubt one that more closures contradict than support."""
     candidates = estimate.closures.candidates
     accepted = sum(c.accepted for c in candidates)
     placed = any(a.status != "unplaced" for a in anchors)
     if grid is not None and candidates and accepted == 0:
-        add = task.stages.warn if placed else task.stages.doubt
+        add = warning if placed else doubt
         text = "no loop closure was accepted: drift is not corrected; drive through places twice"
-        add("no-closure", text, candidates=len(candidates))
+        yield add("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
         text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them in uwblite view"
-        task.stages.doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
+        yield doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
-def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task) -> None:
+def check_calibration(
+    calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task
+) -> Iterator[Finding]:
     """Warn of each calibration value far outside its usual size.
 
     Ranges that are too long where the wheels counted nothing are a doubt: scans along a bare wall show only some of
@@ -213,7 +223,7 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
     ----------
     usual : unknowns with their prior standard deviations; of sound radios it is the settings' range_scale_sound.
     """
-    said = {notice.kind for notice in task.stages.warnings}
+    said = kinds(task.stages.findings)
     for value in calibrated:
         scale = value.key.kind == RANGE_SCALE
         sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
@@ -225,8 +235,8 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
         unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
         unrelated = value.key.kind == "heading_scale" and abs(1.0 + value.value) < _UNRELATED
-        add = task.stages.doubt if short or unclear or unrelated else task.stages.warn
-        add(
+        add = doubt if short or unclear or unrelated else warning
+        yield add(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
@@ -237,7 +247,7 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
         )  # fmt: skip
 
 
-def check_handedness(estimate: Estimate, task: Task) -> None:
+def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map whose ranges or scans fit only where the odometry's turns are scaled grossly.
 
     Ranges alone do not distinguish a map from its mirror image: a trajectory mirrored together with its anchors has the same
@@ -266,10 +276,10 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
                 "or give the places of three anchors"
             )
         if wrong and not -_SLIPS_AT_MOST <= error <= _WRONG_TURNS:
-            task.stages.doubt("mirrored", text, factor=factor)
+            yield doubt("mirrored", text, factor=factor)
 
 
-def check_fit(task: Task) -> None:
+def check_fit(task: Task) -> Iterator[Finding]:
     """Doubt a map whose residuals are far larger than the noise allows."""
     fits = [float(stage.figures["chi2_per_dof"]) for stage in task.stages.done if "chi2_per_dof" in stage.figures]
     if fits and fits[-1] > _POOR_FIT:
@@ -278,4 +288,4 @@ def check_fit(task: Task) -> None:
             f"the residuals are {times:.1f} times as large as the noise allows (chi2/dof {fits[-1]:.1f}): a sensor or one of "
             "its settings is wrong; see the residuals in report.html"
         )
-        task.stages.doubt("poor-fit", text, chi2_per_dof=fits[-1])
+        yield doubt("poor-fit", text, chi2_per_dof=fits[-1])

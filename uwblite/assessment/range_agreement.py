@@ -1,12 +1,15 @@
 """Test whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
+from ..findings import WARNING, Finding, doubt, kinds, of_severity, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.progress import WHEELS_AGAINST_LIDAR, of_recordings
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .certainty import allowed_error
 
@@ -24,7 +27,7 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
     return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs_of(bad) if b - a >= 2]
 
 
-def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:
+def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> Iterator[Finding]:
     """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
 
     Without a lidar, ranges alone determine the path: where half of the anchors disagree for long, that is a doubt.
@@ -43,7 +46,7 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
             heard, wrong = heard + bool(own.any()), wrong + bool(stretches)
             if stretches:
                 when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
-                task.stages.warn(
+                yield warning(
                     "sustained-outliers",
                     f"{where}anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
                     "its line of sight was blocked, or it was moved; these ranges are down-weighted",
@@ -54,27 +57,29 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
                 f"{where}{wrong} of {heard} anchors disagree with the map for long, and only ranges and odometry constrain the "
                 "path: the others may be too few; map the parts before and after separately, or give the anchors' places"
             )
-            task.stages.doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
+            yield doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
 
 
-def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:
+def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
     """Doubt another unit of the wheels where only ranges support it, and these contradict each other."""
-    kinds = {notice.kind for notice in task.stages.warnings}
-    if task.recordings.have_scans or "odometry-unit" not in kinds:
+    said = kinds(of_severity(task.stages.findings, WARNING))
+    if task.recordings.have_scans or "odometry-unit" not in said:
         return
     statuses = [anchor.status for anchor in anchors]
     few = "distrusted" in statuses and sum(status not in ("distrusted", "unplaced") for status in statuses) <= _ENOUGH
-    if few or "sustained-outliers" in kinds or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
+    if few or "sustained-outliers" in said or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
         text = (
             "the odometry was rescaled by the ranges alone, and "
             + ("an anchor is distrusted: too few are left to check it" if few else "an anchor was moved or disagrees for long")
             + "; give the anchors' places, or the distance between two of them"
         )
-        task.stages.doubt("odometry-unit", text)
+        yield doubt("odometry-unit", text)
 
 
-def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Turn the doubt that wheels and lidar contradict each other into a warning where ranges decide for the lidar.
+def check_wheels_against_lidar(
+    table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task
+) -> Iterator[Finding]:
+    """Doubt a map whose wheels and lidar contradict each other; a warning where the ranges decide for the lidar.
 
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
     question, would not agree with a path that the lidar has bent: then only the wheels are wrong. Anchors that seem to have
@@ -84,20 +89,23 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     ----------
     table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
-    against = [notice for notice in task.stages.doubts if notice.kind == "wheels-against-lidar"]
-    if not against or not len(table.get("stamp", ())):
-        return
-    if any(name_and_number(a.id)[1] > 1 for a in anchors):
+    recorded = of_recordings([recording.log for recording in task.recordings.each])
+    against = [finding for finding in recorded if finding.kind == WHEELS_AGAINST_LIDAR]
+    used = bool(len(table.get("stamp", ()))) and not any(name_and_number(a.id)[1] > 1 for a in anchors)
+    if not against or not used:
+        yield from against
         return
     still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.int64)]
     stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
-    for notice in against:
+    for finding in against:
         # Clocks of different recordings may show the same times.
-        own = table["recording"] == notice.figures["recording"] - 1
-        inside = [own & still & (stamps >= a) & (stamps <= b) for a, b in notice.figures["stretches"]]
+        own = table["recording"] == finding.recording - 1
+        inside = [own & still & (stamps >= a) & (stamps <= b) for a, b in finding.stretches]
         agree = own.any() and near[own].mean() >= _MOST_NEAR
         if agree and all(len(set(anchor[r].tolist())) >= _ENOUGH and near[r].mean() >= _MANY_NEAR for r in inside):
-            task.stages.settle(notice, "the ranges agree with the lidar there: check the wheels")
+            text = f"{finding.text}; the ranges agree with the lidar there: check the wheels"
+            finding = replace(finding, severity=WARNING, text=text)
+        yield finding
 
 
 _ENOUGH, _NEAR = 3, 0.3
@@ -108,7 +116,7 @@ _MOST_NEAR, _MANY_NEAR = 0.85, 0.6
 0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
 
 
-def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, sigma: float, task: Task) -> None:
+def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, sigma: float, task: Task) -> Iterator[Finding]:
     """Doubt a map that rests on ranges of which many to one anchor are shorter than the distance.
 
     Obstacles and radios make ranges longer. Where the lidar determines the trajectory, or other anchors do so well, the anchor
@@ -127,7 +135,7 @@ def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, si
         "anchor stood elsewhere for a time, or the trajectory is wrong, and no lidar tells which; give the anchors' places or "
         "heights"
     )
-    task.stages.doubt("short-ranges", text, short=count, ranges=measured)
+    yield doubt("short-ranges", text, short=count, ranges=measured)
 
 
 def many_short(short: int, count: int) -> bool:

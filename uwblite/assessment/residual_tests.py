@@ -4,10 +4,13 @@ Every test compares the residuals of the estimate with the sensor's own noise, o
 is not specific to one fault.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
+from ..findings import DOUBT, Finding, doubt, kinds, of_severity, warning
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
@@ -46,18 +49,18 @@ _SCALE = 0.12
 """Relative difference of lengths by two sensors beyond which one of them is wrong."""
 
 
-def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> None:
+def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
     """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, contradict."""
-    check_range_scatter(estimate, residuals, grid, task)
-    check_odometry_steps(estimate, task)
-    check_odometry_jumps(estimate, task)
-    check_untied_breaks(estimate, task)
-    check_slips(estimate, task)
-    check_scales(estimate, task)
-    check_support(estimate, task)
+    yield from check_range_scatter(estimate, residuals, grid, task)
+    yield from check_odometry_steps(estimate, task)
+    yield from check_odometry_jumps(estimate, task)
+    yield from check_untied_breaks(estimate, task)
+    yield from check_slips(estimate, task)
+    yield from check_scales(estimate, task)
+    yield from check_support(estimate, task)
 
 
-def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> None:
+def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
     """Compare how ranges scatter about the map with how they scatter from one to the next.
 
     Behind metal shelves, ranges are too long by half a metre, but none is too short. Where a lidar shows the obstacles, only
@@ -87,7 +90,7 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
             f"the ranges differ from the map by {typical:.2f} m (median), but from one to the next by {short:.2f} m only: the "
             "radio's clock, anchor ids or the trajectory are wrong"
         )
-    task.stages.doubt("range-scatter", text, typical=typical, short_term=short)
+    yield doubt("range-scatter", text, typical=typical, short_term=short)
 
 
 def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Bools:
@@ -96,7 +99,7 @@ def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Boo
     return blocked(ranges.tag_positions(graph.poses), graph.anchors[ranges.anchor], walls)
 
 
-def check_odometry_steps(estimate: Estimate, task: Task) -> None:
+def check_odometry_steps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be.
 
     They are a doubt of the map, unless the lidar fixes the poses there by itself: from other visits, or from clear and
@@ -109,18 +112,18 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
     off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
     confirmed = _confirmed(graph, task.recordings.path)
     fixed = confirmed[wheels.i] & confirmed[wheels.j]
-    if not any(notice.kind in _CONTRADICTED for notice in task.stages.doubts):
+    if kinds(of_severity(task.stages.findings, DOUBT)).isdisjoint(_CONTRADICTED):
         fixed |= _fixed_by_neighbours(graph)[wheels.i]
-    say, text = task.stages.doubt, "most steps of the odometry contradict the map far beyond their noise"
+    say, text = doubt, "most steps of the odometry contradict the map far beyond their noise"
     stretch = _stretch(off & ~fixed)
     if stretch is None and (stretch := _stretch(off)) is not None:
-        say, text = task.stages.warn, text + "; the map follows the lidar, which determines every pose there: check them"
+        say, text = warning, text + "; the map follows the lidar, which determines every pose there: check them"
     if stretch is not None:
         a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
-        say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
+        yield say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
 
 
-def check_slips(estimate: Estimate, task: Task) -> None:
+def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find single steps of the odometry that are far off by the ranges, where no lidar measures them instead.
 
     A robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
@@ -140,8 +143,8 @@ def check_slips(estimate: Estimate, task: Task) -> None:
             f"at t = {when}{' ...' if len(at) > 5 else ''} s the ranges contradict the odometry by up to {way:.2f} m and "
             f"{turn:.2f} rad: the wheels slipped or were stuck, or the robot was carried"
         )
-        say = task.stages.doubt if max(way, turn) > _CARRIED else task.stages.warn
-        say("odometry-slips", text, way=way, turn=turn)
+        say = doubt if max(way, turn) > _CARRIED else warning
+        yield say("odometry-slips", text, way=way, turn=turn)
 
 
 def _measured_by_lidar(graph: Graph) -> Ints:
@@ -169,7 +172,7 @@ def _confirmed(graph: Graph, path: Floats) -> Bools:
     return confirmed
 
 
-def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
+def check_odometry_jumps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map in which the robot jumps from one keyframe to the next and neither odometry nor scans measured it.
 
     Then only closures support the jump, and in repetitive corridors they may all have the same error. With anchors, steps
@@ -186,7 +189,7 @@ def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
         return
     worst = int(np.argmax(far))
     when = float(stamps[wheels.i[rows[worst]]] - stamps[0])
-    task.stages.doubt(
+    yield doubt(
         "odometry-jumps",
         f"at t = {when:.0f} s map and odometry differ by {far[worst]:.1f} m over one step, and no scan "
         f"measures it ({len(rows)} such steps): loop closures there may join different places that look the same",
@@ -198,7 +201,7 @@ _FAR = 1.0
 """m; no wheel slips by that within one step between keyframes."""
 
 
-def check_untied_breaks(estimate: Estimate, task: Task) -> None:
+def check_untied_breaks(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall.
 
     Ranges connect the parts before and after, unless those of half of the anchors contradict the map in one of them.
@@ -214,7 +217,7 @@ def check_untied_breaks(estimate: Estimate, task: Task) -> None:
         links = wheels.j[links]
     at = (stamps[links - 1] - stamps[0]).tolist()
     if at:
-        task.stages.doubt(
+        yield doubt(
             "loose-links",
             f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s the odometry fails where "
             "the lidar cannot measure the travelled distance, as along a bare wall, and no loop closure connects the parts "
@@ -252,7 +255,7 @@ def _fixed_by_neighbours(graph: Graph) -> Bools:
     return (scans_fixing(graph) >= _REDUNDANT) & moves
 
 
-def check_scales(estimate: Estimate, task: Task) -> None:
+def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Compare the lengths that odometry, lidar and radio measure."""
     calibration, lidar = estimate.graph.calibration, task.recordings.have_scans
     place = calibration.index(RANGE_SCALE)
@@ -261,7 +264,7 @@ def check_scales(estimate: Estimate, task: Task) -> None:
         text = f"the ranges are {scale:.2f} times the distances on the map: " + (
             "lidar or radio has a wrong unit" if lidar else "a radio measures time of flight, so the odometry has a wrong unit"
         )
-        task.stages.doubt("scales", text, range_scale=scale)
+        yield doubt("scales", text, range_scale=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]
@@ -271,17 +274,17 @@ def check_scales(estimate: Estimate, task: Task) -> None:
             f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and {outcome} the distances on the "
             "map, which has the lidar's scale; check the units of both"
         )
-        task.stages.doubt("scales", text, lidar_by_wheels=float(off[0]))
+        yield doubt("scales", text, lidar_by_wheels=float(off[0]))
 
 
-def check_support(estimate: Estimate, task: Task) -> None:
+def check_support(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map that nothing but the odometry constrains."""
     ranges = estimate.ranges
     constrained = ranges is not None and bool(ranges.alive.any())
     constrained |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
     if not constrained and len(estimate.graph.poses) > 2:
         text = "neither ranges nor scans constrain the trajectory: it is the odometry's, which drifts; check the other sensors"
-        task.stages.doubt("odometry-alone", text)
+        yield doubt("odometry-alone", text)
 
 
 def _spread_by_anchor(residuals: Floats, anchor: Ints) -> Floats:

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
+from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
 from ..graph.covariances import Covariances, shape_error
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
+from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from ..pipeline.anchor_moves import SHORT
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
@@ -77,12 +78,11 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
         range_table=table,
         grid=grid,
         stages=tuple(stages.done),
-        warnings=tuple(stages.warnings),
-        doubts=tuple(stages.doubts),
+        findings=tuple(stages.findings),
     )
 
 
-def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -> tuple[AnchorEstimate, ...]:
+def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Finding]) -> tuple[AnchorEstimate, ...]:
     """Return the anchors, none of them 'ok' where a doubt is about the whole map."""
     if all(doubt.kind in _ABOUT_PARTS for doubt in doubts):
         return anchors

@@ -5,9 +5,12 @@ connects the later part of the map with the earlier one. Its errors meanwhile (w
 continues in another building) leave no residual. Where all other sensors end, the odometry alone determines the rest.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
@@ -25,11 +28,11 @@ _AT_ONCE = 10.0
 """s; anchors that all end, and others that all appear, within this time were not passed one after the other."""
 
 
-def check_untied_parts(estimate: Estimate, task: Task) -> None:
+def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map whose parts only the odometry connects, where another sensor had no data in between."""
     ranges = estimate.ranges
     alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
-    check_loose_ends(estimate, alive, task)
+    yield from check_loose_ends(estimate, alive, task)
     for recording in task.recordings.each:
         stamps = recording.frames.stamps
         breaks = _without_scans(recording) if recording.has_scans else _exchanged(recording, alive)
@@ -40,7 +43,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
             if min(sizes) < _PART or _tied(estimate.graph, alive, first, last):
                 continue
             what = "the lidar is silent" if recording.has_scans else "all anchors are replaced by others"
-            task.stages.doubt(
+            yield doubt(
                 "untied-parts",
                 f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors "
                 "connect the parts before and after: each may be right, but their relative pose rests on the odometry alone; "
@@ -49,7 +52,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
             )  # fmt: skip
 
 
-def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> None:
+def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> Iterator[Finding]:
     """Doubt a map with a beginning or an end that no scan, closure or range constrains, where usual wheels drift too far.
 
     Errors of the wheels there leave no residual, and sigmas assume faultless wheels. The middle of a recording
@@ -69,7 +72,7 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
         for word, at, way, lengths, durations in ends:
             off, seconds = float(dead_reckoning_error(way, lengths, durations).max()), frames.stamps[at] - frames.stamps[0]
             if off > _ASTRAY:
-                task.stages.doubt(
+                yield doubt(
                     "untied-parts",
                     f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
                     f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "

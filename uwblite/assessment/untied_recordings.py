@@ -1,12 +1,15 @@
 """Recordings of which it is not sure that they are of one place: most of their common anchors stand elsewhere."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from ..findings import Finding, doubt
 from ..pipeline.estimate import Estimate, Task
 from ..sensor_log.anchor_names import radio_name
 
 
-def check_untied_recordings(estimate: Estimate, task: Task) -> None:
+def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a recording that has hardly more anchors where the others have them than elsewhere, and no closure with these.
 
     Where anchors disagree, which of them were moved is a majority's word, and two that agree by chance are no majority: the
@@ -28,7 +31,7 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> None:
         moved = np.setdiff1d(np.intersect1d(radio[heard[n]], radio[others]), radio[same])
         tied = np.any((ends == n).any(axis=0) & (ends[0] != ends[1]))
         if len(moved) and int(same.sum()) - len(moved) < _MAJORITY and not tied:
-            task.stages.doubt(
+            yield doubt(
                 "untied-parts",
                 f"{recording.name} has {int(same.sum())} anchors where the others have them and {len(moved)} elsewhere "
                 f"({', '.join(moved.tolist())}), and no loop closure with them: it may lie elsewhere, or be of another place; "

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..errors import DataError
-from ..map_result import AnchorEstimate, CalibrationEstimate, Notice
+from ..findings import DOUBT
+from ..findings import Finding as MapFinding
+from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .findings import Finding, Findings
@@ -40,7 +42,7 @@ def diagnose(
     *,
     anchors: tuple[AnchorEstimate, ...] = (),
     calibration: tuple[CalibrationEstimate, ...] = (),
-    doubts: tuple[Notice, ...] | None = None,
+    doubts: tuple[MapFinding, ...] | None = None,
     refused: str = "",
 ) -> Diagnosis:
     """Examine a recording.
@@ -75,7 +77,7 @@ def _advice_without_ranges(log: SensorLog) -> str:
     return "the map rests on wheels and lidar; check the tag if that is not meant"
 
 
-def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: Findings) -> None:
+def _check_screening(log: SensorLog, doubts: tuple[MapFinding, ...] | None, found: Findings) -> None:
     """Faults that a map repairs are warnings, those that it doubts or refuses are serious, except doubts that the map
     settled."""
     try:
@@ -87,14 +89,14 @@ def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: F
     sensors = [s for s in (repaired.ranges, repaired.scans) if s is not None and len(s.stamps) > 1]
     if not sensors:
         found.serious("log", "neither ranges nor scans are left to constrain the trajectory", "odometry alone drifts")
-    for remark in screening.remarks if screening is not None else ():
-        if remark.doubt and (doubts is None or remark.kind in {doubt.kind for doubt in doubts}):
+    for remark in screening.findings if screening is not None else ():
+        if remark.severity == DOUBT and (doubts is None or remark.kind in {doubt.kind for doubt in doubts}):
             found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
 
 
-def _check_map(doubts: tuple[Notice, ...], refused: str, found: Findings) -> None:
+def _check_map(doubts: tuple[MapFinding, ...], refused: str, found: Findings) -> None:
     """The doubts of the check's map, or the reason why there is none, without those of the screening."""
     said = {finding.what for finding in found.ranked()}
     for text in [doubt.text for doubt in doubts] + ([refused] if refused else []):

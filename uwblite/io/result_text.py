@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats, Ints
-from ..map_result import MapResult, Notice
+from ..findings import Finding
+from ..map_result import MapResult
 from ..report.printable import csv_field, encodable
 from ..sensor_log import LogNotes, SensorLog
 
@@ -166,7 +167,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
     return ready
 
 
-def notices(found: Sequence[Notice]) -> list[dict[str, Any]]:
+def notices(found: Sequence[Finding]) -> list[dict[str, Any]]:
     """Return warnings or doubts as JSON-ready records."""
     return [{"kind": n.kind, "text": n.text, "figures": n.figures} for n in found]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import Cancelled, DataError
-from ..map_result import Notice
+from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .known_map import KnownMap
@@ -40,8 +40,8 @@ class Localization:
     """Share of the recording's poses that are known, 0..1."""
     overlap: float
     """Share of the rays' ends that lie on walls of the map, of those in its known space; nan without walls to compare."""
-    warnings: tuple[Notice, ...]
-    doubts: tuple[Notice, ...]
+    warnings: tuple[Finding, ...]
+    doubts: tuple[Finding, ...]
 
 
 def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progress: Progress | None = None) -> Localization:
@@ -78,7 +78,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     ends = passes[0].ends + passes[1].ends
     overlap = float(ends[0] / ends[1]) if ends[1] else float("nan")
     localized, agreed = float(there.mean()), 1.0 - float(found.contradicting[there].mean())
-    warnings, more = _notices(log, known, passes, localized, agreed, overlap)
+    warnings, more = _findings(log, known, passes, localized, agreed, overlap)
     return Localization(
         log.odometry.stamps[rows][there], found.poses[there], found.covariances[there], localized, overlap,
         warnings, (*doubts, *more),
@@ -117,35 +117,34 @@ def _refuse_nothing_in_common(log: SensorLog, known: KnownMap) -> None:
         )
 
 
-def _notices(
+def _findings(
     log: SensorLog, known: KnownMap, passes: tuple[Pass, Pass], localized: float, agreed: float, overlap: float
-) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
+) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """Return warnings and doubts."""
-    remarks = () if log.screening is None else log.screening.remarks
-    warnings = [Notice(r.kind, r.text) for r in remarks if not r.doubt]
-    doubts = [Notice(r.kind, r.text) for r in remarks if r.doubt]
+    remarks = () if log.screening is None else log.screening.findings
+    found = [*remarks]
     shared = len(_shared(log, known))
     if shared < 2:
         text = f"it has ranges to {shared} of the map's anchors: its place is from the walls alone"
-        warnings.append(Notice("few-common-anchors", text, {"anchors": shared}))
+        found.append(warning("few-common-anchors", text, anchors=shared))
     for name in sorted({n for p in passes for n in p.moved_anchors}):
         text = f"anchor {name} does not stand where the map has it: it was moved; its ranges were left out"
-        warnings.append(Notice("moved-anchor", text, {"anchor": name}))
+        found.append(warning("moved-anchor", text, anchor=name))
     if overlap < LEAST_OVERLAP:
-        doubts.append(_walls_differ(f"overlap {overlap:.0%}"))
+        found.append(_walls_differ(f"overlap {overlap:.0%}"))
     if localized < 1.0:
         reason = passes[0].reason or passes[1].reason or "measurements and map fell apart meanwhile"
         text = f"{1.0 - localized:.0%} of the recording is not localized and left out: {reason}"
-        notices = doubts if localized < LEAST_LOCALIZED else warnings
-        notices.append(Notice("not-localized", text, {"localized": round(localized, 4)}))
+        say = doubt if localized < LEAST_LOCALIZED else warning
+        found.append(say("not-localized", text, localized=round(localized, 4)))
     if agreed < LEAST_LOCALIZED:
         text = f"forwards and backwards the recording is found at different places for {1.0 - agreed:.0%} of its poses"
-        doubts.append(Notice("ambiguous-place", text, {"agreed": round(agreed, 4)}))
-    return tuple(warnings), tuple(doubts)
+        found.append(doubt("ambiguous-place", text, agreed=round(agreed, 4)))
+    return of_severity(found, WARNING), of_severity(found, DOUBT)
 
 
-def _walls_differ(why: str) -> Notice:
-    return Notice(
+def _walls_differ(why: str) -> Finding:
+    return doubt(
         "walls-differ",
         f"the walls do not lie on those of the map ({why}): the place has changed, or it is another; the position rests on "
         "the anchors alone",

@@ -11,10 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..findings import WARNING, Finding, warning
 from ..radio.change_points import ON_GIVEN_PATH, ON_OWN_PATH, Evidence, Move, find_moves
 from ..radio.range_noise import short_term_sigma
 from ..radio.trilateration import usable
-from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
+from ..sensor_log import OdometryBreaks, Screening, SensorLog, UwbRanges
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .estimate import Estimate, Task
 from .radio_stages import first_optimisation
@@ -98,8 +99,8 @@ SHORT = 0.5
 """m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
 
 
-def _remarks(log: SensorLog) -> tuple[Remark, ...]:
-    return () if log.screening is None else log.screening.remarks
+def _remarks(log: SensorLog) -> tuple[Finding, ...]:
+    return () if log.screening is None else log.screening.findings
 
 
 def _of_all(log: SensorLog, moves: Moves) -> Moves:
@@ -168,12 +169,12 @@ def _said_of(log: SensorLog, places: set[str]) -> SensorLog:
     if log.screening is None:
         return log
     said = []
-    for remark in log.screening.remarks:
-        if not remark.place or remark.place in places:
+    for remark in log.screening.findings:
+        if not remark.anchor or remark.anchor in places:
             said.append(remark)
-        elif remark.without_place:
-            said.append(Remark("sustained-outliers", remark.without_place))
-    return replace(log, screening=replace(log.screening, remarks=tuple(said)))
+        elif remark.cure:
+            said.append(warning("sustained-outliers", remark.cure))
+    return replace(log, screening=replace(log.screening, findings=tuple(said)))
 
 
 def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
@@ -186,7 +187,7 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
         return log
     names = np.asarray(ranges.anchor_ids)[ranges.anchor].astype(object)
     measured, heights = ranges.ranges.copy(), dict(log.mounting.anchor_heights)
-    remarks: list[Remark] = []
+    remarks: list[Finding] = []
     for name, found in moves.items():
         base, number = name_and_number(name)
         own = names == name
@@ -205,14 +206,14 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
                 less = f" (its {carried.sum()} ranges meanwhile were left out)"
                 without = f"anchor {name} seemed to be moved by {move.distance:.1f} m {when}{less}: {_SAME}"
             text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}; from then on it is called {other}"
-            remarks.append(Remark("moved-anchor", text, place=other, without_place=without))
+            remarks.append(Finding("moved-anchor", WARNING, text, without, anchor=other))
     ids, anchor = np.unique(names.astype(str), return_inverse=True)
     before = log.screening or Screening((), OdometryBreaks.none())
     return replace(
         log,
         ranges=replace(ranges, ranges=measured, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())),
         mounting=replace(log.mounting, anchor_heights=heights),
-        screening=replace(before, remarks=(*before.remarks, *remarks)),
+        screening=replace(before, findings=(*before.findings, *remarks)),
     )
 
 

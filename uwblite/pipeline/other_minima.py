@@ -6,7 +6,7 @@ and its covariance does not contain the other side. So wherever the trajectory c
 on the other side once, and the same problem is solved from there; and again from each optimum found in this way.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, rms_length, runs_of
 from ..errors import SolverError
+from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
 from .estimate import Estimate, Task
@@ -41,7 +42,7 @@ def at_best(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate.with_estimates_of(best), other_minimum=others[0]) if others else estimate
 
 
-def check_other_minimum(estimate: Estimate, task: Task) -> None:
+def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
     graph, other = estimate.graph, estimate.other_minimum
     if task.recordings.have_scans or len(task.recordings) > 1:
@@ -55,7 +56,7 @@ def check_other_minimum(estimate: Estimate, task: Task) -> None:
                 f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
                 f"{off:.1f} m (rms) away (chi2 {more:+.1f}): place an anchor off that line, or give the places of the anchors"
             )
-            task.stages.doubt("other-side", text, apart=off, chi2=more)
+            yield doubt("other-side", text, apart=off, chi2=more)
             return
 
 

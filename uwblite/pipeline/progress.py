@@ -1,10 +1,12 @@
 """Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
 
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 
 from ..errors import Cancelled
+from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..graph.solver import SolverSummary
-from ..map_result import Notice, StageSummary
+from ..map_result import StageSummary
 from ..sensor_log import SensorLog
 
 
@@ -36,17 +38,21 @@ class Stages:
         self._progress, self._clock = progress, clock
         self._since = clock() if clock else 0.0
         self.done: list[StageSummary] = []
-        self.warnings: list[Notice] = []
-        self.doubts: list[Notice] = []
+        self.findings: list[Finding] = []
+
+    @property
+    def warnings(self) -> list[Finding]:
+        """The findings that are warnings."""
+        return list(of_severity(self.findings, WARNING))
+
+    @property
+    def doubts(self) -> list[Finding]:
+        """The findings that are doubts."""
+        return list(of_severity(self.findings, DOUBT))
 
     def note(self, logs: Sequence[SensorLog]) -> None:
-        """Take over what the screening of the recordings found."""
-        for number, log in enumerate(logs):
-            where = f"recording {number + 1}: " if len(logs) > 1 else ""
-            for remark in log.screening.remarks if log.screening is not None else ():
-                add = self.doubt if remark.doubt else self.warn
-                figures = {"recording": number + 1, "stretches": remark.stretches} if remark.stretches else {}
-                add(remark.kind, where + remark.text, **figures)
+        """Take over what the screening of the recordings found, but for what only a finished map can judge."""
+        self.findings += [finding for finding in of_recordings(logs) if finding.kind != WHEELS_AGAINST_LIDAR]
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
@@ -56,31 +62,27 @@ class Stages:
 
     def warn(self, kind: str, text: str, **figures: object) -> None:
         """Add a warning."""
-        self.warnings.append(Notice(kind, text, figures))
+        self.findings.append(warning(kind, text, **figures))
 
     def withdraw(self, kind: str, figure: str, but: Container[object] = ()) -> None:
         """Remove all warnings of a kind that have a figure, but those where it is one of some values."""
-        self.warnings = [
-            notice for notice in self.warnings
-            if notice.kind != kind or figure not in notice.figures or notice.figures[figure] in but
+        self.findings = [
+            finding for finding in self.findings
+            if finding.severity != WARNING or finding.kind != kind or figure not in finding.figures
+            or finding.figures[figure] in but
         ]  # fmt: skip
 
     def doubt(self, kind: str, text: str, **figures: object) -> None:
         """Add a reason not to trust the result."""
-        self.doubts.append(Notice(kind, text, figures))
+        self.findings.append(doubt(kind, text, **figures))
 
-    def settle(self, doubt: Notice, by: str) -> None:
-        """Turn a doubt into a warning, and add the reason that settles it."""
-        self.doubts.remove(doubt)
-        self.warn(doubt.kind, f"{doubt.text}; {by}", **doubt.figures)
+    def mark(self) -> tuple[Finding, ...]:
+        """Return what was found so far."""
+        return tuple(self.findings)
 
-    def mark(self) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
-        """Return the warnings and doubts reported so far."""
-        return tuple(self.warnings), tuple(self.doubts)
-
-    def back_to(self, mark: tuple[tuple[Notice, ...], tuple[Notice, ...]]) -> None:
-        """Restore an earlier list of notices, because the stages that reported the later ones run again."""
-        self.warnings, self.doubts = list(mark[0]), list(mark[1])
+    def back_to(self, mark: tuple[Finding, ...]) -> None:
+        """Restore earlier findings, because the stages that made the later ones run again."""
+        self.findings = list(mark)
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
@@ -92,6 +94,20 @@ class Stages:
     def reporter(self, stage: str) -> Callable[[int, int], None]:
         """Return a callback (done, total) for one stage."""
         return lambda done, total: self.report(stage, done, total)
+
+
+def of_recordings(logs: Sequence[SensorLog]) -> list[Finding]:
+    """Return what the screening found in recordings, each with its recording's number and, where there are several, name."""
+    found = []
+    for number, log in enumerate(logs):
+        where = f"recording {number + 1}: " if len(logs) > 1 else ""
+        own = () if log.screening is None else log.screening.findings
+        found += [replace(finding, text=where + finding.text, recording=number + 1) for finding in own]
+    return found
+
+
+WHEELS_AGAINST_LIDAR = "wheels-against-lidar"
+"""Kind of a finding of which the map may show that it is a warning only."""
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:

@@ -1,10 +1,12 @@
 """The odometry in turns: its scale, which must be one constant that no single wrong turn changes; and the point about which
 the robot turns."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from ..findings import Finding, doubt
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
@@ -38,26 +40,26 @@ def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, graph=replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed))
 
 
-def check_turn_scales(estimate: Estimate, task: Task) -> None:
+def check_turn_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map whose scale of turns is not that of the lidar's own steps, or differs between parts of the recording."""
     for edges in estimate.graph.edges:
         if isinstance(edges, ScanEdges):
             for index, found in turn_scales(estimate.odometry, edges, estimate.graph).items():
-                _judge(found, float(estimate.graph.calibration.values[index]), task)
+                yield from _judge(found, float(estimate.graph.calibration.values[index]), task)
 
 
-def _judge(found: TurnScale, used: float, task: Task) -> None:
+def _judge(found: TurnScale, used: float, task: Task) -> Iterator[Finding]:
     """Return the text about what is wrong with the scale that a map uses."""
     if found.varies:
         parts = ", ".join(f"{1.0 + value:.2f}" for value in found.stretches)
-        task.stages.doubt(
+        yield doubt(
             "turn-scale",
             f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no calibration "
             "changes so; the map's heading is wrong, or the odometry failed",
             stretches=found.stretches.tolist(),
         )  # fmt: skip
     elif abs(used - found.value) > _WRONG and found.contradicts(used):
-        task.stages.doubt(
+        yield doubt(
             "turn-scale",
             f"the map multiplies the odometry's turns by {1.0 + used:.2f}, but from step to step the lidar turns "
             f"{_shown(found)} times as much: a turn of the map or a loop closure is wrong",

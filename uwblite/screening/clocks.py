@@ -6,8 +6,9 @@ import numpy as np
 
 from ..arrays import Floats, weighted_median
 from ..errors import DataError
+from ..findings import Finding, doubt, warning
 from ..odometry.attached import OUTSIDE
-from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
+from ..sensor_log import LaserScans, SensorLog, UwbRanges
 
 _FEW_STAMPS = 20
 """Stamps that may be equal by chance."""
@@ -35,7 +36,7 @@ def refuse_without_stamps(log: SensorLog) -> None:
         )
 
 
-def made_up(log: SensorLog) -> list[Remark]:
+def made_up(log: SensorLog) -> list[Finding]:
     """Report stamps on a grid too coarse for a sensor's clock: they were made by counting messages."""
     if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
         return []
@@ -47,19 +48,19 @@ def made_up(log: SensorLog) -> list[Remark]:
         f"odometry and scans are stamped exactly every {period:g} s: these stamps were generated, not measured, so speeds, "
         "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock"
     )
-    return [Remark("made-up-stamps", text)]
+    return [warning("made-up-stamps", text)]
 
 
-def set_back(log: SensorLog) -> list[Remark]:
+def set_back(log: SensorLog) -> list[Finding]:
     """Return a doubt for each sensor whose clock was set back."""
     return [
-        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there", doubt=True)
+        doubt("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there")
         for sensor, by in log.notes.set_back.items()
         if by > 1.0
     ]
 
 
-def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Undo jumps forward of one clock: gaps without which odometry and sensor end together, and with which they do not.
 
     The odometry's stamps stay: where its own clock jumped, those of the other sensors follow.
@@ -77,7 +78,7 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
             f"the clock of the {what if ahead else 'odometry'} was set forward by {by:.1f} s at t = {at - odometry[0]:.0f} s, "
             f"as the ends of the sensors show: the {what}'s later stamps were moved by {moved:+.1f} s"
         )
-        remarks.append(Remark("clock-jump", text))
+        remarks.append(warning("clock-jump", text))
     return log, remarks
 
 
@@ -96,7 +97,7 @@ def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
     return (float(stamps[longest]), by) if abs(stamps[-1] - by - end) < _SAME_END else None
 
 
-def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Leave out scans outside the odometry's time; report how many, and how many ranges. Doubt the recording where most are.
 
     Ranges outside it stay in the recording; a map gives them no weight.
@@ -116,7 +117,7 @@ def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
             f"{np.sum(outside)} of {len(outside)} {name} were stamped outside the odometry's time and left out: {differ}"
             "start the odometry first and stop it last, and use one clock"
         )
-        remarks.append(Remark(f"{name}-outside-odometry", text, doubt=share > _MOST))
+        remarks.append((doubt if share > _MOST else warning)(f"{name}-outside-odometry", text))
     return log, remarks
 
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
+from ..findings import Finding, doubt, warning
 from ..lidar import laser_mounting
-from ..sensor_log import Odometry, Remark, SensorLog
+from ..sensor_log import Odometry, SensorLog
 from .units import heading_agreement
 from .wheel_motion import Pairs
 
@@ -23,7 +24,7 @@ _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
 _LEAST_PAIRS = 15
 
 
-def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Return the recording with the heading's sign that agrees with the path; a lidar decides which is right."""
     plain, varied = heading_agreement(log.odometry)
     if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
@@ -36,7 +37,7 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     text = f"the odometry's heading turns against its path: {best} was inverted"
     if not one_fits:
         text += "; nothing in the recording shows whether the map is mirrored, so compare it with the building"
-    return tried[best], [Remark("heading-against-path", text)]
+    return tried[best], [warning("heading-against-path", text)]
 
 
 def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
@@ -51,7 +52,7 @@ def _fits_laser(log: SensorLog) -> float:
     return -1.0 if seen.turned_over else 1.0
 
 
-def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Return the recording with the laser mounted upright or upside down, as its turns show.
 
     A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in
@@ -66,10 +67,10 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
         f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
     )
-    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser-turned-over", text, doubt=True)]
+    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [doubt("laser-turned-over", text)]
 
 
-def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
+def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Finding]]:
     """Return the recording with the direction of the laser that the driving shows, where that is far from the given one."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
     clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
@@ -94,7 +95,7 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
         f"measure; corrected: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
     )
     mounting = replace(log.mounting, T_base_laser=mount, tag_position=tags[0], more_tags=tags[1:])
-    return replace(log, mounting=mounting), [Remark("laser-turned-away", text)]
+    return replace(log, mounting=mounting), [warning("laser-turned-away", text)]
 
 
 def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> float:

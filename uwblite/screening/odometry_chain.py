@@ -13,7 +13,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..errors import DataError
-from ..sensor_log import Odometry, OdometryBreaks, Remark
+from ..findings import Finding, warning
+from ..sensor_log import Odometry, OdometryBreaks
 from .units import FASTEST
 
 _LEAST_JUMP = 0.3
@@ -62,7 +63,7 @@ class Motion:
         return (length > _LEAST_JUMP + self.speed[0] * time) | (turn > _LEAST_SPIN + self.speed[1] * time)
 
 
-def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
+def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Finding]]:
     """Leave out readings whose removal makes the chain continuous again.
 
     Raises
@@ -91,10 +92,10 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
         return odometry, []
     first = float(odometry.stamps[np.argmax(wrong)] - odometry.stamps[0])
     text = f"{int(wrong.sum())} odometry readings lie far from the path (the first at t = {first:.1f} s) and were left out"
-    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [Remark("odometry-glitches", text)]
+    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [warning("odometry-glitches", text)]
 
 
-def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]]:
+def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Finding]]:
     """Join the two sides of each jump by predicted motion, and return its uncertainty."""
     motion = Motion.of(odometry)
     jumps = motion.jumps()
@@ -116,7 +117,7 @@ def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]
         "sensors connect the path before and after"
     )
     joined = Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))
-    return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [Remark("odometry-breaks", text)]
+    return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [warning("odometry-breaks", text)]
 
 
 def without_repeats(odometry: Odometry) -> tuple[Odometry, int]:

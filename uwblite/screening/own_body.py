@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Ints, runs_of
-from ..sensor_log import LaserScans, Remark, SensorLog
+from ..findings import Finding, warning
+from ..sensor_log import LaserScans, SensorLog
 
 _SECTOR = np.deg2rad(30.0)
 """Turn after which walls are elsewhere in a scan, rad: a robot that follows a wall has it at one side only without turns."""
@@ -18,7 +19,7 @@ _STEADY, _SHARE, _ENOUGH = 0.04, 0.8, 500
 the median."""
 
 
-def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Remove readings that stay the same at all places and headings of the robot."""
     scans = log.scans
     if scans is None or not len(scans.stamps) or log.odometry.travelled_at(scans.stamps[-1:])[0] < _WAY:
@@ -36,7 +37,7 @@ def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         f"{int(own.sum())} of {len(own)} beams of the lidar (at {parts} degrees) see the same nearby however the robot is "
         "turned: the robot itself; they were left out"
     )
-    return replace(log, scans=replace(scans, ranges=ranges)), [Remark("repeated-readings", text)]
+    return replace(log, scans=replace(scans, ranges=ranges)), [warning("repeated-readings", text)]
 
 
 def _steady(scans: LaserScans, sector: Ints) -> Bools:

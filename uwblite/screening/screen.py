@@ -6,8 +6,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
+from ..findings import DOUBT, Finding, doubt, warning
 from ..odometry.gyro import heading_from_gyro
-from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
+from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
 from .own_body import without_own_body
 from .shared_names import without_shared_names
@@ -83,7 +84,7 @@ def _way_ratio(pairs: Pairs | None) -> float:
     return float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
 
 
-def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:
+def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Finding]]:
     """Compare wheels and lidar, with the laser in the direction that the driving shows."""
     pairs = wheel_motion.compare(log)
     if pairs is None:
@@ -94,7 +95,7 @@ def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark
     return log, wheel_motion.compare(log) if remarks else pairs, remarks
 
 
-def _hardly_moving(odometry: Odometry) -> list[Remark]:
+def _hardly_moving(odometry: Odometry) -> list[Finding]:
     """Doubt a recording of a robot that stands: nothing can be placed from one spot."""
     path = float(np.sum(np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T)))
     if path >= _SHORTEST_PATH:
@@ -104,21 +105,21 @@ def _hardly_moving(odometry: Odometry) -> list[Remark]:
         f"the robot hardly moves: {path:.2f} m in {np.ptp(odometry.stamps):.0f} s (turning {turned:.1f} rad); does the base "
         "report its wheels, in metres? Drive through the building"
     )
-    return [Remark("hardly-moving", text, doubt=True)]
+    return [doubt("hardly-moving", text)]
 
 
-def _repeats(count: int) -> list[Remark]:
+def _repeats(count: int) -> list[Finding]:
     text = f"{count} odometry readings are in the log twice; one of each was left out"
-    return [Remark("repeated-odometry", text)] if count else []
+    return [warning("repeated-odometry", text)] if count else []
 
 
-def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
+def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
     """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?"""
     stamps, poses = log.odometry.stamps, log.odometry.poses
     span = np.diff(stamps)
     period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
     gaps = np.flatnonzero(span > max(_GAP, 20.0 * period))
-    at, sigma, remarks, silent = [], [], list[Remark](), list[tuple[float, float]]()
+    at, sigma, remarks, silent = [], [], list[Finding](), list[tuple[float, float]]()
     for k in gaps.tolist():
         a, b = float(stamps[k]), float(stamps[k + 1])
         step = se2.between(poses[k], poses[k + 1])
@@ -129,10 +130,10 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
         when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
         if elsewhere:
             text = f"{when}, but the robot was moved meanwhile: only other sensors connect the path before and after"
-            remarks.append(Remark("carried", text, doubt=True))
+            remarks.append(doubt("carried", text))
         elif not stood:
             text = f"{when}, while the robot drove on; ranges and scans of that time were left out"
-            remarks.append(Remark("odometry-gap", text))
+            remarks.append(warning("odometry-gap", text))
         if elsewhere or not stood:
             silent.append((a, b))
         at.append(a)
@@ -167,13 +168,13 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
     return replace(log, ranges=ranges, scans=scans)
 
 
-def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
+def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Finding]]:
     """Find stretches in which the wheels stand and other sensors move, and replace the wheels there."""
     start = float(log.odometry.stamps[0])
     unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if pairs is None or not wheel_motion.seen(pairs, *s)]
     unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
     text = "the trajectory there rests on ranges alone"
-    remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in unseen]
+    remarks = [replace(_lost_remark(a - start, b - start, text), severity=DOUBT) for a, b in unseen]
     unknown = _unknown_steps(log.odometry, unseen)
     stretches = [] if pairs is None else wheel_motion.lost(log, pairs)
     if not stretches:
@@ -184,9 +185,9 @@ def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs 
     return log, wheel_motion.compare(log), OdometryBreaks.of_all([unknown, breaks]), remarks
 
 
-def _lost_remark(a: float, b: float, outcome: str) -> Remark:
+def _lost_remark(a: float, b: float, outcome: str) -> Finding:
     text = f"the wheels count nothing from t = {a:.0f} to {b:.0f} s while the robot moves: {outcome}"
-    return Remark("wheels-stand-still", text)
+    return warning("wheels-stand-still", text)
 
 
 def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:
@@ -199,7 +200,7 @@ def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> 
     return OdometryBreaks(odometry.stamps[before], sigma)
 
 
-def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Remark]]:
+def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Finding]]:
     """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s; jumps may be such."""
     times = cuts.found(log, jumps)
     stamps, start = log.odometry.stamps, log.odometry.stamps[0]
@@ -213,4 +214,4 @@ def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks
         f"at {where}{' ...' if len(times) > 4 else ''} the robot is suddenly elsewhere: it was carried, or the log was cut; "
         "only other sensors connect the path before and after"
     )
-    return OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1))), [Remark("carried", text, doubt=True)]
+    return OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1))), [doubt("carried", text)]

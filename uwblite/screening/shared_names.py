@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..sensor_log import Remark, SensorLog
+from ..findings import Finding, warning
+from ..sensor_log import SensorLog
 from .odometry_chain import Motion
 from .stuck_sensors import quiet_noise, resolution_of
 
@@ -27,7 +28,7 @@ _STEADY, _VARIES = 0.9, 0.7
 have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
 
 
-def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Leave out the ranges of each name that two anchors have: the place of none of them is known."""
     ranges = log.ranges
     if ranges is None or len(log.odometry.stamps) < 2:
@@ -47,7 +48,7 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
                 f"({int(leaps.sum())} of {len(leaps)} times by more than the robot drove); they were left out, "
                 "give each anchor its own name"
             )
-            remarks.append(Remark("shared-name", text))
+            remarks.append(warning("shared-name", text))
             wrong |= ranges.anchor == anchor
     if not remarks:
         return log, []

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, runs_of, white_noise
-from ..sensor_log import Remark, SensorLog
+from ..findings import Finding, doubt, warning
+from ..sensor_log import SensorLog
 
 _SAME_RANGES = 12
 """Least number of constant ranges in a row."""
@@ -35,7 +36,7 @@ _LEAST_SEEN = 10
 """Least number of beams with a reading; scans without readings may be equal."""
 
 
-def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Spread readings of odometry and lidar that share one stamp because they waited in a buffer.
 
     Each burst is spread evenly over the time since the one before; the remaining delay is calibrated.
@@ -61,19 +62,19 @@ def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
     return stamps - gap[group] * (1.0 - (place + 1.0) / size[group]), usual, between
 
 
-def _burst_remark(what: str, size: float, between: float) -> Remark:
+def _burst_remark(what: str, size: float, between: float) -> Finding:
     text = (
         f"{what} come in bursts of about {size:.0f} with one stamp, every {between:.2f} s: they were spread over the time "
         "since the previous burst; stamp each reading when it is made"
     )
-    return Remark("stamps-in-bursts", text)
+    return warning("stamps-in-bursts", text)
 
 
 _BURST, _LEAST_BURSTS = 4, 5
 """Readings with one stamp that make a burst (two or three are a coarse clock), and bursts that must be."""
 
 
-def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Leave out scans that repeat the one before to the last digit.
 
     Two in a row may be alike by chance. A driver that sends at twice the lidar's rate repeats many: each is a step of the
@@ -96,7 +97,7 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         when = _when(scans.stamps, stuck, start)
         share = f"{int(stuck.sum())} of {len(stuck)} scans equal the scan before ({when})"
         why = "the driver sends scans again" if often else "the lidar or its driver was stuck"
-        remarks.append(Remark("repeated-scans", f"{share}: {why}; they were left out"))
+        remarks.append(warning("repeated-scans", f"{share}: {why}; they were left out"))
     return replace(log, scans=scans.rows(~wrong)), remarks
 
 
@@ -114,7 +115,7 @@ _FEW_BEAMS = 32
 """Beams that are compared first."""
 
 
-def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Leave out ranges that stand still while the robot moves, and ranges written twice.
 
     Noise lets n ranges in a row lie within a width w with a probability of at most (w / (sigma sqrt(2 pi)))^n, wherever the
@@ -138,7 +139,7 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         if stuck.any():
             when = _when(ranges.stamps[own], stuck, start)
             text = f"anchor {name} repeats one range while the robot moves ({when}); these were left out"
-            remarks.append(Remark("repeated-ranges", text))
+            remarks.append(warning("repeated-ranges", text))
         wrong[own[stuck]] = True
     if not wrong.any():
         return log, []
@@ -186,7 +187,7 @@ def quiet_noise(each: list[Floats], resolution: float) -> float:
     return float(np.sqrt(max(np.quantile(found, _QUIET) ** 2 - (0.5 * resolution) ** 2, _LEAST_NOISE**2)))
 
 
-def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Leave out a value that stands for no distance: what a radio reports beyond its reach, or when it missed its partner."""
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < _MARKS:
@@ -206,10 +207,10 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     )
     # Few are left to constrain a trajectory that no lidar does.
     most = log.scans is None and bool(wrong.mean() > _MOST_MARKS)
-    return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text, doubt=most)]
+    return replace(log, ranges=ranges.rows(~wrong)), [(doubt if most else warning)("repeated-ranges", text)]
 
 
-def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     """Remove a reading that stands for no distance: for example the value of a lidar or its driver beyond its reach."""
     scans = log.scans
     if scans is None or not len(scans.stamps):
@@ -226,7 +227,7 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     share = f"{int(wrong.sum())} of {wrong.size} readings of the lidar are exactly {mark:g} m, wherever the robot is"
     ranges = np.where(wrong, np.float32(np.inf if farthest else np.nan), scans.ranges)
     scans = replace(scans, ranges=ranges, range_max=mark if farthest else scans.range_max)
-    return replace(log, scans=scans), [Remark("repeated-readings", f"{share}: {what}; they are not taken as walls")]
+    return replace(log, scans=scans), [warning("repeated-readings", f"{share}: {what}; they are not taken as walls")]
 
 
 def _mark(values: Floats | NDArray[np.float32]) -> float | None:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median, spread_about_median
+from ..findings import DOUBT, Finding, doubt
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
-from ..sensor_log import Odometry, Remark, SensorLog
+from ..sensor_log import Odometry, SensorLog
 from .motion_ratios import ratios, undiluted
 
 _PAIRS = 250
@@ -201,7 +202,7 @@ _CLEARLY_WORSE = 2.0
 """Factor between the mean square distances of matches at two motions from which one of them is wrong."""
 
 
-def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Remark]:
+def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Finding]:
     """Return a doubt where wheels and lidar measure different motions for long, one factor for all taken out.
 
     Along a bare wall any motion matches two scans of few rays, that of the wheels as well as that which the lidar seems to
@@ -230,14 +231,14 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
         f"wheels and lidar measure different motions ({when}{more}): one of the two is stuck, slips or has another scale there "
         "than elsewhere; cut that part off, or drive it again"
     )
-    return [Remark("wheels-against-lidar", text, doubt=True, stretches=tuple((float(a), float(b)) for a, b in runs))]
+    return [Finding("wheels-against-lidar", DOUBT, text, stretches=tuple((float(a), float(b)) for a, b in runs))]
 
 
 _WORSE_BY_WHEELS = 1.2
 """Factor between the mean square distances of matches as wheels and lidar measure the motion from which the lidar shows it."""
 
 
-def unmatched(pairs: Pairs) -> list[Remark]:
+def unmatched(pairs: Pairs) -> list[Finding]:
     """Return a doubt where scans a short time apart hardly ever match; pairs with too few readings do not count."""
     seen = pairs.share[pairs.share > 0.0]
     if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
@@ -246,7 +247,7 @@ def unmatched(pairs: Pairs) -> list[Remark]:
         f"successive scans do not match (nine of ten pairs share less than {100 * most:.0f} % of their "
         "points): the readings are noise, or beam order or angles are not as stated; check the lidar's driver"
     )
-    return [Remark("scans-do-not-match", text, doubt=True)]
+    return [doubt("scans-do-not-match", text)]
 
 
 _NOISE_SHARE = 0.4

@@ -3,12 +3,12 @@
 Every array is time-ordered. Times are seconds of one clock (the log's ipc_timestamp); lengths metres; angles radians.
 """
 
-from .notes import LogNotes, OdometryBreaks, Remark, Screening
+from .notes import LogNotes, OdometryBreaks, Screening
 from .recording import MOST_ANCHORS, MOST_METRES, MOST_SECONDS, SensorLog, fault_of_id, one_word
 from .sensors import LONGEST_RANGE, SHORTEST_RANGE, Gyro, LaserScans, Odometry, SensorMounting, UwbRanges, plausible
 
 __all__ = [
     "LONGEST_RANGE", "MOST_ANCHORS", "MOST_METRES", "MOST_SECONDS", "SHORTEST_RANGE", "Gyro", "LaserScans", "LogNotes",
-    "Odometry", "OdometryBreaks", "Remark", "Screening", "SensorLog", "SensorMounting", "UwbRanges", "fault_of_id", "one_word",
+    "Odometry", "OdometryBreaks", "Screening", "SensorLog", "SensorMounting", "UwbRanges", "fault_of_id", "one_word",
     "plausible",
 ]  # fmt: skip

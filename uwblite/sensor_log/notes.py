@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arrays import Floats
+from ..findings import Finding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,24 +31,6 @@ class LogNotes:
     """By how much a sensor's clock was set back at most, s, in the order in which its messages were written."""
     scans_left_out: int = 0
     """Scans that were recorded and are not among `scans`, because no map looks at them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """One contradiction within a recording."""
-
-    kind: str
-    """A name for programs."""
-    text: str
-    """What, where and how to fix it, for people."""
-    doubt: bool = False
-    """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
-    stretches: tuple[tuple[float, float], ...] = ()
-    """First and last time, s, of each stretch in which it was so; empty where it is no matter of stretches."""
-    place: str = ""
-    """Name of the place of an anchor that it concerns; empty where it concerns none."""
-    without_place: str = ""
-    """The text that remains where a map does not have that place; empty: none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +59,7 @@ class OdometryBreaks:
 class Screening:
     """What was found and repaired in a recording before it is mapped."""
 
-    remarks: tuple[Remark, ...]
+    findings: tuple[Finding, ...]
     breaks: OdometryBreaks
     lidar_by_wheels: float = float("nan")
     """Distance by the lidar / distance by the wheels; nan where nothing shows it."""
