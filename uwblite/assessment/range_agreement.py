@@ -89,7 +89,7 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
         return
     if any(name_and_number(a.id)[1] > 1 for a in anchors):
         return
-    still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.int64)]
+    still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.intp)]
     stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
     for notice in against:
         # Clocks of different recordings may show the same times.

@@ -63,7 +63,7 @@ _UNTOUCHED, _SHARED = -2, -1
 
 def _claim(owner: Ints, index: Ints, part: Ints) -> None:
     """Note that edges of these parts (e,) touch these unknowns (e,)."""
-    low, high = np.full(len(owner), np.iinfo(np.int64).max), np.full(len(owner), -1)
+    low, high = np.full(len(owner), np.iinfo(np.intp).max), np.full(len(owner), -1)
     np.minimum.at(low, index, part)
     np.maximum.at(high, index, part)
     here = high >= 0
