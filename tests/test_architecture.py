@@ -167,6 +167,18 @@ def test_library_code_is_silent_and_pure(module):
             assert name != "open", f"{module}:{node.lineno} opens a file below io"
 
 
+@pytest.mark.parametrize("module", [m for m in MODULES if m != "arrays"])
+def test_numbers_are_as_wide_as_addresses_or_named_as_wider(module):
+    # On 32-bit machines numpy takes no 64-bit numbers as indices or counts, and 32 bits hold no ids of files: Ints and WIDE
+    # of arrays.py say which is meant.
+    for node in ast.walk(tree_of(module)):
+        name = node.attr if isinstance(node, ast.Attribute) else node.value if isinstance(node, ast.Constant) else ""
+        assert name not in FIXED_WIDTHS, f"{module}:{node.lineno} says {name}; np.intp where it indexes, else WIDE of arrays.py"
+
+
+FIXED_WIDTHS = ("int64", "int_", "longlong", "i8", "<i8", "=i8")
+
+
 @pytest.mark.parametrize("module", [m for m in MODULES if not m.startswith("cli/")])
 def test_no_mutable_state_at_module_level(module):
     for node in tree_of(module).body:

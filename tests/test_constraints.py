@@ -27,7 +27,7 @@ from uwblite.radio.bootstrap_attempt import BootstrapResult
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
 STAMPS = 100.0 + 0.5 * np.arange(40)
-CLOCK = Clock(STAMPS, np.zeros(40, dtype=np.int64))
+CLOCK = Clock(STAMPS, np.zeros(40, dtype=np.intp))
 ALL = np.ones(4, dtype=bool)
 
 
@@ -177,7 +177,7 @@ def test_a_given_closure_ties_two_times_together():
 def test_forbidden_pairs_are_refused_both_ways_and_others_not():
     constraints = Constraints(forbidden=(ForbiddenClosure((100.0, 200.0), within=5.0),))
     one, two = np.array([101.0, 199.0, 101.0, 150.0]), np.array([198.0, 104.0, 190.0, 200.0])
-    clock = Clock(np.concatenate([one, two]), np.zeros(8, dtype=np.int64))
+    clock = Clock(np.concatenate([one, two]), np.zeros(8, dtype=np.intp))
     assert constraints.allowed(clock, np.arange(4), np.arange(4, 8)).tolist() == [False, False, True, True]
 
 

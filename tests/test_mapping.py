@@ -225,7 +225,7 @@ def test_sensors_that_report_nothing_of_use_are_borne_and_reported(minute):
     blind = replace(minute.scans, ranges=np.full_like(minute.scans.ranges, np.inf))
     result = build_map(replace(minute, scans=blind))
     assert any(w.kind == "empty-scans" for w in result.warnings)
-    none = UwbRanges(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+    none = UwbRanges(np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), ())
     result = build_map(replace(minute, ranges=none))
     assert any("no UWB" in w.text for w in result.warnings)
 

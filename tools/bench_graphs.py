@@ -119,7 +119,7 @@ def g2o_graph(path: Path) -> Graph:
         rows = [line.split() for line in lines]
     vertices = {int(r[1]): [float(x) for x in r[2:5]] for r in rows if r[0] == "VERTEX_SE2"}
     table = np.array([[float(x) for x in r[1:12]] for r in rows if r[0] == "EDGE_SE2"])
-    i, j = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    i, j = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
     edges = RelativePoseEdges(i, j, table[:, 2:5].copy(), _sqrt(table[:, 5:]))
     if vertices:
         return Graph(np.array([vertices[k] for k in range(len(vertices))]), edges=(edges,))

@@ -33,7 +33,7 @@ from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 ROUNDS = 8
@@ -128,7 +128,7 @@ class Oracle:
         if pieces and self.rays is not None:
             self.rays, self.walls, self.columns = _in_pieces(self.rays, self.truth, self.walls, self.columns)
         self.has_ranges = log.ranges is not None
-        seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.int64)
+        seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.intp)
         self.seen = seen
         self.anchors = len(recording.anchors) if self.has_ranges else 0
         self.layout = _Layout(len(self.frames), self.anchors, len(seen), 1 if first_known else 0)
@@ -150,7 +150,7 @@ class Oracle:
         assert log.scans is not None
         owner, chosen = choose_scans(log.scans, self.frames, KeyframeConfig())
         found = scan_points(log, self.frames, owner, chosen)
-        surface = self.recording.surfaces[found.scan, found.ray].astype(np.int64)
+        surface = self.recording.surfaces[found.scan, found.ray].astype(np.intp)
         kept = surface >= 0
         way = found.points[kept] - found.origins[kept]
         reach = np.hypot(way[:, 0], way[:, 1])
@@ -521,10 +521,10 @@ def _in_pieces(rays: _Rays, poses: Floats, walls: Floats, columns: Floats) -> tu
     at = _hits(rays, own, walls, columns)
     line = walls[np.where(wall, rays.surface, 0)]
     along = (line[:, 2:] - line[:, :2]) / np.hypot(*(line[:, 2:] - line[:, :2]).T)[:, None]
-    piece = np.floor(np.maximum(((at - line[:, :2]) * along).sum(axis=1), 0.0) / _PIECE).astype(np.int64)
-    behind = (along[:, 0] * (own[:, 1] - line[:, 1]) - along[:, 1] * (own[:, 0] - line[:, 0]) > 0.0).astype(np.int64)
+    piece = np.floor(np.maximum(((at - line[:, :2]) * along).sum(axis=1), 0.0) / _PIECE).astype(np.intp)
+    behind = (along[:, 0] * (own[:, 1] - line[:, 1]) - along[:, 1] * (own[:, 0] - line[:, 0]) > 0.0).astype(np.intp)
     away = at - columns[np.where(wall, 0, rays.surface - len(walls)), :2] if len(columns) else at
-    sector = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2.0 * np.pi / _SECTORS)).astype(np.int64) % _SECTORS
+    sector = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2.0 * np.pi / _SECTORS)).astype(np.intp) % _SECTORS
     part = np.where(wall, 2 * piece + behind, sector)
     many = int(part.max(initial=0)) + 1
     found, surface = np.unique(rays.surface * many + part, return_inverse=True)

@@ -25,7 +25,7 @@ from uwblite.se2 import align, transform
 from uwblite.sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.intp]
 
 RECORDINGS, MINUTES, BAR, RATIO = 3, 10.0, 0.10, 1.3
 """Recordings of one map, their length, and the bars: ATE in m, or this multiple of the oracle's."""
@@ -92,7 +92,7 @@ def _numbered(each: list[oracle.Oracle]) -> tuple[int, int, list[Ints]]:
     before = dict.fromkeys(key for own, one in zip(keys, each, strict=True) for key in own[: one.layout.shared])
     every = dict.fromkeys([*before, *(key for own in keys for key in own)])
     number = {key: k for k, key in enumerate(every)}
-    return len(before), len(every), [np.array([number[key] for key in own], dtype=np.int64) for own in keys]
+    return len(before), len(every), [np.array([number[key] for key in own], dtype=np.intp) for own in keys]
 
 
 def ate(found: list[Floats], true: list[Floats]) -> float:

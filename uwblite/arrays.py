@@ -10,10 +10,14 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 _Joined = TypeVar("_Joined")
-_Number = TypeVar("_Number", np.float64, np.int64)
+_Number = TypeVar("_Number", np.float64, np.intp, np.int64)
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.intp]
+"""Numbers that index or count: as wide as addresses, because numpy takes no wider ones as indices on 32-bit machines."""
+WIDE = np.int64
+"""Element type of numbers that may exceed 32 bits, such as ids of files and row * columns + column; never an index."""
+Wides = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MAD_TO_SIGMA = 1.4826
@@ -41,7 +45,7 @@ class Table:
 def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     """Return the values of either of two arrays (e,), (e,), ascending, and the positions among them of the values of both."""
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
-    where = number.reshape(-1).astype(np.int64)
+    where = number.reshape(-1).astype(np.intp)
     return used, where[: len(one)], where[len(one) :]
 
 
@@ -54,7 +58,7 @@ def unique_rows(rows: NDArray[_Number]) -> tuple[NDArray[_Number], Ints]:
     ascending = rows[order]
     fresh = np.ones(len(rows), dtype=bool)
     fresh[1:] = np.any(ascending[1:] != ascending[:-1], axis=1)
-    number = np.empty(len(rows), dtype=np.int64)
+    number = np.empty(len(rows), dtype=np.intp)
     number[order] = np.cumsum(fresh) - 1
     return ascending[fresh], number
 
@@ -72,7 +76,7 @@ def concatenated(parts: Sequence[_Joined]) -> _Joined:
 def connected(one: Ints, other: Ints, many: int) -> Ints:
     """Return the number (n,) of the part to which each of many nodes belongs, by ties (e,), (e,)."""
     ties = sparse.coo_matrix((np.ones(len(one), dtype=np.int8), (one, other)), shape=(many, many))
-    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
+    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.intp)
 
 
 def dots(one: NDArray[np.floating], other: NDArray[np.floating]) -> Floats:
@@ -87,7 +91,7 @@ def rms_length(vectors: Floats) -> float:
 
 def runs_of(flags: Bools) -> list[tuple[int, int]]:
     """Return first and one past the last of each run of set flags (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int64)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.intp)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 

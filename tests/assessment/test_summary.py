@@ -327,7 +327,7 @@ def named(*ids):
     return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
 
 
-ONE = SimpleNamespace(of_keyframe=np.zeros(1, dtype=np.int64))
+ONE = SimpleNamespace(of_keyframe=np.zeros(1, dtype=np.intp))
 """The only recording, of one keyframe."""
 
 

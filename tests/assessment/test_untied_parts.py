@@ -24,7 +24,7 @@ def measured(*spans):
     count = len(stamps)
     zero = np.zeros(count)
     return RangeEdges(
-        stamps.astype(np.int64), anchor, zero + 1.0, zero + 1.0, np.zeros((count, 2)), zero, np.zeros((count, 2)), np.zeros(2),
+        stamps.astype(np.intp), anchor, zero + 1.0, zero + 1.0, np.zeros((count, 2)), zero, np.zeros((count, 2)), np.zeros(2),
         zero, np.full((count, 6), -1), stamps=stamps,
     )  # fmt: skip
 

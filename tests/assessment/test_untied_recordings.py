@@ -15,7 +15,7 @@ def doubted(heard, closures=(), few=()):
     ids = tuple(sorted({name for names in heard for name in names}))
     one = [(n, name) for n, names in enumerate(heard) for name in names]
     pose, anchor = np.array([(n, ids.index(name)) for n, name in one for _ in range(2 if (n, name) in few else 3)]).T
-    i, j = np.array(closures, dtype=np.int64).reshape(-1, 2).T
+    i, j = np.array(closures, dtype=np.intp).reshape(-1, 2).T
     estimate = SimpleNamespace(
         ranges=plain_ranges(pose, anchor, np.ones(len(pose)), 0.1), anchor_ids=ids, placed=np.ones(len(ids), dtype=bool),
         closures=SimpleNamespace(edges=SimpleNamespace(i=i, j=j)),

@@ -36,7 +36,7 @@ def test_a_path_goes_to_a_table_and_a_picture(rooms, tmp_path, capsys):
     assert table[-1, :2] == pytest.approx([3.0, 3.0])
     assert table[:, 4].min() >= 0.2
     assert 2.0 in table[:, 0]
-    pixels = decode_png((tmp_path / "plan.png").read_bytes()).astype(np.int64)
+    pixels = decode_png((tmp_path / "plan.png").read_bytes()).astype(np.intp)
     assert len(np.unique(pixels @ [65536, 256, 1])) > 10
     assert main(words) == 1
     assert "exists" in capsys.readouterr().err

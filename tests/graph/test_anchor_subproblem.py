@@ -62,7 +62,7 @@ def along_a_line(seed=0):
     distance = np.hypot(*(truth[heard, :2] - anchor).T) + 0.03 * rng.standard_normal(len(heard))
     edges = (
         relative_edges(truth, np.arange(80), np.arange(1, 81), [0.002, 0.002, 0.001]),
-        plain_ranges(heard, np.zeros(len(heard), dtype=np.int64), distance, 0.03),
+        plain_ranges(heard, np.zeros(len(heard), dtype=np.intp), distance, 0.03),
     )
     stretched = truth + np.outer(x / 20.0, [0.3, 0.0, 0.0])
     return Graph(stretched, np.array([[10.0, 0.03]]), edges)

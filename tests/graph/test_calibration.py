@@ -137,7 +137,7 @@ def test_what_is_switched_off_has_index_minus_one():
 def test_no_anchors_no_range_table():
     calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
     assert all(key.anchor is None for key in calibration.keys)
-    assert range_indices(calibration, np.zeros(0, dtype=np.int64), ()).shape == (0, 6)
+    assert range_indices(calibration, np.zeros(0, dtype=np.intp), ()).shape == (0, 6)
 
 
 def test_heights_below_zero_are_fixed_there_and_nothing_else_changes():

@@ -205,7 +205,7 @@ def test_a_room_comes_out_as_a_room():
     poses = drive()
     grid = from_scans(poses, room_scans(poses, noise=0.01), GridConfig(move_distance=0.0))
     states, geometry = grid.states(), grid.geometry
-    row, col = (a.astype(np.int64) for a in np.mgrid[: geometry.rows, : geometry.cols])
+    row, col = (a.astype(np.intp) for a in np.mgrid[: geometry.rows, : geometry.cols])
     centre = geometry.centre_of(row, col)
     depth = 2.0 - np.abs(centre).max(axis=-1)
     # Noise of 1 cm moves the wall by less than two cells of 5 cm.
@@ -248,7 +248,7 @@ def test_beams_that_saw_nothing_never_draw_and_clear_only_so_far():
     grid = from_scans(poses, scans, GridConfig(move_distance=0.0, max_clear_distance=2.0))
     states, geometry = grid.states(), grid.geometry
     assert (states != OCCUPIED).all()
-    row, col = (a.astype(np.int64) for a in np.mgrid[: geometry.rows, : geometry.cols])
+    row, col = (a.astype(np.intp) for a in np.mgrid[: geometry.rows, : geometry.cols])
     far = np.linalg.norm(geometry.centre_of(row, col), axis=-1)
     assert (states[far > 2.25] == UNKNOWN).all()
     assert (states[far < 1.8] == FREE).all()
@@ -263,7 +263,7 @@ def test_beams_that_saw_nothing_do_not_clear_behind_walls():
     bearing = se2.wrap_angle(poses[:, 2:] + scans.angles)
     scans.ranges[(np.abs(bearing) < 0.4) & (np.arange(60) % 2 == 0)[:, None]] = np.inf
     grid = from_scans(poses, scans, GridConfig(move_distance=0.0, clear_weight=1.0))
-    row, col = (a.astype(np.int64) for a in np.mgrid[: grid.geometry.rows, : grid.geometry.cols])
+    row, col = (a.astype(np.intp) for a in np.mgrid[: grid.geometry.rows, : grid.geometry.cols])
     outside = np.abs(grid.geometry.centre_of(row, col)).max(axis=-1) > 1.6
     assert (grid.states()[outside] == UNKNOWN).all()
     assert grid.states()[grid.geometry.cell_of(np.array([1.51, 0.0]))] == OCCUPIED

@@ -28,7 +28,7 @@ def scanned(poses, walls, noise=0.0, seed=0, beams=360, reach=8.0) -> Clouds:
     distance = cast(poses[owner], bearings, walls) + noise * rng.standard_normal(len(owner))
     hit = np.isfinite(distance) & (distance < reach)
     points = distance[hit, None] * np.column_stack([np.cos(bearings[hit]), np.sin(bearings[hit])])
-    nothing = np.zeros(hit.sum(), dtype=np.int64)
+    nothing = np.zeros(hit.sum(), dtype=np.intp)
     rays = ScanPoints(owner[hit], points, np.zeros_like(points), nothing, nothing)
     return build(rays, len(poses), CloudConfig(voxel=0.02, normal_radius=0.3))
 

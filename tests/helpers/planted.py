@@ -72,7 +72,7 @@ def ranges(
     distance[outlying] += (rng.uniform(0.5, 5.0, len(times)) * np.where(rng.random(len(times)) < 0.8, 1.0, -1.0))[outlying]
     used, index = np.unique(which, return_inverse=True)
     ids = tuple(f"A{k:02d}" for k in used)
-    return UwbRanges(times, index.astype(np.int64), np.maximum(distance, 0.0), np.full(len(times), 100.0), ids)
+    return UwbRanges(times, index.astype(np.intp), np.maximum(distance, 0.0), np.full(len(times), 100.0), ids)
 
 
 def cast(poses, bearings, walls) -> np.ndarray:

@@ -40,5 +40,5 @@ def scattered(rng, counts) -> Clouds:
     angle = rng.uniform(-np.pi, np.pi, n)
     normals = np.column_stack([np.cos(angle), np.sin(angle)]) * (rng.random(n) > 0.1)[:, None]
     owner = np.repeat(np.arange(len(counts)), counts)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
     return Clouds(offsets, rng.uniform(-2, 3, (n, 2)), normals, owner, np.full(n, 1e-3))

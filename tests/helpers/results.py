@@ -113,6 +113,6 @@ def small_log(*, name: str = "run.log") -> SensorLog:
     """Return a recording that such a result could come from."""
     stamps = 1000.0 + np.arange(24) * 0.5
     poses = np.stack([0.1 * np.arange(24), np.zeros(24), np.zeros(24)], axis=1)
-    ranges = UwbRanges(stamps, np.zeros(24, dtype=np.int64), np.full(24, 3.0), np.full(24, 100.0), ("5C0B",))
+    ranges = UwbRanges(stamps, np.zeros(24, dtype=np.intp), np.full(24, 3.0), np.full(24, 100.0), ("5C0B",))
     scans = LaserScans(stamps, np.full((24, 90), 2.0, dtype=np.float32), -0.78, 0.0175, 0.0, 0.02, 5.6)
     return SensorLog(Odometry(stamps, poses), ranges, scans, notes=LogNotes(source=name, sha256="ab" * 32, lines=72))

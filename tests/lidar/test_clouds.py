@@ -24,7 +24,7 @@ def rays_from(points, owner, origins=None) -> ScanPoints:
     """Return points (n, 2) as rays of the keyframes owner (n,), seen from the origins (0, 0 where none are given)."""
     order = np.argsort(owner, kind="stable")
     origins = np.zeros_like(points) if origins is None else origins
-    nothing = np.zeros(len(points), dtype=np.int64)
+    nothing = np.zeros(len(points), dtype=np.intp)
     return ScanPoints(np.asarray(owner)[order], points[order], origins[order], nothing, nothing)
 
 

@@ -36,7 +36,7 @@ NOISE = np.array([0.01, 0.005, 0.006])
 
 def refined(graph, clouds, path, config=CONFIG, selections=2):
     """Return the result of choosing pairs and refining, twice as the walk does."""
-    recording = np.zeros(len(clouds), dtype=np.int64)
+    recording = np.zeros(len(clouds), dtype=np.intp)
     raster, twist, result = rasterize(clouds, 0.2 * config.first_gate, config.first_gate), np.zeros((len(clouds), 3)), None
     for _ in range(selections):
         i, j = choose_pairs(clouds, graph.poses, path, recording, config)
@@ -111,7 +111,7 @@ def test_poses_that_creep_along_a_wall_move_no_surface():
 
 def test_pairs_are_ordered_unique_and_overlap():
     truth, path, clouds = room(4)
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     i, j = choose_pairs(clouds, truth, path, recording, CONFIG)
     assert np.all(i < j)
     assert len(np.unique(i * len(truth) + j)) == len(i)
@@ -149,7 +149,7 @@ def test_the_best_views_are_those_of_a_loop(partners):
 
 
 def test_a_single_cloud_has_no_pair():
-    pairs = choose_pairs(scanned(np.zeros((1, 3)), ROOM), np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.int64), CONFIG)
+    pairs = choose_pairs(scanned(np.zeros((1, 3)), ROOM), np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.intp), CONFIG)
     assert [part.tolist() for part in pairs] == [[], []]
 
 
@@ -165,14 +165,14 @@ def test_clouds_take_turns_at_giving_the_lines():
 
 def test_no_partners_are_only_neighbours():
     truth, path, clouds = room(5)
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     i, j = choose_pairs(clouds, truth, path, recording, replace(CONFIG, partners=0))
     assert set((j - i).tolist()) == set(CONFIG.neighbours)
 
 
 def test_neighbours_are_of_one_recording():
     truth, path, clouds = room(6)
-    recording = (np.arange(len(truth)) >= 20).astype(np.int64)
+    recording = (np.arange(len(truth)) >= 20).astype(np.intp)
     i, j = choose_pairs(clouds, truth, path, recording, replace(CONFIG, partners=0))
     assert np.all(recording[i] == recording[j])
 
@@ -217,7 +217,7 @@ def test_keyframes_without_any_return_are_fixed_by_the_wheels():
 def test_rounds_are_reported_and_bounded():
     truth, path, clouds = room(7, 0.01, 8.0)
     graph = drifted(np.random.default_rng(1), truth, NOISE)
-    recording, reported = np.zeros(len(truth), dtype=np.int64), []
+    recording, reported = np.zeros(len(truth), dtype=np.intp), []
     i, j = choose_pairs(clouds, graph.poses, path, recording, CONFIG)
     config = replace(CONFIG, rounds=3)
     raster = rasterize(clouds, 0.1, 0.5)

@@ -86,7 +86,7 @@ MOTION, CENTRE = np.array([0.8, -0.5, 0.6]), (3.0, 1.5)
 
 def aligned(target, source, guesses):
     """Align one pair of clouds from several guesses (g, 3)."""
-    clouds, i = joined([target, source]), np.zeros(len(guesses), dtype=np.int64)
+    clouds, i = joined([target, source]), np.zeros(len(guesses), dtype=np.intp)
     points = pair_points(clouds, i + 1, len(source.points))
     return align_pairs(clouds, rasterize(clouds, 0.05, 0.8), i, guesses, points, 0.8, 0.15, 30)
 

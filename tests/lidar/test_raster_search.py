@@ -53,7 +53,7 @@ def test_the_true_pose_is_found_to_a_step():
 def test_without_points_or_target_there_is_no_pose():
     clouds = two_clouds(np.zeros(3))
     raster = rasterize(clouds, CELL, REACH)
-    assert best_poses(clouds, raster, np.zeros(0, dtype=np.int64), np.zeros(3), WINDOW, 3).shape == (0, 3)
+    assert best_poses(clouds, raster, np.zeros(0, dtype=np.intp), np.zeros(3), WINDOW, 3).shape == (0, 3)
     far = np.array([50.0, 0.0, 0.0])
     rows = np.arange(clouds.offsets[1], clouds.offsets[2])
     assert best_poses(clouds, raster, rows, far, WINDOW, 3).shape == (0, 3)

@@ -69,7 +69,7 @@ def test_noise_is_learnt_from_the_rays_of_each_place_on_a_surface():
     x = rng.uniform(-4.0, 4.0, 4000)
     bent = 0.5 * rng.standard_normal(8)[np.floor(x + 4.0).astype(int)]
     y = 2.0 + 0.02 * (np.sqrt(0.75) * rng.standard_normal(4000) + bent)
-    way, nothing = np.column_stack([np.zeros(4000), np.ones(4000)]), np.zeros(4000, dtype=np.int64)
+    way, nothing = np.column_stack([np.zeros(4000), np.ones(4000)]), np.zeros(4000, dtype=np.intp)
     rays = SurfaceRays(nothing, nothing, np.column_stack([x, y]), way, np.full(4000, 0.02), np.arange(4000))
     wall = Surfaces(np.array([False]), np.array([[0.0, 2.0]]), np.array([-np.pi / 2]), np.zeros(1), np.ones(1))
     noise = noise_of(rays, wall, np.zeros((1, 3)), np.zeros((1, 3)))
@@ -134,7 +134,7 @@ def test_a_pillar_that_is_not_round_does_not_fit_a_circle():
     column = Surfaces(np.array([True]), np.zeros((1, 2)), np.zeros(1), np.zeros(1), np.array([0.25]))
     for reach, least, most in ((on_round, 0.9, 1.1), (faces.max(axis=1), 1.4, 5.0)):
         reach = reach + 0.02 * rng.standard_normal(900)
-        nothing, sigma = np.zeros(900, dtype=np.int64), np.full(900, 0.02)
+        nothing, sigma = np.zeros(900, dtype=np.intp), np.full(900, 0.02)
         rays = SurfaceRays(keyframe, nothing, reach[:, None] * way, way, sigma, np.arange(900))
         found = MeasuredSurfaces(column, rays.by_keyframe(column), RayNoise(np.ones(6), np.ones(2)))
         assert least < misfit(found, poses, poses)[0] < most

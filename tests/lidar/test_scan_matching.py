@@ -223,7 +223,7 @@ def test_headings_are_wrapped():
 def test_nothing_to_match_is_no_information():
     clouds = scattered(np.random.default_rng(0), [5, 0, 5])
     raster = rasterize(clouds, 0.1, 0.3)
-    none = np.zeros(0, dtype=np.int64)
+    none = np.zeros(0, dtype=np.intp)
     empty = match(clouds, raster, none, np.zeros((0, 3)), pair_points(clouds, none, 10), 0.3, 0.1)
     assert measured(empty, np.zeros((0, 3)), np.zeros(0))[1].shape == (0, 3, 3)
     i, j, far = np.array([0, 1, 0]), np.array([1, 0, 2]), np.full((3, 3), 50.0)

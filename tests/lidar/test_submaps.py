@@ -44,7 +44,7 @@ def test_a_sub_map_holds_the_points_of_its_keyframes_in_the_middle_one_s_frame()
     poses = truth[::6]
     clouds = scanned(poses, ROOM)
     path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    made = build(clouds, poses, path, np.zeros(len(poses), dtype=np.int64), KEEP)
+    made = build(clouds, poses, path, np.zeros(len(poses), dtype=np.intp), KEEP)
     assert len(made) == len(made.clouds) == len(made.reference)
     for k in range(len(made)):
         assert made.first[k] <= made.reference[k] < made.last[k]
@@ -70,13 +70,13 @@ def wall_seen_from_both_sides(turn, rng) -> Clouds:
     angle = np.where(side > 0, np.pi / 2, -np.pi / 2) + 0.05 * rng.standard_normal(n) + turn
     points = se2.rotate(turn, np.column_stack([along, 0.04 + 0.015 * side]))
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
-    return Clouds(np.array([0, n]), points, normals, np.zeros(n, dtype=np.int64), np.full(n, 1e-3))
+    return Clouds(np.array([0, n]), points, normals, np.zeros(n, dtype=np.intp), np.full(n, 1e-3))
 
 
 @pytest.mark.parametrize("turn", np.linspace(0, np.pi, 13))
 def test_the_two_sides_of_a_thin_wall_stay_apart_whatever_its_direction(turn):
     clouds = wall_seen_from_both_sides(turn, np.random.default_rng(2))
-    made = build(clouds, np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.int64), KEEP)
+    made = build(clouds, np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.intp), KEEP)
     points, normals = se2.rotate(-turn, made.clouds.points), se2.rotate(-turn, made.clouds.normals)
     assert np.all(np.abs(normals[:, 1]) > 0.9)
     single = 8.0 * 2.0**-23  # clouds are kept in single precision, these within 8 m
@@ -90,16 +90,16 @@ def test_lone_points_are_filtered():
     points = np.concatenate([clouds.points, stray])
     normals = np.concatenate([clouds.normals, np.tile([1.0, 0.0], (12, 1))])
     n = len(points)
-    dirty = Clouds(np.array([0, n]), points, normals, np.zeros(n, dtype=np.int64), np.zeros(n))
-    made = build(dirty, np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.int64), SubmapConfig())
+    dirty = Clouds(np.array([0, n]), points, normals, np.zeros(n, dtype=np.intp), np.zeros(n))
+    made = build(dirty, np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.intp), SubmapConfig())
     on_walls = np.minimum(np.abs(np.abs(made.clouds.points[:, 0]) - 3), np.abs(np.abs(made.clouds.points[:, 1]) - 2))
     assert np.sum(on_walls > 0.1) <= 2
     assert np.sum(on_walls < 0.1) > 0.9 * 20 / 0.08
 
 
 def test_sub_maps_of_a_recording_without_returns_are_empty():
-    empty = Clouds(np.zeros(4, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0))
-    made = build(empty, np.zeros((3, 3)), np.array([0.0, 3.0, 6.0]), np.zeros(3, dtype=np.int64), KEEP)
+    empty = Clouds(np.zeros(4, dtype=np.intp), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, dtype=np.intp), np.zeros(0))
+    made = build(empty, np.zeros((3, 3)), np.array([0.0, 3.0, 6.0]), np.zeros(3, dtype=np.intp), KEEP)
     assert len(made) == 3
     assert made.clouds.counts.tolist() == [0, 0, 0]
 

@@ -23,7 +23,7 @@ def test_rays_of_a_wall_are_bundled_and_lie_on_it(noise):
     bearing = np.linspace(0.5, 2.6, 300)
     way = np.column_stack([np.cos(bearing), np.sin(bearing)])
     reach = 1.0 / way[:, 1] + noise * np.random.default_rng(3).standard_normal(300)
-    nothing = np.zeros(300, dtype=np.int64)
+    nothing = np.zeros(300, dtype=np.intp)
     rays = ScanPoints(nothing, reach[:, None] * way, np.zeros((300, 2)), np.arange(300), nothing)
     stretch = stretch_of(as_rays(rays), clouds, rasterize(clouds, 0.1, 0.3), stretches(clouds))
     on = np.flatnonzero(stretch >= 0)
@@ -55,7 +55,7 @@ def test_points_of_clouds_are_told_walls_columns_and_the_rest():
 
 def test_only_rays_that_face_a_column_count():
     rays = rays_that_end()
-    scan = ScanPoints(rays.keyframe, rays.points, np.zeros((40, 2)), np.arange(40), np.zeros(40, dtype=np.int64))
+    scan = ScanPoints(rays.keyframe, rays.points, np.zeros((40, 2)), np.arange(40), np.zeros(40, dtype=np.intp))
     columns = np.array([[-1.5, 1.0, 0.4]])
     every = as_rays(scan)
     near = every.rows(around_columns(every, POSES, surroundings(columns, NEAR)))

@@ -36,7 +36,7 @@ def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(hall):
 
 def test_visits_agree_where_every_pose_is_true(hall):
     truth, path, clouds = hall
-    share, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
+    share, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.intp))
     assert visits > 20
     assert share < 0.01
 
@@ -46,13 +46,13 @@ def test_visits_are_inconsistent_where_half_of_the_recording_lies_elsewhere(hall
     truth, path, clouds = hall
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])
-    share, _ = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))
+    share, _ = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
     assert 0.05 < share < 1.0
 
 
 def test_one_visit_has_nothing_to_compare_with(hall):
     truth, path, clouds = hall
-    assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
+    assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.intp)) == (0.0, 0)
 
 
 def test_one_keyframe_compared_with_many_is_one_visit(hall):
@@ -64,7 +64,7 @@ def test_one_keyframe_compared_with_many_is_one_visit(hall):
     kept &= path < path[np.argmax(kept)] + 5.0
     kept[again] = True
     poses[kept] = truth[kept]
-    share, visits = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))
+    share, visits = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
     assert visits == 1
     assert share < 0.05
 
@@ -75,13 +75,13 @@ def near(poses, k):
 
 def test_recordings_are_visits_of_their_own(hall):
     truth, path, clouds = hall
-    recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
+    recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.intp)
     assert free_space_violation(clouds, truth, 0.01 * path, recording)[1] > 0
 
 
 def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(hall):
     truth, path, clouds = hall
-    pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
+    pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.intp), SubmapConfig(epsilon=4.0))
     free = observed_free_space(clouds, pieces, truth)
     where = truth[pieces.reference]
     pairs = ((a, b) for a in range(len(where)) for b in range(a + 2, len(where)))
@@ -111,7 +111,7 @@ def with_a_walker(truth, clouds):
 
 def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(hall):
     truth, path, clouds = hall
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     settings = SubmapConfig(epsilon=4.0)
     quiet = build(clouds, truth, path, recording, settings)
     busy_clouds = with_a_walker(truth, clouds)
@@ -128,7 +128,7 @@ def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(hall):
 
 def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(hall):
     truth, path, clouds = hall
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
 
     def of(own):
         pieces = build(own, truth, path, recording, SubmapConfig(epsilon=4.0))

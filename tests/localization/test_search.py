@@ -10,7 +10,7 @@ from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
 
 BOUNDS = (np.array([-1.0, -1.0]), np.array([6.0, 5.0]))
-NO_RANGES = Ranges(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 @pytest.fixture(scope="module")

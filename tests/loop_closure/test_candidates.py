@@ -57,7 +57,7 @@ def test_places_are_uncertain_from_three_sigma_in_the_worst_direction(sigma, fou
     covariance[:2, :2] = axes @ np.diag([sigma**2, 1e-4]) @ axes.T
     joint = SimpleNamespace(relative=lambda i, j: np.tile(covariance, (len(i), 1, 1)))
     poses = np.column_stack([[0.0, 1.0, 0.5, 900.0], np.zeros(4), np.zeros(4)])
-    graph, recording = SimpleNamespace(poses=poses), np.zeros(4, dtype=np.int64)
+    graph, recording = SimpleNamespace(poses=poses), np.zeros(4, dtype=np.intp)
     assert uncertain(graph, joint, np.array([0, 1, 2]), recording, LoopClosureConfig(), 1.0) is found
     assert uncertain(graph, joint, np.array([0, 3]), recording, LoopClosureConfig(), 1.0) is False
 

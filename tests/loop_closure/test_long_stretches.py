@@ -35,7 +35,7 @@ ALIKE = corridor(np.arange(-15.0, 65.0, 2.5))
 def looked_for(walls):
     """Return truth, stretches and their uncertain pairs of a recording whose way back is known to 4 m."""
     truth, graph, path, clouds = returned(walls, 4.0, SHIFT)
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
     covariance = JointCovariance(graph, pieces.reference)
     few = propose(graph, covariance, pieces, recording, set(), set(), False, CONFIG)
@@ -50,7 +50,7 @@ def unlike():
 
 def test_each_stretch_overlaps_the_next_of_its_recording_by_half():
     truth, graph, path, clouds = returned(UNLIKE[:2], 4.0, SHIFT)
-    pieces = of_pieces(clouds, graph.poses, *cut(path, (np.arange(len(truth)) >= 75).astype(np.int64)), SubmapConfig())
+    pieces = of_pieces(clouds, graph.poses, *cut(path, (np.arange(len(truth)) >= 75).astype(np.intp)), SubmapConfig())
     own = np.flatnonzero(pieces.last <= 75)
     length = path[pieces.last - 1] - path[pieces.first]
     assert np.all(pieces.first[own[1:]] < pieces.last[own[:-1]])
@@ -69,7 +69,7 @@ def test_only_pairs_beyond_a_search_of_sub_maps_are_listed_the_surest_first(unli
 @pytest.mark.parametrize(("far", "expected"), [(1.0, False), (4.0, True)])
 def test_what_a_search_of_sub_maps_reaches_needs_no_stretches(far, expected):
     _, graph, path, _ = returned(UNLIKE[:2], far, SHIFT)
-    recording = np.zeros(len(path), dtype=np.int64)
+    recording = np.zeros(len(path), dtype=np.intp)
     reference = cut(path, recording)[2]
     assert any_uncertain(graph, JointCovariance(graph, reference), reference, recording, CONFIG) == expected
 

@@ -63,7 +63,7 @@ def broken(truth, error, link=LINK):
 
 
 def tied(graph, wheels, clouds, recording=None):
-    recording = np.zeros(len(graph.poses), dtype=np.int64) if recording is None else recording
+    recording = np.zeros(len(graph.poses), dtype=np.intp) if recording is None else recording
     links = loose_links(wheels, graph)
     candidates, pieces = propose(graph, clouds, wheels, links, recording, CONFIG, SubmapConfig())
     free = observed_free_space(clouds, pieces, graph.poses)
@@ -122,7 +122,7 @@ def test_many_loose_links_are_no_exceptions(walk):
 def test_pieces_stay_in_the_recording_of_their_link(walk):
     truth, _, clouds = walk
     graph, wheels = broken(truth, np.zeros(3))
-    recording = (np.arange(len(truth)) > LINK + 1).astype(np.int64)
+    recording = (np.arange(len(truth)) > LINK + 1).astype(np.intp)
     candidates, pieces = propose(graph, clouds, wheels, np.array([LINK]), recording, CONFIG, SubmapConfig())
     assert len(candidates.target) > 0
     assert pieces.last.max() <= LINK + 2
@@ -132,7 +132,7 @@ def test_pieces_stay_in_the_recording_of_their_link(walk):
 def test_pieces_reach_over_no_other_link(walk, border):
     truth, _, clouds = walk
     graph, wheels = broken(truth, np.zeros(3))
-    links, recording = np.array([24, 30, 32, 38]), (np.arange(len(truth)) > border).astype(np.int64)
+    links, recording = np.array([24, 30, 32, 38]), (np.arange(len(truth)) > border).astype(np.intp)
     candidates, pieces = propose(graph, clouds, wheels, links, recording, CONFIG, SubmapConfig())
     over = (pieces.first[:, None] <= links) & (pieces.last[:, None] > links + 1)
     assert not over.any()
@@ -146,7 +146,7 @@ def test_pieces_reach_over_no_other_link(walk, border):
 def test_pieces_end_at_the_next_link(walk):
     """Of links behind keyframes 10 and 14: six keyframes before and behind each, as far as no other link lies between."""
     _, _, clouds = walk
-    recording = np.zeros(len(clouds), dtype=np.int64)
+    recording = np.zeros(len(clouds), dtype=np.intp)
     first, last, reference = _pieces(np.array([10, 14]), np.array([11, 15]), clouds, recording)
     several = {(int(r), int(a), int(b)) for r, a, b in zip(reference[:, 0], first[:, 0], last[:, 0], strict=True)}
     assert several == {(10, 5, 11), (11, 11, 15), (14, 11, 15), (15, 15, 21)}

@@ -31,7 +31,7 @@ def laps():
 
 def pieces_of(laps, epsilon=2.0, poses=None):
     truth, path, clouds = laps
-    recording = np.zeros(len(path), dtype=np.int64)
+    recording = np.zeros(len(path), dtype=np.intp)
     return build(clouds, truth if poses is None else poses, path, recording, SubmapConfig(epsilon=epsilon)), recording
 
 
@@ -73,7 +73,7 @@ def test_what_two_sub_maps_share_is_a_share_of_the_squares_of_the_smaller_one(se
     clouds = Clouds(np.append(0, np.cumsum(counts)), points, np.zeros_like(points), owner, np.zeros(len(points)))
     squares = [{tuple(c) for c in np.floor(se2.transform(poses[k], points[owner == k]) / 0.5).tolist()} for k in range(5)]
     expected = [[len(a & b) / max(min(len(a), len(b)), 1) for b in squares] for a in squares]
-    none = np.zeros(5, dtype=np.int64)
+    none = np.zeros(5, dtype=np.intp)
     np.testing.assert_allclose(_shared(poses, Submaps(none, none, none, clouds, 0.1)), expected)
     assert expected[0][1] == 1.0
 

@@ -38,7 +38,7 @@ def hall():
     """A walk of 60 m in the hall, its drifting chain, its sub-maps and what was proposed."""
     truth, path, clouds = walked(3)
     graph = drifted(np.random.default_rng(4), truth, NOISE)
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     pieces = build(clouds, graph.poses, path, recording, SubmapConfig(epsilon=4.0))
     covariances = marginals(graph)
     proposed = propose(graph, covariances, pieces, recording, set(), set(), True, CONFIG)
@@ -103,7 +103,7 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
 
 def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
     _, graph, covariances, pieces, recording, _ = hall
-    half = (np.arange(len(recording)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
+    half = (np.arange(len(recording)) >= pieces.first[len(pieces) // 2]).astype(np.intp)
     candidates = propose(graph, covariances, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
@@ -270,7 +270,7 @@ def test_equal_pillars_are_recognised_as_ambiguous():
     truth[30:, 2] = np.pi
     path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(truth[:, 0])))])
     clouds = scanned(truth, TWINS, 0.01, 5, beams=300, reach=8.0)
-    pieces = build(clouds, truth, path, np.zeros(60, dtype=np.int64), SubmapConfig(epsilon=4.5))
+    pieces = build(clouds, truth, path, np.zeros(60, dtype=np.intp), SubmapConfig(epsilon=4.5))
     a, b = np.array([0, 1]), np.array([3, 2])
     poses = truth[pieces.reference]
     covariance = np.tile(np.diag([1.0**2, 0.3**2, 0.02**2]), (2, 1, 1))
@@ -339,7 +339,7 @@ def test_no_closures_change_nothing(hall):
     assert solved is graph
     assert len(left.edges) == 0
     assert left.candidates == ()
-    none = np.zeros(0, dtype=np.int64)
+    none = np.zeros(0, dtype=np.intp)
     empty = Candidates(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
     assert find(empty, hall[3], CONFIG, SEARCH).candidates == ()
 
@@ -357,7 +357,7 @@ def test_a_robot_that_never_returns_has_no_candidates():
     walls = np.array([[-5.0, -2.0, 30.0, -2.0], [30.0, 3.0, -5.0, 3.0]])
     clouds = scanned(truth, walls, 0.01, 1, reach=5.6)
     graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
-    recording = np.zeros(60, dtype=np.int64)
+    recording = np.zeros(60, dtype=np.intp)
     pieces = build(clouds, graph.poses, truth[:, 0], recording, SubmapConfig(epsilon=8.0))
     far = propose(graph, marginals(graph), pieces, recording, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)

@@ -23,7 +23,7 @@ from uwblite.pipeline.progress import Stages
 def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
     """A way back known to 1 m is within a search; one known to 40 m is beyond any, and says so as well."""
     truth, graph, path, clouds = returned(CORRIDOR, far, [1.0, 0.0, 0.0])
-    recording = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.intp)
     pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
     recordings = SimpleNamespace(stamps=100.0 + np.arange(len(truth)), of_keyframe=recording)
     stages = Stages(None, None)
@@ -39,7 +39,7 @@ def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
 def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_were(monkeypatch, far, tried):
     """Of a way back known to 6 m; no match holds, so all pairs are tried once and nothing moves."""
     truth, graph, path, clouds = returned(CORRIDOR, far, [1.0, 0.0, 0.0])
-    recording, asked = np.zeros(len(truth), dtype=np.int64), []
+    recording, asked = np.zeros(len(truth), dtype=np.intp), []
 
     def find(pairs, *others):
         asked.append(pairs.names(LoopClosureConfig()))
@@ -84,7 +84,7 @@ def rounds_and_sub_maps_made(monkeypatch, certain, by, config):
     monkeypatch.setattr(closure_rounds.closure_candidates, "missed", lambda *_: set())
     monkeypatch.setattr(closure_rounds.closures, "merged", lambda found, new: found)
     monkeypatch.setattr(closure_rounds.verification, "reconcile", reconciled)
-    recordings = SimpleNamespace(stamps=np.arange(len(truth)), of_keyframe=np.zeros(len(truth), dtype=np.int64), path=path)
+    recordings = SimpleNamespace(stamps=np.arange(len(truth)), of_keyframe=np.zeros(len(truth), dtype=np.intp), path=path)
     task = SimpleNamespace(recordings=recordings, config=config, stages=Stages(None, None), executor=None)
     odometry = next(e for e in graph.edges if isinstance(e, OdometryEdges))
     estimate = Estimate(graph, odometry, None, (), scans=ScanClouds(clouds, None, 0.0))

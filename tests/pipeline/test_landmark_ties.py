@@ -181,7 +181,7 @@ def test_what_is_not_there_is_reported(carpet):
 def one_cloud(points):
     points = np.asarray(points, dtype=float)
     n = len(points)
-    return clouds.Clouds(np.array([0, n]), points, np.zeros((n, 2)), np.zeros(n, dtype=np.int64), np.zeros(n))
+    return clouds.Clouds(np.array([0, n]), points, np.zeros((n, 2)), np.zeros(n, dtype=np.intp), np.zeros(n))
 
 
 def test_a_column_is_found_beside_its_given_place():

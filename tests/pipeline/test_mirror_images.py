@@ -47,7 +47,7 @@ def estimate(bend, believed=ANCHOR):
     count, none = len(x), np.zeros((len(x), 2))
     noise = np.random.default_rng(5).normal(0.0, 0.1, count)
     edges = RangeEdges(
-        np.arange(count), np.zeros(count, dtype=np.int64), np.hypot(*(tags - ANCHOR).T) + noise, np.full(count, 0.1), none,
+        np.arange(count), np.zeros(count, dtype=np.intp), np.hypot(*(tags - ANCHOR).T) + noise, np.full(count, 0.1), none,
         np.zeros(count), none, np.zeros(2), np.zeros(count), np.full((count, 6), -1),
     )  # fmt: skip
     poses, known = np.column_stack([tags, np.zeros(count)]), np.ones(count, dtype=bool)

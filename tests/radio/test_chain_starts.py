@@ -65,7 +65,7 @@ def test_chains_find_their_places(seed, ties):
     errors = [np.hypot(*(g.poses[:, :2] - truth[:, :2]).T).max() for g in place_chains(graph, chains)]
     # Odometry of 80 steps bends by some decimetres over 16 m.
     assert min(errors) < 1.0
-    assert len(place_chains(replace(graph, poses=truth), np.zeros(len(truth), dtype=np.int64))) == 1
+    assert len(place_chains(replace(graph, poses=truth), np.zeros(len(truth), dtype=np.intp))) == 1
 
 
 @pytest.mark.parametrize("seed", range(3))

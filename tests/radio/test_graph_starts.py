@@ -16,7 +16,7 @@ def test_an_anchor_of_two_ranges_has_a_place_only_where_one_is_given():
     *others, ranges = graph.edges
     few = ranges.rows(np.flatnonzero((ranges.anchor != 0) | (np.cumsum(ranges.anchor == 0) <= 2)))
     graph = replace(graph, poses=truth, anchors=np.full((3, 2), np.nan), edges=(*others, few))
-    chains = np.zeros(len(truth), dtype=np.int64)
+    chains = np.zeros(len(truth), dtype=np.intp)
     [start] = starts(graph, chains)
     assert start.unplaced == (0,)
     assert np.isnan(start.placed(start.graph).anchors).tolist() == [[True] * 2, [False] * 2, [False] * 2]
@@ -32,7 +32,7 @@ def test_chains_that_nothing_ties_to_the_first_have_no_start():
     graph, truth, _ = loop(2, anchors=0)
     alone = replace(graph, edges=(graph.edges[0],))
     assert list(starts(alone, np.arange(len(truth)) // 30)) == []
-    assert len(list(starts(alone, np.zeros(len(truth), dtype=np.int64)))) == 1
+    assert len(list(starts(alone, np.zeros(len(truth), dtype=np.intp)))) == 1
 
 
 def test_starts_nearby_have_the_headings_or_the_anchors_anew():

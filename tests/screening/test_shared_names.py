@@ -95,7 +95,7 @@ def test_tags_of_one_robot_that_are_far_apart_measure_one_anchor():
     log = renamed(recording())
     original = recording().ranges
     tagged = replace(log, mounting=SensorMounting(more_tags=np.zeros((1, 3))))
-    tagged = changed(tagged, tag=(original.anchor == 1).astype(np.int64))
+    tagged = changed(tagged, tag=(original.anchor == 1).astype(np.intp))
     assert without_shared_names(tagged) == (tagged, [])
 
 

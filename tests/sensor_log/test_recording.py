@@ -100,7 +100,7 @@ def test_sensors_stand_on_the_robot(log, mounting):
 
 def test_a_thousand_anchors_are_enough():
     names = tuple(f"A{k}" for k in range(1001))
-    radio = UwbRanges(np.arange(3.0), np.zeros(3, dtype=np.int64), np.ones(3), np.full(3, 100.0), names)
+    radio = UwbRanges(np.arange(3.0), np.zeros(3, dtype=np.intp), np.ones(3), np.full(3, 100.0), names)
     with pytest.raises(DataError, match="name 1001 anchors"):
         SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), radio)
 

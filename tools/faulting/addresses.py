@@ -20,7 +20,7 @@ def damaged_ids(share: float) -> Fault:
         wrong = [f"{int(said[a], 16) ^ (1 << int(rng.integers(12))):04X}" for a in r.anchor]
         hit = rng.random(len(wrong)) < share
         names, number = np.unique(np.where(hit, wrong, np.array(said)[r.anchor]), return_inverse=True)
-        ranges = replace(r, anchor=number.astype(np.int64), anchor_ids=tuple(names.tolist()))
+        ranges = replace(r, anchor=number.astype(np.intp), anchor_ids=tuple(names.tolist()))
         places = {new: case.anchors[old] for new, old in zip(said, r.anchor_ids, strict=True) if old in case.anchors}
         return replace(case, log=replace(case.log, ranges=ranges), anchors=places)
 

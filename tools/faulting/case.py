@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, UwbRanges
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = NDArray[np.intp]
 Rng = np.random.Generator
 
 

@@ -212,7 +212,7 @@ def turning_mount(angle: float) -> Fault:
 
     def change(s: LaserScans) -> LaserScans:
         age, beams = (s.stamps - s.stamps[0]) / np.ptp(s.stamps), s.ranges.shape[1]
-        column = np.arange(beams) + np.round(age * angle / abs(s.angle_increment)).astype(np.int64)[:, None]
+        column = np.arange(beams) + np.round(age * angle / abs(s.angle_increment)).astype(np.intp)[:, None]
         readings = np.take_along_axis(s.ranges, np.clip(column, 0, beams - 1), axis=1)
         return replace(s, ranges=np.where((column >= 0) & (column < beams), readings, np.float32(np.nan)))
 

@@ -143,7 +143,7 @@ def one_name_for_two(case: Case, rng: Rng) -> Case:
     def change(r: UwbRanges) -> UwbRanges:
         anchor = np.where(r.anchor == 1, 0, r.anchor)
         used, anchor = np.unique(anchor, return_inverse=True)
-        return replace(r, anchor=anchor.astype(np.int64), anchor_ids=tuple(r.anchor_ids[k] for k in used))
+        return replace(r, anchor=anchor.astype(np.intp), anchor_ids=tuple(r.anchor_ids[k] for k in used))
 
     return with_ranges(case, change)
 

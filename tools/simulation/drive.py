@@ -51,12 +51,12 @@ class RoadMap:
         self.cells = np.argwhere(self.free)
         self.edges = self._edges(np.clip(clearance / np.maximum(distance, 1e-3), 0.2, 1.0))
 
-    def cell(self, point: Floats) -> NDArray[np.int64]:
+    def cell(self, point: Floats) -> NDArray[np.intp]:
         """Return the free cell nearest to a point."""
-        nearest: NDArray[np.int64] = self.cells[np.argmin(((self.cells * _CELL - point) ** 2).sum(axis=1))]
+        nearest: NDArray[np.intp] = self.cells[np.argmin(((self.cells * _CELL - point) ** 2).sum(axis=1))]
         return nearest
 
-    def _edges(self, dear: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    def _edges(self, dear: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         number = np.arange(self.free.size).reshape(self.free.shape)
         rows, cols, cost = [], [], []
         for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
@@ -68,7 +68,7 @@ class RoadMap:
             cost.append(np.hypot(dx, dy) * (1.0 + dear[a][both] + dear[b][both]))
         return np.concatenate(rows), np.concatenate(cols), np.concatenate(cost)
 
-    def roads(self, start: Floats, goals: NDArray[np.int64], taste: Floats) -> list[Floats]:
+    def roads(self, start: Floats, goals: NDArray[np.intp], taste: Floats) -> list[Floats]:
         """Return the cheapest road (k, 2) from the start to each goal cell; taste (cells,) makes places dear or cheap."""
         source = int(np.ravel_multi_index(tuple(self.cell(start)), self.free.shape))
         liking = np.ones(self.free.size)

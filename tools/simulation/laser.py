@@ -44,7 +44,7 @@ class LaserModel:
 
 def cast(
     origins: Floats, angles: Floats, walls: Floats, columns: Floats, reach: float
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Return distance (n,), cosine of incidence (n,) and surface index (n,) seen by rays from origins (n, 2) at angles (n,).
 
     Walls are (w, 4), columns (c, 3) or (n, c, 3) where they move. Nothing within reach: distance inf, surface -1.
@@ -52,7 +52,7 @@ def cast(
     """
     dx, dy = np.cos(angles), np.sin(angles)
     best = np.full(len(angles), np.inf)
-    cosine, surface = np.ones(len(angles)), np.full(len(angles), -1, dtype=np.int64)
+    cosine, surface = np.ones(len(angles)), np.full(len(angles), -1, dtype=np.intp)
     for k, (x1, y1, x2, y2) in enumerate(walls):
         ex, ey = x2 - x1, y2 - y1
         ax, ay = x1 - origins[:, 0], y1 - origins[:, 1]
@@ -80,7 +80,7 @@ def cast(
     return best, cosine, surface
 
 
-def near(walls: Floats, columns: Floats, centre: Floats, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def near(walls: Floats, columns: Floats, centre: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return indices of the walls and columns that come within reach of the centre (2,)."""
     a, e = walls[:, :2], walls[:, 2:] - walls[:, :2]
     length2 = np.maximum((e * e).sum(axis=1), 1e-12)
@@ -90,8 +90,8 @@ def near(walls: Floats, columns: Floats, centre: Floats, reach: float) -> tuple[
 
 
 def disturb(
-    true: Floats, cosine: Floats, surface: NDArray[np.int64], model: LaserModel, colour: Floats, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    true: Floats, cosine: Floats, surface: NDArray[np.intp], model: LaserModel, colour: Floats, rng: np.random.Generator
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the reported distances, mm, of whole scans (k, beams), and which are of two surfaces at once.
 
     There are noise, mixed pixels, lost rays and error codes.
@@ -117,4 +117,4 @@ def disturb(
     lost |= ~seen | (stated >= model.max_range) | (stated < model.min_range)
     code = rng.random(true.shape) < model.error_codes
     codes = np.where(code, rng.integers(0, 20, true.shape), round(model.max_range * 1000))
-    return np.where(lost, codes, np.rint(stated * 1000)).astype(np.int64), both
+    return np.where(lost, codes, np.rint(stated * 1000)).astype(np.intp), both

@@ -155,7 +155,7 @@ def legs(walk: Floats, stride: Floats) -> Floats:
     return np.concatenate([sides, np.full((*sides.shape[:2], 1), 0.06)], axis=2)
 
 
-def unseen_glass(rooms: RealRooms, glass: Bools, surface: NDArray[np.int64], cosine: Floats) -> Bools:
+def unseen_glass(rooms: RealRooms, glass: Bools, surface: NDArray[np.intp], cosine: Floats) -> Bools:
     """Return which rays (k, beams) go through glass; glass (w,): which walls are."""
     wall = (surface >= 0) & (surface < len(glass))
     return wall & glass[np.where(wall, surface, 0)] & (cosine < rooms.glass_cosine)

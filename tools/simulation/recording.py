@@ -108,7 +108,7 @@ class Recording:
     """(k, beams) wall, or number of walls plus column, that each ray measured; -1 = none, a passer-by, or a mixed pixel."""
     range_stamps: Floats
     """(m,) on the radio's clock."""
-    range_anchors: NDArray[np.int64]
+    range_anchors: NDArray[np.intp]
     """(m,) index into anchors."""
     ranges: Floats
     """(m,) m, as reported."""
@@ -294,7 +294,7 @@ def scene_of(settings: Settings, plan: FloorPlan, crowd: list[drive.Motion], rng
 
 def swept(
     scene: Scene, stamps: Floats, times: Floats, pose: Floats, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the readings (k, beams), mm, and surfaces (k, beams) of sweeps that begin at the stamps (k,).
 
     The rays leave at the times (k * beams,) from poses (k * beams, 3) of the base.
@@ -328,7 +328,7 @@ def swept(
 
 def _range(
     settings: Settings, plan: FloorPlan, motion: drive.Motion, anchors: Floats, crowd: list[drive.Motion]
-) -> tuple[Floats, NDArray[np.int64], Floats, dict[str, Any]]:
+) -> tuple[Floats, NDArray[np.intp], Floats, dict[str, Any]]:
     """Return stamps (m,), anchor indices (m,), ranges (m,) and what is true of the radio."""
     model, count = settings.radio, len(anchors)
     bias = _biases(settings, count)
@@ -339,7 +339,7 @@ def _range(
         "tag_height": settings.tag_height,
     }
     if "uwb" in settings.without or count == 0:
-        return np.empty(0), np.empty(0, dtype=np.int64), np.empty(0), truth
+        return np.empty(0), np.empty(0, dtype=np.intp), np.empty(0), truth
     times = np.round(np.arange(0.213, motion.stamps[-1], 1.0 / settings.uwb_rate), 6)
     measured = ranged(settings, plan, anchors, times, motion.at(times), crowd, lambda part: _rng(settings, part))
     rng = _rng(settings, 8)
@@ -401,7 +401,7 @@ def ranged(
 
 def picked(
     received: Floats, effort: Floats, most: int, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return epoch (m,) and anchor (m,) of the ranges that a tag reports: the easiest of each epoch, so many at most."""
     rank = np.argsort(np.argsort(effort + rng.uniform(0, 3, effort.shape), axis=1), axis=1)
     epoch, anchor = np.nonzero((received > 0) & (rank < most))
@@ -414,7 +414,7 @@ def _biases(settings: Settings, count: int) -> Floats:
 
 
 def _spoil(
-    settings: Settings, stamps: Floats, anchor: NDArray[np.int64], values: Floats, rng: np.random.Generator, size: float
+    settings: Settings, stamps: Floats, anchor: NDArray[np.intp], values: Floats, rng: np.random.Generator, size: float
 ) -> Floats:
     for false in settings.false_ranges:
         during = (anchor == false.anchor - 1) & (stamps >= false.start) & (stamps < false.start + false.seconds)

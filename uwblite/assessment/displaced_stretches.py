@@ -33,7 +33,7 @@ def check_displaced_stretches(table: dict[str, Floats], anchors: Sequence[Anchor
     table : MapResult.range_table. anchors : in the order of its numbers.
     """
     places, placed = np.array([a.position for a in anchors]), np.array([a.status != "unplaced" for a in anchors])
-    numbers = table["anchor"].astype(np.int64)
+    numbers = table["anchor"].astype(np.intp)
     used = (table["weight"] > 0.0) & placed[numbers] if len(numbers) else np.zeros(0, dtype=bool)
     for recording in task.recordings.each if used.any() else ():
         own = np.flatnonzero(used & (table["recording"] == recording.number))

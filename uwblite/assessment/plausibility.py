@@ -134,7 +134,7 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
     if not table or not anchors or (lidar and len(task.recordings.each) > 1):
         return
     names, stamps = [name_and_number(anchor.id) for anchor in anchors], table["stamp"]
-    base = np.array([name for name, _ in names])[table["anchor"].astype(np.int64)]
+    base = np.array([name for name, _ in names])[table["anchor"].astype(np.intp)]
     moves = sorted((a.since, k) for k, a in enumerate(anchors) if np.isfinite(a.since) and names[k][1] > 1)
     for start, _ in moves:
         these = [k for since, k in moves if start <= since < start + _ONE_TIME]

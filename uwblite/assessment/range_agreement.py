@@ -95,7 +95,7 @@ def check_wheels_against_lidar(
     if not against or not used:
         yield from against
         return
-    still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.int64)]
+    still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.intp)]
     stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
     for finding in against:
         # Clocks of different recordings may show the same times.

@@ -150,7 +150,7 @@ def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
 def _measured_by_lidar(graph: Graph) -> Ints:
     """Return the keyframes whose step to the next one the lidar measures."""
     scans = [edges for edges in graph.edges if isinstance(edges, ScanEdges)]
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1] for e in scans)])
+    return np.concatenate([np.zeros(0, dtype=np.intp), *(np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1] for e in scans)])
 
 
 def _stretch(off: Bools) -> tuple[int, int] | None:

@@ -85,7 +85,7 @@ def _held(graph: Graph, ranges: RangeEdges | None) -> Ints:
     """Return the keyframes that scans, closures and ranges constrain, in order."""
     ends = [] if ranges is None else [ranges.pose]
     ends += [np.append(e.i, e.j) for e in graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *ends]))
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends]))
 
 
 def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
@@ -134,7 +134,7 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     _, from_end = np.unique(anchor[::-1], return_index=True)
     silent = len(anchor) - 1 - from_end
     # No anchor is measured both up to and after range k.
-    spans = np.zeros(len(anchor) + 1, dtype=np.int64)
+    spans = np.zeros(len(anchor) + 1, dtype=np.intp)
     np.add.at(spans, appears, 1)
     np.add.at(spans, silent, -1)
     at = np.flatnonzero(np.cumsum(spans)[: len(anchor)] == 0)[:-1]

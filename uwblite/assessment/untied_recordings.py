@@ -19,7 +19,7 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]
     if len(recordings.each) == 1 or ranges is None:
         return
     alive = ranges.rows(np.flatnonzero(ranges.alive))
-    counts = np.zeros((len(recordings.each), len(names)), dtype=np.int64)
+    counts = np.zeros((len(recordings.each), len(names)), dtype=np.intp)
     np.add.at(counts, (recordings.of_keyframe[alive.pose], alive.anchor), 1)
     heard = (counts >= _HEARD) & estimate.placed
     radio = np.array([radio_name(name) for name in names])

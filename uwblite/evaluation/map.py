@@ -77,7 +77,7 @@ def landmark_errors_along(
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_MOST_OBSERVATIONS, len(seen))).astype(np.int64))]
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_MOST_OBSERVATIONS, len(seen))).astype(np.intp))]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
@@ -143,7 +143,7 @@ def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Flo
     if not len(viewpoints):
         return np.zeros(len(points), dtype=bool)
     # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
-    coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.int64), axis=0, return_index=True)[1]]
+    coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.intp), axis=0, return_index=True)[1]]
     count = min(_VIEWS, len(coarse))
     distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=reach)
     point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))

@@ -123,7 +123,7 @@ def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
     """Return the indices of queries that lie between stamps at most max_gap apart, or at a stamp."""
     right = np.clip(np.searchsorted(stamps, queries), 1, max(1, len(stamps) - 1))
     if len(stamps) < 2:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, dtype=np.intp)
     before, after = stamps[right - 1], stamps[right]
     inside = (queries >= before) & (queries <= after) & (after - before <= max_gap)
     # Rounded stamps may stick out by a little; a pose extended for longer than that would be invented.
@@ -155,7 +155,7 @@ def stretches(positions: Floats, delta: float) -> Ints:
         after = int(np.searchsorted(way, way[ends[-1]] + delta - 1e-9 * delta))
         after = max(after, ends[-1] + 1)
         if after >= len(way):
-            return np.array(ends, dtype=np.int64)
+            return np.array(ends, dtype=np.intp)
         ends.append(after)
 
 

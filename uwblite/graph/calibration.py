@@ -155,12 +155,12 @@ def prior_edges(listed: tuple[Unknown, ...]) -> PriorEdges:
 
 def indices(calibration: Calibration, *kinds: str) -> Ints:
     """Return the positions (len(kinds),) in the block, -1 where one is not an unknown."""
-    return np.array([calibration.index(kind) for kind in kinds], dtype=np.int64)
+    return np.array([calibration.index(kind) for kind in kinds], dtype=np.intp)
 
 
 def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...], tag: Ints | None = None) -> Ints:
     """Return the (m, 6) calibration indices of RangeEdges for ranges to anchors (m,) by tags (m,), None = by one tag."""
-    tags = np.zeros(len(anchor), dtype=np.int64) if tag is None else tag
+    tags = np.zeros(len(anchor), dtype=np.intp) if tag is None else tag
     scale, delay = indices(calibration, RANGE_SCALE, "range_delay").tolist()
 
     def row(name: str, number: int) -> tuple[int, ...]:
@@ -170,7 +170,7 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
         return scale, bias, calibration.index(HEIGHT, name) if height < 0 else height, x, y, delay
 
     table = [[row(name, number) for name in anchor_ids] for number in range(int(np.max(tags, initial=0)) + 1)]
-    return np.array(table, dtype=np.int64).reshape(len(table), len(anchor_ids), 6)[tags, anchor]
+    return np.array(table, dtype=np.intp).reshape(len(table), len(anchor_ids), 6)[tags, anchor]
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:

@@ -14,7 +14,7 @@ def floating_components(graph: Graph) -> Ints:
     """Return for each pose (n,) the first pose of its part, -1 where a fixed unknown or a prior fixes the part."""
     n, nodes = len(graph.poses), len(graph.poses) + len(graph.anchors)
     first = {"poses": 0, "anchors": n}
-    links, tied = [np.zeros((2, 0), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    links, tied = [np.zeros((2, 0), dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
     for edges in graph.edges:
         ends = [first[name] + index for name, index, _ in edges.linearize(graph).blocks if name in first]
         links += [np.stack([ends[0], end]) for end in ends[1:]]
@@ -42,8 +42,8 @@ def given_anchors(graph: Graph) -> Bools:
 def tied_chains(graph: Graph, chains: Ints) -> Bools:
     """Return for each pose (n,) whether ranges or landmarks connect its chain with chain 0 or with given landmarks."""
     count = int(chains.max(initial=0)) + 1
-    given = np.flatnonzero(given_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
-    ends = [(np.zeros(len(given), dtype=np.int64), count + given)]
+    given = np.flatnonzero(given_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.intp)
+    ends = [(np.zeros(len(given), dtype=np.intp), count + given)]
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
             ends.append((chains[e.i], chains[e.j]))

@@ -31,7 +31,7 @@ def pairs_of(matrix: sparse.csc_matrix) -> Ints:
     """Return the pairs (b, 2) of columns with an entry in a symmetric matrix."""
     column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
     below = matrix.indices > column
-    return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.int64)
+    return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.intp)
 
 
 def alike_columns(matrix: sparse.csc_matrix) -> tuple[Ints, Ints]:
@@ -50,7 +50,7 @@ def alike_columns(matrix: sparse.csc_matrix) -> tuple[Ints, Ints]:
 
 def narrow_order(pairs: Ints, nodes: int) -> tuple[Ints, Ints]:
     """Return the order (nodes,) of a narrow band, by reverse Cuthill-McKee, and how far (nodes,) each row reaches in it."""
-    order = reverse_cuthill_mckee(adjacency(pairs, nodes).tocsr(), symmetric_mode=True).astype(np.int64)
+    order = reverse_cuthill_mckee(adjacency(pairs, nodes).tocsr(), symmetric_mode=True).astype(np.intp)
     lower = _lower_triangle(pairs, order)
     first, some = np.arange(nodes), np.diff(lower.indptr) > 0
     first[some] = lower.indices[lower.indptr[:-1][some]]
@@ -99,7 +99,7 @@ def elimination_tree(pairs: Ints, order: Ints) -> Ints:
         while above[k] != k:
             above[k] = k = above[above[k]]
         parent[k] = above[k] = node
-    return np.array(parent, dtype=np.int64)
+    return np.array(parent, dtype=np.intp)
 
 
 def postorder(parent: Ints) -> Ints:
@@ -111,7 +111,7 @@ def postorder(parent: Ints) -> Ints:
     """
     n = len(parent)
     tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
-    walk: Ints = depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.int64)
+    walk: Ints = depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.intp)
     return walk
 
 
@@ -142,10 +142,10 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     walk = postorder(parent)
     place = np.append(np.argsort(walk), len(order))
     parent = place[parent[walk]]
-    order, scalars = order[walk], width[order[walk]].astype(np.int64)
+    order, scalars = order[walk], width[order[walk]].astype(np.intp)
     n = len(order)
     lower = _lower_triangle(pairs, order)
-    below, row = lower.indices.astype(np.int64), np.repeat(np.arange(n), np.diff(lower.indptr))
+    below, row = lower.indices.astype(np.intp), np.repeat(np.arange(n), np.diff(lower.indptr))
     change = np.zeros(n + 1)
     change += np.bincount(below, scalars[row], n + 1)
     again = np.flatnonzero(row[1:] == row[:-1]) + 1
@@ -155,7 +155,7 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     change[:-1] += np.where(tied, 0, scalars)
     change -= np.bincount(parent, scalars, n + 1)
     total = np.append(0.0, np.cumsum(change[:-1]))
-    sizes = np.empty(n, dtype=np.int64)
+    sizes = np.empty(n, dtype=np.intp)
     sizes[walk] = np.rint(total[1:] - total[_first_below(parent)])
     return sizes
 
@@ -181,7 +181,7 @@ _ALONE = 6.0
 
 def work_of(matrix: sparse.csc_matrix) -> float:
     """Return the multiplications of a factorisation of a symmetric matrix by minimum degree; infinite where it fills up."""
-    pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.int64)
+    pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
     if is_full(narrow_order(pairs, len(width))[1]):
         return np.inf
     order = minimum_degree(pairs, len(width))
@@ -203,7 +203,7 @@ def _first_below(parent: Ints) -> Ints:
     first = list(range(len(parent) + 1))
     for node, above in enumerate(parent.tolist()):
         first[above] = min(first[above], first[node])
-    return np.array(first[:-1], dtype=np.int64)
+    return np.array(first[:-1], dtype=np.intp)
 
 
 def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
@@ -215,7 +215,7 @@ def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
     highest = [parent]
     while 2 << len(highest) - 1 <= len(parent):
         half = 1 << len(highest) - 1
-        highest.append(np.maximum(highest[-1], np.append(highest[-1][half:], np.zeros(half, dtype=np.int64))))
-    step = np.log2(np.maximum(other - one, 1)).astype(np.int64)
-    table = np.stack(highest) if len(parent) else np.zeros((1, 0), dtype=np.int64)
+        highest.append(np.maximum(highest[-1], np.append(highest[-1][half:], np.zeros(half, dtype=np.intp))))
+    step = np.log2(np.maximum(other - one, 1)).astype(np.intp)
+    table = np.stack(highest) if len(parent) else np.zeros((1, 0), dtype=np.intp)
     return np.asarray(np.maximum(table[step, one], table[step, other - (1 << step)]))

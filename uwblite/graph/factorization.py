@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import Floats, Ints
+from ..arrays import WIDE, Floats, Ints
 from ..errors import SINGULAR, SolverError
 from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
 from .schwarz_cg import expected_work
@@ -90,7 +90,7 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     order = with_subtrees_contiguous(among, poses)
     every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
     multiplications = work(among if bordered else pairs, every, width)
-    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=np.int64).sum())
+    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
     if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
         return Ordering(np.arange(poses), False, False, iterative=True)
     return Ordering(order, bordered, False, work=multiplications)

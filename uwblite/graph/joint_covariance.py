@@ -34,7 +34,7 @@ class JointCovariance:
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
         found = np.empty((len(i), 3, 3))
         for first in range(0, len(i), _PAIRS_AT_ONCE):
             part = slice(first, first + _PAIRS_AT_ONCE)
@@ -94,7 +94,7 @@ def _end(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
     number = normal.unknowns.number["poses"]
     first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
     factor = cast(SuperLU, factor_of(normal))
-    place = factor.perm_c[first:].astype(np.int64)
+    place = factor.perm_c[first:].astype(np.intp)
     inside = np.sort(place)
     lower, pivots = factor.L, factor.U.diagonal()[inside]
     # These contain two further copies of the factor, and the matrix.

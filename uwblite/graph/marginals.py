@@ -62,7 +62,7 @@ class Marginals:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal, further)
         self._unseen, self._common = np.append(normal.diagonal <= 0, False), common
-        self._among = np.asarray(among, dtype=np.int64)
+        self._among = np.asarray(among, dtype=np.intp)
 
     @property
     def covariances(self) -> Covariances:
@@ -196,7 +196,7 @@ class Marginals:
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
         return relative_covariances(self._graph, i, j, self.covariances.poses[i], self.covariances.poses[j], self._cross(i, j))
 
     def _cross(self, i: Ints, j: Ints) -> Floats:

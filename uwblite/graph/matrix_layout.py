@@ -86,8 +86,8 @@ class SparseLayout:
         own = row == column
         above = np.cumsum(height) - height
         above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
-        in_blocks = np.bincount(column, height, n).astype(np.int64)
-        tall = np.empty(n, dtype=np.int64)
+        in_blocks = np.bincount(column, height, n).astype(np.intp)
+        tall = np.empty(n, dtype=np.intp)
         for k in range(3):
             has = own & (k < width)
             tall[column[has] + k] = in_blocks[column[has]]

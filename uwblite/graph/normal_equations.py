@@ -23,7 +23,7 @@ from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
 
 _AT_ONCE = 1 << 15
 """Edges whose products are in memory at once; a bound on the memory."""
-_NONE = np.zeros(0, dtype=np.int64)
+_NONE = np.zeros(0, dtype=np.intp)
 _Small = NDArray[np.int32]
 _Touched = tuple[Ints, bool]
 """Node (e,) touched by each edge, -1 = fixed; and whether it is a calibration value."""
@@ -125,7 +125,7 @@ class NormalEquations:
         which = np.where(which < len(apart), which + nodes, 0)
         following = iter(np.split(which, np.cumsum([len(k) for k in keys])[:-1])[1:])
         return pairs, [
-            place[np.where(low >= 0, high - m, -1), low].astype(np.int64) if by_value else next(following)
+            place[np.where(low >= 0, high - m, -1), low].astype(np.intp) if by_value else next(following)
             for low, high, by_value in _meetings(touched)
         ]
 
@@ -141,7 +141,7 @@ class NormalEquations:
         self._trash = blocks.places
         each = np.repeat(np.arange(len(width)), width)
         scalar = np.repeat(corner[:-1] - np.cumsum(width) + width, width) + np.arange(blocks.size)
-        self._diagonal = np.empty(blocks.size, dtype=np.int64)
+        self._diagonal = np.empty(blocks.size, dtype=np.intp)
         self._diagonal[scalar] = self._base[each] + scalar * (self._stride[each] + 1)
         return blocks
 

@@ -229,7 +229,7 @@ class ScanEdges(EdgeTable):
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""
         # A pose has one cloud, and many edges: what they have in common is computed once.
-        row = np.zeros(len(graph.poses), dtype=np.int64)
+        row = np.zeros(len(graph.poses), dtype=np.intp)
         row[poses] = np.arange(len(poses))
         if len(poses) > len(row) and np.array_equal(twist[row].take(poses, axis=0), twist):
             sensor, heading = self._moved(graph, graph.poses, twist[row])

@@ -92,7 +92,7 @@ def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
     begin = np.unique(part, return_index=True)[1]
     # One further node is the start of the walk through every part.
     rooted = links + sparse.csr_matrix((np.ones(len(begin)), (np.full(len(begin), poses), begin)), shape=links.shape)
-    order = depth_first_order(rooted, poses, directed=False, return_predecessors=False)[1:].astype(np.int64)
+    order = depth_first_order(rooted, poses, directed=False, return_predecessors=False)[1:].astype(np.intp)
     linked = np.asarray((links + links.T)[order[:-1], order[1:]]).ravel() > 0.0
     # A star has no chains, and the coarse level has no place for pieces of one pose each.
     return order, linked if _makes_chains(linked) else np.ones_like(linked)
@@ -142,7 +142,7 @@ class LocalPlaces:
     def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces) -> None:
         """Find the entries whose row and column belong to one piece."""
         count, self._width = pieces.number.shape
-        owner, within = np.full(matrix.shape[0] + 1, -1), np.zeros(matrix.shape[0] + 1, dtype=np.int64)
+        owner, within = np.full(matrix.shape[0] + 1, -1), np.zeros(matrix.shape[0] + 1, dtype=np.intp)
         owner[pieces.number] = np.arange(count)[:, None]
         within[pieces.number] = np.arange(self._width)
         owner[-1] = -1

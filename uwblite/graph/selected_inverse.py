@@ -76,7 +76,7 @@ def selected_inverse(factor: SymmetricFactor, rows: Ints, columns: Ints) -> Floa
     """
     if not np.array_equal(factor.perm_r, factor.perm_c):
         raise SolverError("covariances need a positive definite matrix; add a prior on what nothing measures")
-    position = factor.perm_c.astype(np.int64)
+    position = factor.perm_c.astype(np.intp)
     first, second = np.minimum(position[rows], position[columns]), np.maximum(position[rows], position[columns])
     order = np.argsort(first, kind="stable")
     found = np.empty(len(rows))
@@ -121,13 +121,13 @@ def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
     """
     handed: dict[int, Ints] = {}
     done: list[tuple[int, int, Ints]] = []
-    start, end, below = 0, 0, np.zeros(0, dtype=np.int64)
+    start, end, below = 0, 0, np.zeros(0, dtype=np.intp)
     for first, last in _within_subtrees(lower):
         touched = [lower.indices[lower.indptr[first] : lower.indptr[last]]]
         touched += [handed.pop(c) for c in range(first, last) if c in handed]
         if len(below) and below[0] < last:
             touched.append(below)
-        own = np.unique(np.concatenate(touched).astype(np.int64))
+        own = np.unique(np.concatenate(touched).astype(np.intp))
         own = own[own >= last]
         both = np.union1d(below[below >= last], own)
         apart = (end - start + len(below)) ** 2 + (last - first + len(own)) ** 2 + _OVERHEAD

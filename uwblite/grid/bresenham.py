@@ -43,7 +43,7 @@ def mark_rays(
     if len(order) == 0 or shorter_by[0] == 0:
         return
     here, along, across, slope = _strides(start[order], d_row[order], d_col[order], -shorter_by, stride)
-    moved, aside, cell = np.full(len(order), _HALF), np.empty_like(here), np.empty(len(order), dtype=np.int64)
+    moved, aside, cell = np.full(len(order), _HALF), np.empty_like(here), np.empty(len(order), dtype=np.intp)
     for r in np.searchsorted(shorter_by, -np.arange(-shorter_by[0])).tolist():
         aside[:r] = moved[:r]
         aside[:r] *= across[:r]

@@ -45,7 +45,7 @@ class GridGeometry:
     def cell_of(self, points: Floats) -> tuple[Ints, Ints]:
         """Return row and column (...) of the cells that contain points (..., 2), m; the numbering continues outside the
         grid."""
-        cell = np.floor((points - self.origin) / self.resolution).astype(np.int64)
+        cell = np.floor((points - self.origin) / self.resolution).astype(np.intp)
         return cell[..., 1], cell[..., 0]
 
     def centre_of(self, row: Ints, col: Ints) -> Floats:

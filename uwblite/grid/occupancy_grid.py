@@ -103,7 +103,7 @@ class OccupancyGrid:
     def occupied_points(self) -> Floats:
         """Return the centres (n, 2) of the occupied cells, m, map frame."""
         row, col = np.nonzero(self.states() == OCCUPIED)
-        return self.geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
+        return self.geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
 
 
 def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:

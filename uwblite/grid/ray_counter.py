@@ -56,7 +56,7 @@ class RayCounter:
             return
         if walls is not None and walls.shape != self.hits.shape:
             raise DataError(f"walls of shape {walls.shape} do not fit a grid of {self.hits.shape}")
-        slot = np.zeros(len(origins), dtype=np.int64)
+        slot = np.zeros(len(origins), dtype=np.intp)
         if scan is not None:
             slot[1:] = np.cumsum(np.diff(scan) != 0)
         cells = np.stack([*self.geometry.cell_of(origins), *self.geometry.cell_of(endpoints)])

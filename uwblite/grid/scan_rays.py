@@ -44,7 +44,7 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
         if (x - x0) ** 2 + (y - y0) ** 2 >= distance * distance or turned >= angle:
             chosen.append(index)
             x0, y0, theta0 = x, y, theta
-    return np.array(chosen, dtype=np.int64)
+    return np.array(chosen, dtype=np.intp)
 
 
 def seen_reach(scans: LaserScans, chosen: Ints, max_range: float = math.inf) -> NDArray[np.float32]:

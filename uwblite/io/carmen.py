@@ -271,14 +271,14 @@ class LogReader:
         names = [name.decode() for name in self.uwb_ids]
         ids = sorted(names)
         place = {name: i for i, name in enumerate(ids)}
-        rank = np.array([place[name] for name in names], dtype=np.int64)
+        rank = np.array([place[name] for name in names], dtype=np.intp)
         order = time_order(rows[:, 0], "UWB", warnings, self.set_back)
         rows = rows[order]
-        tag = rows[:, 4].astype(np.int64)
+        tag = rows[:, 4].astype(np.intp)
         self.tags = int(tag.max()) + 1
         silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.gives_tag(k + 1)]
         if silent:
             name = f"uwb{silent[0]}_tag_offset_x"
             warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")
-        anchor = rank[rows[:, 1].astype(np.int64)]
+        anchor = rank[rows[:, 1].astype(np.intp)]
         return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)

@@ -54,7 +54,7 @@ _NEXT = 2.0
 """s; a part of a log that follows another begins so much later at most."""
 
 
-def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> NDArray[np.int64]:
+def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> NDArray[np.intp]:
     """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
 
     Parameters

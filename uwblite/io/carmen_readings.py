@@ -42,7 +42,7 @@ class Block:
     def decode_rows(self, beams: int, pending: list[Pending]) -> tuple[NDArray[np.float32], list[ValueError | None]]:
         """Return the readings (k, beams) of messages, the quick ways first, and by message what is wrong with it."""
         errors: list[ValueError | None] = [None] * len(pending)
-        first = np.array([p.first for p in pending], dtype=np.int64)
+        first = np.array([p.first for p in pending], dtype=np.intp)
         left = np.array([p.readings is None for p in pending])
         begins = self.gaps[np.maximum(first - 1, 0)] + 1
         ends = self.gaps[first + beams - 1]

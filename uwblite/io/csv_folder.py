@@ -256,7 +256,7 @@ def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
     if not cells:
         return None
     ids = tuple(sorted({one_word(name) for name in names}))
-    index = np.array([ids.index(one_word(name)) for name in names], dtype=np.int64)
+    index = np.array([ids.index(one_word(name)) for name in names], dtype=np.intp)
     table = np.array(cells).reshape(-1, 3)
     order = np.argsort(table[:, 0], kind="stable")
     return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)

@@ -8,7 +8,7 @@ eight characters long; everything else is reported as not done and left to the s
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Ints
+from ..arrays import WIDE, Ints
 
 Bytes = NDArray[np.uint8]
 
@@ -125,7 +125,7 @@ def encode_fixed_point(values: NDArray[np.float32], decimals: int = 3) -> list[b
     """
     if values.size == 0:
         return [b""] * len(values)
-    scaled = np.rint(values.astype(np.float64) * 10**decimals).astype(np.int64)
+    scaled = np.rint(values.astype(np.float64) * 10**decimals).astype(WIDE)
     digits = max(len(str(int(scaled.max()))), decimals + 1)
     text = np.zeros((*values.shape, digits + 2), dtype=np.uint8)
     text[..., -1] = 0x20

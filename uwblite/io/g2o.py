@@ -23,7 +23,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import WIDE, Floats, Ints, Wides
 from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
@@ -176,28 +176,28 @@ def _together(a: Records, b: Records) -> Records:
     return Records(*(np.concatenate(pair)[order] for pair in columns))
 
 
-def _ids(content: RecordFile) -> Ints:
+def _ids(content: RecordFile) -> Wides:
     """Return the vertex id that each name of the file stands for."""
     wrong = next((name for name in content.names if not _ID.fullmatch(name) or abs(int(name)) >= 2**63), None)
     if wrong is not None:
         raise content.error(f"{wrong[:30].decode(errors='replace')!r} is not a vertex id, a whole number")
-    return np.array([int(name) for name in content.names], dtype=np.int64)
+    return np.array([int(name) for name in content.names], dtype=WIDE)
 
 
 _ID = re.compile(rb"-?\d{1,19}")
 """As many digits as 64 bits hold: gtsam puts a letter into the highest byte."""
 
 
-def _numbered(ids: Ints, names: Sequence[Ints]) -> tuple[Ints, Ints]:
+def _numbered(ids: Wides, names: Sequence[Ints]) -> tuple[Wides, Ints]:
     """Return the ids (n,) among these names in order, and for every name of the file its place there, -1 = none."""
     used = np.unique(np.concatenate([n.reshape(-1) for n in names]))
     listed, place = np.unique(ids[used], return_inverse=True)
-    index = np.full(len(ids), -1, dtype=np.int64)
+    index = np.full(len(ids), -1, dtype=np.intp)
     index[used] = place.reshape(-1)
     return listed, index
 
 
-def _check(content: RecordFile, pose_ids: Ints, landmark_ids: Ints, ends: Ints, lines: Ints, ranged: Records) -> None:
+def _check(content: RecordFile, pose_ids: Wides, landmark_ids: Wides, ends: Ints, lines: Ints, ranged: Records) -> None:
     """Raise FormatError where the records make no graph."""
     if len(pose_ids) == 0:
         raise content.error("holds no poses; is this a g2o file?")

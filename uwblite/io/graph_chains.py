@@ -35,7 +35,7 @@ def along_edges(graph: Graph) -> tuple[Graph, Ints]:
             priors[e.block] |= dict(zip(e.index.tolist(), e.value, strict=True))
     for anchor, place in priors["anchors"].items():
         anchors[anchor] = place if np.isnan(anchors[anchor, 0]) else anchors[anchor]
-    chains = np.zeros(len(poses), dtype=np.int64)
+    chains = np.zeros(len(poses), dtype=np.intp)
     given = bool(np.isfinite(poses[:, 0]).any() or given_anchors(graph).any())
     poses = chained_poses(poses, *steps) if steps and np.isfinite(poses[:, 0]).any() else poses
     while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
@@ -76,8 +76,8 @@ def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
     key, link = np.unique(key, return_index=True)
     links = csr_matrix((cost[link], (key // (n + 1), key % (n + 1))), shape=(n + 1, n + 1))
     order, parent = breadth_first_order(minimum_spanning_tree(links), n, directed=False)
-    node = order[1:][~known[order[1:]]].astype(np.int64)
-    parent = parent[node].astype(np.int64)
+    node = order[1:][~known[order[1:]]].astype(np.intp)
+    parent = parent[node].astype(np.intp)
     edge = link[np.searchsorted(key, np.minimum(node, parent) * (n + 1) + np.maximum(node, parent))]
     step = np.where((j[edge] == node)[:, None], T_i_j[edge], se2.inverse(T_i_j[edge]))
     result = np.where(known[:, None], poses, np.nan)

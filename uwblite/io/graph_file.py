@@ -19,7 +19,7 @@ from .graph_chains import along_edges
 from .plain_edges import ENDS, WIDTHS, Measured, root
 from .records import RecordFile, Records
 
-_NONE = np.zeros(0, dtype=np.int64)
+_NONE = np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class GraphFile:
     """Name of each landmark in the file; they are the graph's anchors."""
     stamps: Floats
     """(n,) s, time of each pose; its number where the file gives no time."""
-    chains: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    chains: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """(n,) chain of each pose: 0 stands in the map's frame; others begin at the origin and want a place (see `along_edges`)."""
     skipped: dict[str, int] = field(default_factory=dict)
     """Lines of kinds that are not used, by tag."""
@@ -191,5 +191,5 @@ _DISTANCES = ("range", "pose_range", "landmark_range")
 def _ranges_from_poses(pose: Ints, anchor: Ints, ranges: Floats, sigma: Floats) -> RangeEdges:
     """Return range edges without lever arms and calibration."""
     n, flat = len(pose), np.zeros((len(pose), 2))
-    none = np.full((n, 6), -1, dtype=np.int64)
+    none = np.full((n, 6), -1, dtype=np.intp)
     return RangeEdges(pose, anchor, ranges, sigma, flat, np.zeros(n), flat, np.zeros(2), np.zeros(n), none)

@@ -64,4 +64,4 @@ def _nearest(sorted_stamps: Floats, query: Floats) -> Ints:
     right = np.clip(np.searchsorted(sorted_stamps, query), 1, max(len(sorted_stamps) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(sorted_stamps) - 1)
-    return np.where(query - sorted_stamps[left] <= sorted_stamps[right] - query, left, right).astype(np.int64)
+    return np.where(query - sorted_stamps[left] <= sorted_stamps[right] - query, left, right).astype(np.intp)

@@ -240,7 +240,7 @@ def _take_words(words: list[bytes], pixels: Image, done: int, path: str) -> int:
     """Write numbers behind those that are there already; return how many there are then."""
     words = words[: len(pixels) - done]
     try:
-        values = np.array(words, dtype=np.int64)  # not uint8: numpy 1 wraps what is above 255
+        values = np.array(words, dtype=np.intp)  # not uint8: numpy 1 wraps what is above 255
     except (ValueError, OverflowError):
         values = np.array([-1])
     if len(values) and not 0 <= values.min() <= values.max() <= 255:

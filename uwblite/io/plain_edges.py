@@ -13,7 +13,7 @@ from ..graph.point_edges import LandmarkEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 
-_NONE = np.zeros(0, dtype=np.int64)
+_NONE = np.zeros(0, dtype=np.intp)
 ENDS = {
     "relative": ("pose", "pose"), "observation": ("pose", "landmark"), "range": ("pose", "landmark"),
     "pose_range": ("pose", "pose"), "landmark_range": ("landmark", "landmark"), "pose_prior": ("pose",),

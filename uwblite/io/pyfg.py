@@ -192,7 +192,7 @@ def _inverse(covariance: Floats, of: Records, content: RecordFile) -> Floats:
 def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ...], Ints]:
     """Return names of poses, place of every name among them (-1 = none), and the same of landmarks."""
     parsed = [_NAME.fullmatch(name) for name in content.names]
-    index = [np.full(len(parsed), -1, dtype=np.int64) for _ in range(2)]
+    index = [np.full(len(parsed), -1, dtype=np.intp) for _ in range(2)]
     listed: list[list[tuple[bytes, int, int]]] = [[], []]
     for place, (name, match) in enumerate(zip(content.names, parsed, strict=True)):
         if match is None:

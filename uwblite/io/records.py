@@ -134,9 +134,9 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
         raise result.error("a number is beyond anything that is measured; are the units right?", rows[far[0]][0])
     indices = [[names.setdefault(name, len(names)) for name in tokens[first : first + layout.names]] for _, tokens in rows]
     return Records(
-        np.array([line for line, _ in rows], dtype=np.int64),
+        np.array([line for line, _ in rows], dtype=np.intp),
         values[:, 0] if layout.stamped else np.zeros(len(rows)),
-        np.array(indices, dtype=np.int64).reshape(len(rows), layout.names),
+        np.array(indices, dtype=np.intp).reshape(len(rows), layout.names),
         values[:, 1:] if layout.stamped else values,
     )
 
@@ -153,7 +153,7 @@ def _not_a_number(rows: list[tuple[int, list[bytes]]], numeric: list[list[bytes]
 
 def _joined(parts: list[Records], layout: Layout) -> Records:
     if not parts:
-        none = np.zeros(0, dtype=np.int64)
+        none = np.zeros(0, dtype=np.intp)
         return Records(none, np.zeros(0), none.reshape(0, layout.names), np.zeros((0, layout.numbers)))
     columns = [(p.lines, p.stamps, p.names, p.numbers) for p in parts]
     return Records(*(np.concatenate(column) for column in zip(*columns, strict=True)))

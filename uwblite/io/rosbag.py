@@ -198,7 +198,7 @@ class _Collector:
         place = {name: k for k, name in enumerate(ids)}
         stamps = np.array([row[0] for row in rows])
         order = np.argsort(stamps, kind="stable")
-        anchor = np.array([place[row[1]] for row in rows], dtype=np.int64)
+        anchor = np.array([place[row[1]] for row in rows], dtype=np.intp)
         ranges, quality = (np.array([row[k] for row in rows]) for k in (2, 3))
         return UwbRanges(stamps[order], anchor[order], ranges[order], quality[order], ids)
 

@@ -56,7 +56,7 @@ def resampled(ranges: NDArray[np.float32], have: ScanGeometry, want: ScanGeometr
     step, place = have.angle_increment, (want.angles - have.angle_min) / have.angle_increment
     if have.full_turn:
         place = np.mod(place + 0.5, 2.0 * np.pi / abs(step)) - 0.5
-    low = np.floor(place).astype(np.int64)
+    low = np.floor(place).astype(np.intp)
     share = (place - low).astype(np.float32)
     ends = np.stack([low, low + 1])
     ends = ends % have.beams if have.full_turn else np.clip(ends, 0, have.beams - 1)

@@ -154,7 +154,7 @@ def _report(path: Path) -> dict[str, Any]:
 def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
     """Return stamps (k,), recordings (k,) and covariances (k, 3, 3) of the keyframes; none where the file is missing."""
     if not path.exists():
-        return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3, 3))
+        return np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3))
     table = read_csv(path)
     # Stamps are times since 1970 in many recordings: too large for the lengths that a table is checked for.
     texts = zip(table.texts("stamp"), table.lines, strict=True)
@@ -163,7 +163,7 @@ def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
     covariances = np.empty((len(upper), 3, 3))
     row, col = np.triu_indices(3)
     covariances[:, row, col] = covariances[:, col, row] = upper
-    number = table.numbers("recording", default=1.0)[:, 0].astype(np.int64)
+    number = table.numbers("recording", default=1.0)[:, 0].astype(np.intp)
     if len(number) and not 1 <= number.min() <= number.max() <= recordings:
         raise FormatError(f"names recording {number.max()}; the folder holds {recordings} trajectories", table.path)
     return stamps, number, covariances

@@ -31,7 +31,7 @@ def filled(rays: ScanPoints) -> ScanPoints:
     """Return the points of scans with further ones in the gaps between beams that hit one straight surface."""
     first = _on_one_line(rays)
     step = rays.points[first + 1] - rays.points[first]
-    parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / _SPACING).astype(np.int64)
+    parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / _SPACING).astype(np.intp)
     own = np.repeat(np.arange(len(first)), parts - 1)
     number = np.arange(len(own)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
     share = (number / parts[own])[:, None]

@@ -10,7 +10,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats, Ints
+from ..arrays import WIDE, Floats, Ints
 from .clouds import Clouds
 
 _CLOUDS_AT_ONCE = 64
@@ -63,7 +63,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     filled = np.isfinite(low[:, :1])
     margin = reach + cell
     low = np.where(filled, low - margin, 0.0)
-    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + filled
+    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.intp) + filled
     runs = shape[:, 0] * -(-shape[:, 1] // _RUN)
     start = (np.concatenate([[0], np.cumsum(runs)]) + 1).astype(np.int32)
     narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
@@ -77,7 +77,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
         block = np.full((rows.stop - rows.start, _RUN), NOBODY, dtype=kind)
         _claim_cells(clouds, some, block.reshape(-1), (start[some] - rows.start) * _RUN, low, shape, cell, offsets)
         # All bits of -1 are set: the words of a run that names no point are -1 together, too.
-        named = np.flatnonzero(reduce(np.bitwise_and, block.view(np.int64).T) != NOBODY)
+        named = np.flatnonzero(reduce(np.bitwise_and, block.view(WIDE).T) != NOBODY)
         run[rows][named] = (count + np.arange(len(named))) * _RUN
         kept.append(block[named])
         count += len(named)
@@ -112,7 +112,7 @@ def _claim_cells(
     usable, owner, x, y = _usable(clouds, some)
     rows = (usable - clouds.offsets[owner]).astype(cells.dtype)
     stride = -(-shape[owner, 1] // _RUN) * _RUN
-    cx, cy = ((x - low[owner, 0]) / cell).astype(np.int64), ((y - low[owner, 1]) / cell).astype(np.int64)
+    cx, cy = ((x - low[owner, 0]) / cell).astype(np.intp), ((y - low[owner, 1]) / cell).astype(np.intp)
     base = cx * stride + cy + start[owner - some.start]
     # Of points in one cell, the last one counts in every cell.
     cells[base] = rows
@@ -165,7 +165,7 @@ def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArra
     d is the distance from the cell's centre to the point that the raster names; 0 where it names none.
     """
     high = int(raster.shape[0, 1])
-    nearest = raster.cells(0).reshape(-1).astype(np.int64)
+    nearest = raster.cells(0).reshape(-1).astype(np.intp)
     cells = np.flatnonzero(nearest >= 0)
     own = nearest[cells]
     centre = raster.origin[0] + (np.column_stack([cells // high, cells % high]) + 0.5) * raster.cell

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, concatenated
 from ..config import setting
 from ..odometry.attached import ScanPoints
 from . import beam_gaps
@@ -87,7 +87,7 @@ class Clouds:
     def only(self, kept: Bools) -> "Clouds":
         """Return the clouds with some of their points (p,) alone."""
         counts = np.bincount(self.owner[kept], minlength=len(self))
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
         return Clouds(offsets, self.points[kept], self.normals[kept], self.owner[kept], self.normal_variance[kept])
 
 
@@ -111,7 +111,7 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     owner = owner[kept]
     offsets = np.searchsorted(owner, np.arange(keyframes + 1))
     return Clouds(
-        offsets.astype(np.int64),
+        offsets.astype(np.intp),
         centres.astype(np.float32, order="F"),
         normals.astype(np.float32, order="F"),
         owner.astype(np.int32),
@@ -122,8 +122,8 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
 def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clouds:
     """Return the clouds of several parts, one after the other, as one, in single precision or another kind."""
     starts = np.cumsum([0] + [len(p) for p in parts])
-    counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.int64)])
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.intp)])
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
     size = int(offsets[-1])
     points, normals = (np.empty((size, 2), dtype=kind, order="F") for _ in range(2))
     whole = Clouds(offsets, points, normals, np.empty(size, dtype=np.int32), np.empty(size, dtype=kind))
@@ -166,15 +166,15 @@ def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]
     return rays.keyframe[one], mean[:, :2], mean[:, 2:]
 
 
-def cell_number(owner: Ints, points: Floats, size: float) -> Ints:
+def cell_number(owner: Ints, points: Floats, size: float) -> Wides:
     """Return a number (p,) that points (p, 2) have in common which have one owner (p,) and lie in one square."""
-    x, y = np.floor(np.ascontiguousarray(points.T) / size).astype(np.int64)
+    x, y = np.floor(np.ascontiguousarray(points.T) / size).astype(WIDE)
     x -= x.min(initial=0)
     y -= y.min(initial=0)
     return np.asarray((owner * (x.max(initial=0) + 1) + x) * (y.max(initial=0) + 1) + y)
 
 
-def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
+def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
     """Average the rows of values (p, v) that share a key (p,).
 
     Returns

@@ -130,8 +130,8 @@ def _source_image(
     """Return the source turned to the heading and put at the guess, its normals summed in the cells of the target's field."""
     c, s = np.cos(heading), np.sin(heading)
     x, y = source.points.T
-    column = np.floor((c * x - s * y + guess[0] - origin[0]) / config.resolution).astype(np.int64)
-    row = np.floor((s * x + c * y + guess[1] - origin[1]) / config.resolution).astype(np.int64)
+    column = np.floor((c * x - s * y + guess[0] - origin[0]) / config.resolution).astype(np.intp)
+    row = np.floor((s * x + c * y + guess[1] - origin[1]) / config.resolution).astype(np.intp)
     inside = (column >= -half[0]) & (column < field[1] + half[0]) & (row >= -half[1]) & (row < field[0] + half[1])
     cell = (row[inside] % shape[0]) * shape[1] + column[inside] % shape[1]
     image = np.empty(shape[0] * shape[1], np.complex64)
@@ -155,4 +155,4 @@ def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     while len(peaks) and len(chosen) < config.candidates:
         chosen.append(peaks[0])
         peaks = peaks[(np.abs(peaks - peaks[0]) >= unit).any(axis=1)]
-    return np.array(chosen, dtype=np.int64).reshape(-1, 3)
+    return np.array(chosen, dtype=np.intp).reshape(-1, 3)

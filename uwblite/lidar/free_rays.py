@@ -54,10 +54,10 @@ def with_free_rays(found: MeasuredSurfaces, short: Bools, free: SurfaceRays, sen
 def _cells(found: MeasuredSurfaces, sensors: Floats) -> tuple[Floats, Ints]:
     """Return the middles (c, 2) of the cells of walls that enough rays have shown, and the wall (c,) of each."""
     surfaces, rays = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface])
-    way, wall = surfaces.tangent, rays.surface.astype(np.int64)
+    way, wall = surfaces.tangent, rays.surface.astype(np.intp)
     ended = se2.transform_each(sensors, rays.keyframe, rays.points)
     along = dots(ended - surfaces.place.take(wall, axis=0), way.take(wall, axis=0))
-    cells, number = unique_rows(np.column_stack([wall, np.floor(along / _CELL).astype(np.int64)]))
+    cells, number = unique_rows(np.column_stack([wall, np.floor(along / _CELL).astype(np.intp)]))
     wall, cell = cells[np.bincount(number, minlength=len(cells)) >= _SHOWN].T
     return surfaces.place[wall] + ((cell + 0.5) * _CELL)[:, None] * way[wall], wall
 

@@ -56,7 +56,7 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
     (c, s), (px, py) = se2.cos_sin(back[:, 2]), np.ascontiguousarray(points.T)
     x, y = c * px - s * py + back[:, 0], s * px + c * py + back[:, 1]
     distance = np.sqrt(x * x + y * y)
-    bins = ((np.arctan2(y, x) + np.pi) * (parts / (2.0 * np.pi))).astype(np.int64)
+    bins = ((np.arctan2(y, x) + np.pi) * (parts / (2.0 * np.pi))).astype(np.intp)
     bins *= bins < parts  # Straight behind is one direction; a remainder takes longer.
     until = free.ranges.take(bins + parts * np.arange(len(free.poses))[:, None])
     reach = until > 0.0

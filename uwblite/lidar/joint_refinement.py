@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, Wides
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
@@ -107,7 +107,7 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
         owner = clouds.owner[usable[part]]
         cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / _SURFACE_CELL)
         bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
-        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
+        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.intp) % 8
     cell -= cell.min(axis=0, initial=0)
     wide = int(cell[:, 1].max(initial=0)) + 1
     row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
@@ -120,13 +120,13 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
 
 def _seen_cells(
     owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
-) -> Iterator[tuple[Ints, Ints]]:
+) -> Iterator[tuple[Wides, Wides]]:
     """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
     for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
-        key = (cell[part, 0].astype(np.int64) * wide + cell[part, 1]) * 8 + facing[part]
+        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * 8 + facing[part]
         many = int(key.max(initial=0)) + 1
-        yield np.divmod(np.unique(owner[part].astype(np.int64) * many + key), many)
+        yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)
 
 
 def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
@@ -137,8 +137,8 @@ def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, c
     poses : (k, 3). path : (k,) travelled distance, m. recording : (k,) recording of each keyframe.
     """
     k = len(clouds)
-    near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
-    near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
+    near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.intp)])
+    near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.intp)])
     joined = (recording[near_i] == recording[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
     pairs = near_i * k + near_j
@@ -152,7 +152,7 @@ def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, c
 def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
     """Return for every cloud i the clouds j from other times that share most with it, one of each epoch."""
     size = np.maximum(np.diff(seen.indptr), 1)
-    epoch = (path / config.epoch).astype(np.int64)
+    epoch = (path / config.epoch).astype(np.intp)
     visit = recording * (int(epoch.max(initial=0)) + 1) + epoch
     visits = int(visit.max(initial=0)) + 1
     across, found = seen.T.tocsr(), []
@@ -161,7 +161,7 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
         common = seen[first : first + _CLOUDS_AT_ONCE] @ across
         common.sort_indices()
         common = common.tocoo()
-        i, j = common.row.astype(np.int64) + first, common.col.astype(np.int64)
+        i, j = common.row.astype(np.intp) + first, common.col.astype(np.intp)
         share = common.data / np.minimum(size[i], size[j])
         kept = np.flatnonzero((np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= 4))
         i, j, share = i[kept], j[kept], share[kept]

@@ -59,7 +59,7 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
     scores = np.empty((len(headings), len(shift), len(shift)), np.float32)
     for n, heading in enumerate(headings):
         laid = se2.transform(np.array([guess[0], guess[1], heading]), points)
-        cell = np.floor((laid - raster.origin[0]) / raster.cell).astype(np.int64)
+        cell = np.floor((laid - raster.origin[0]) / raster.cell).astype(np.intp)
         # The rim of the raster names no point: what lies outside is put there.
         x, y = np.clip(cell[:, 0, None] + shift, 0, wide - 1), np.clip(cell[:, 1, None] + shift, 0, high - 1)
         seen = field.take((x * high)[:, :, None] + y[:, None, :]).reshape(len(rows), -1)
@@ -79,4 +79,4 @@ def _maxima(scores: NDArray[np.float32], count: int) -> Ints:
             break
         chosen.append(top)
         left[tuple(slice(max(0, t - w), t + w + 1) for t, w in zip(top, _SEPARATION, strict=True))] = 0.0
-    return np.array(chosen, dtype=np.int64).reshape(-1, 3)
+    return np.array(chosen, dtype=np.intp).reshape(-1, 3)

@@ -93,10 +93,10 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
     """
     k, s = len(poses), len(found.surfaces.facing)
     of_poses, of_surfaces = np.zeros((k, 3, 4)), np.zeros((s, 4, 5))
-    across, where = [np.zeros((0, 4, 3))], [np.zeros((2, 0), dtype=np.int64)]
+    across, where = [np.zeros((0, 4, 3))], [np.zeros((2, 0), dtype=np.intp)]
     for rays in found.rays.in_parts(found.surfaces):
         first = _groups(rays)
-        keyframe, surface = pair = np.stack([rays.keyframe[first], rays.surface[first]]).astype(np.int64)
+        keyframe, surface = pair = np.stack([rays.keyframe[first], rays.surface[first]]).astype(np.intp)
         products = _products(rays, first, found, sensors, poses, kernel)
         np.add.at(of_poses, keyframe, products[:, :3, [0, 1, 2, 7]])
         np.add.at(of_surfaces, surface, products[:, 3:7, 3:])

@@ -78,11 +78,11 @@ def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools)
     """Return the ratios (2,) of the squared sums of residuals over places to their sums of squares, of walls and of columns."""
     first = int(place.min(initial=0))
     many = int(place.max(initial=0)) - first + 1
-    number = surface.astype(np.int64) * many + (place - first)
+    number = surface.astype(np.intp) * many + (place - first)
     shown = np.flatnonzero(np.bincount(number))
     sums, squares, of = np.bincount(number, residual)[shown], np.bincount(number, residual**2)[shown], shown // many
     places = np.bincount(of, minlength=len(curved))
-    free = places - _FITTED[curved.astype(np.int64)]
+    free = places - _FITTED[curved.astype(np.intp)]
     share = np.where(places >= _MANY, places / np.maximum(free, 1), 0.0)[of]
     found = np.full(2, ALIKE)
     for kind in range(2):

@@ -103,11 +103,11 @@ _SINGULAR = 1e-14
 def find_columns(found: Circles, poses: Floats) -> Floats:
     """Return the columns (n, 3), x, y, radius in the map, that circles of several keyframes at poses (k, 3) show."""
     at = se2.transform(poses[found.keyframe], found.centre)
-    one, other = cKDTree(at).query_pairs(_APART, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.int64)
+    one, other = cKDTree(at).query_pairs(_APART, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
     smaller = np.minimum(found.radius[one], found.radius[other])
     alike = np.abs(found.radius[one] - found.radius[other]) < _UNLIKE * smaller + _RADII[0] / 2.0
     number = connected(one[alike], other[alike], len(at))
-    views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.int64))
+    views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.intp))
     weight = np.bincount(number, found.rays).astype(np.float64)
     values = np.column_stack([at, found.radius])
     columns = np.stack([np.bincount(number, found.rays * v) / weight for v in values.T], axis=1)
@@ -148,7 +148,7 @@ class Surroundings:
     def inside(self, at: Floats) -> Ints:
         """Return the rows (n,) of points (p, 2) on such squares."""
         x, y = (
-            np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.int64)
+            np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.intp)
             for k in range(2)
         )
         return np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
@@ -173,7 +173,7 @@ def surroundings(columns: Floats, margin: float) -> Surroundings:
     reach, wide = columns[:, 2].max() + margin, np.ptp(columns[:, :2], axis=0)
     size = max(_SQUARE, float(np.sqrt(np.prod(wide + 2.0 * reach) / _MOST_SQUARES)))
     corner = columns[:, :2].min(axis=0) - reach - 2.0 * size
-    x, y = np.ceil((wide + 2.0 * reach) / size).astype(np.int64) + 4
+    x, y = np.ceil((wide + 2.0 * reach) / size).astype(np.intp) + 4
     middle = corner + (np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1) + 0.5) * size
     near = cKDTree(columns[:, :2]).query(middle)[0] < reach + size
     return Surroundings(columns, corner, size, near)

@@ -54,7 +54,7 @@ class PairPoints:
     def of(self, pair: int) -> Ints:
         """Return the rows of one pair."""
         rows = self.row[pair]
-        return np.asarray(rows[rows >= 0], dtype=np.int64)
+        return np.asarray(rows[rows >= 0], dtype=np.intp)
 
 
 def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
@@ -136,7 +136,7 @@ def _looked_up(
     row: NDArray[np.int32], square: Floats,
 ) -> Correspondences:
     """Look up the points of some pairs (e,), whose squared gates are columns (e, 1) as other per-pair values are."""
-    rows = row.astype(np.int64)  # Once, and not at every use.
+    rows = row.astype(np.intp)  # Once, and not at every use.
     c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
     px, py, sx, sy = (column.take(rows) for column in surface)
     rx, ry = c * px - s * py, s * px + c * py
@@ -211,7 +211,7 @@ def shifts_by_range_error(
         far_p, far_q = np.maximum(np.hypot(rx, ry), _NEAREST), np.maximum(np.hypot(qx, qy), _NEAREST)
         by_range = nx * (rx / far_p - qx / far_q) + ny * (ry / far_p - qy / far_q)
         weighted = found.good / np.square(1.0 + np.square(found.distance * (1.0 / scale))) * by_range
-        quarter = np.floor((np.arctan2(ny, nx) + turn[found.pairs, None]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+        quarter = np.floor((np.arctan2(ny, nx) + turn[found.pairs, None]) * (2.0 / np.pi) + 0.5).astype(np.intp) % 4
         for k in range(4):
             own = weighted * (quarter == k)
             sums = [(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)]

@@ -151,7 +151,7 @@ def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats
     places = search(target, source, guess, _SEARCH, CorrelativeConfig())
     if not len(places.poses):
         return None
-    one = np.ones(len(places.poses), dtype=np.int64)
+    one = np.ones(len(places.poses), dtype=np.intp)
     points = scan_matching.pair_points(built, one * j, _POINTS)
     aligned = align_pairs(built, raster, one * i, places.poses, points, 0.3, _LAST_GATE)
     best = int(np.argmax(aligned.share))
@@ -168,4 +168,4 @@ def _points(scans: LaserScans, mounting: SensorMounting, chosen: Ints, range_max
     in_laser = reach[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     points = se2.transform(mounting.T_base_laser, in_laser)
     origins = np.broadcast_to(mounting.T_base_laser[:2], points.shape)
-    return ScanPoints(scan.astype(np.int64), points, origins, ray.astype(np.int64), chosen[scan])
+    return ScanPoints(scan.astype(np.intp), points, origins, ray.astype(np.intp), chosen[scan])

@@ -129,7 +129,7 @@ def _straight(moments: _Moments, ahead: Floats, apart: Bools) -> tuple[Ints, Int
     """Split runs until they are straight; return the first ray of each and the one after the last, ascending."""
     first = np.flatnonzero(apart)
     last = np.append(first[1:], len(apart))
-    found = [np.zeros((2, 0), dtype=np.int64)]
+    found = [np.zeros((2, 0), dtype=np.intp)]
     for _ in range(_SPLITS):
         many = last - first >= _FEWEST
         first, last = first[many], last[many]
@@ -175,9 +175,9 @@ def walls_of(pieces: Pieces, poses: Floats) -> Walls:
     return Walls(np.where(good, np.cumsum(good) - 1, -1)[number], centre[good], facing[good])
 
 
-def _together(at: Floats, normal: Floats, deviation: Floats) -> NDArray[np.int64]:
+def _together(at: Floats, normal: Floats, deviation: Floats) -> NDArray[np.intp]:
     """Return the number (s,) of the wall of each piece with a centre (s, 2) and a normal (s, 2)."""
-    pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray") if len(at) else np.zeros((0, 2), dtype=np.int64)
+    pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray") if len(at) else np.zeros((0, 2), dtype=np.intp)
     one, other = pairs.T
     step = at[other] - at[one]
     lean = np.arccos(np.clip((normal[one] * normal[other]).sum(axis=1), -1.0, 1.0))

@@ -98,9 +98,9 @@ class StepSearch:
         motion = guesses[0]
         distance = min(self._distance + 2.0 * float(np.hypot(motion[0], motion[1])), _FARTHEST)
         window = Window(distance, self._angle + _TURNING * abs(float(motion[2])))
-        rows = pair_points(pair, np.ones(1, dtype=np.int64), _POINTS).of(0)
+        rows = pair_points(pair, np.ones(1, dtype=np.intp), _POINTS).of(0)
         starts = np.concatenate([guesses, best_poses(pair, raster, rows, motion, window, _STARTS)])
-        target = np.zeros(len(starts), dtype=np.int64)
+        target = np.zeros(len(starts), dtype=np.intp)
         points = pair_points(pair, target + 1, _POINTS)
         tried = align_pairs(pair, raster, target, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
         through = self.through(k, tried.pose)

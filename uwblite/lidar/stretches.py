@@ -82,7 +82,7 @@ def _stretches_of(clouds: Clouds, rows: slice) -> Stretches:
 
 
 def _numbered(begins: Bools) -> Ints:
-    return np.cumsum(begins, dtype=np.int64) - 1
+    return np.cumsum(begins, dtype=np.intp) - 1
 
 
 def _split(begins: Bools, points: Floats) -> None:

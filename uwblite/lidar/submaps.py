@@ -71,7 +71,7 @@ def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
     -------
     first (s,) and one past the last keyframe (s,) of each piece.
     """
-    piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.int64) if epsilon > 0 else np.arange(len(path))
+    piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.intp) if epsilon > 0 else np.arange(len(path))
     change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(recording) != 0)])
     first = np.flatnonzero(change)
     return first, np.append(first[1:], len(path))
@@ -132,7 +132,7 @@ def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: In
     scatter = clouds.normal_variance[rows]
     number, points, normals, scatter = _merge(piece[owner], points, normals, scatter, config.voxel)
     kept = np.ones(len(number), dtype=bool)
-    offsets = np.searchsorted(number, np.arange(len(first) + 1)).astype(np.int64)
+    offsets = np.searchsorted(number, np.arange(len(first) + 1)).astype(np.intp)
     for a, b in itertools.pairwise(offsets):
         if b > a:
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
@@ -146,7 +146,7 @@ def _merge(
 ) -> tuple[Ints, Floats, Floats, Floats]:
     """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
     # Four facings, not two: for no direction of the wall may noise turn a normal from one side's facing into the other's.
-    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.intp) % 4
     key = cell_number(owner, points, size) * 4 + facing
     one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))
     length = np.hypot(mean[:, 2], mean[:, 3])

@@ -51,8 +51,8 @@ def _common(edges: ScanEdges, graph: Graph) -> CommonErrors:
     """Return the errors of one table, those of each size numbered after those before."""
     assert edges.by_surface is not None
     shift = whiten(edges.sqrt_information, edges.by_surface.transpose(0, 2, 1)).transpose(0, 2, 1)
-    edge, errors, count = np.arange(len(edges)), [np.zeros(len(edges), dtype=np.int64)], 1
-    shifts, kind = [_DEVICE * shift.sum(axis=1)], [np.zeros(1, dtype=np.int64)]
+    edge, errors, count = np.arange(len(edges)), [np.zeros(len(edges), dtype=np.intp)], 1
+    shifts, kind = [_DEVICE * shift.sum(axis=1)], [np.zeros(1, dtype=np.intp)]
     for number, size in enumerate(_SIZES):
         errors.append((count + 4 * _places(graph.poses[edges.i, :2], size)[:, None] + np.arange(4)).ravel())
         shifts.append(_SURFACE * shift.reshape(-1, 3))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, dots
+from ..arrays import WIDE, Bools, Floats, Ints, Table, dots
 from ..odometry.attached import ScanPoints
 from .cloud_rasters import CloudRasters, look_up
 from .clouds import Clouds
@@ -101,7 +101,7 @@ class SurfaceRays(Table):
 
     def by_keyframe(self, surfaces: Surfaces) -> "SurfaceRays":
         """Return the rays in order: those on walls before those on columns, by keyframe, and by surface."""
-        key = surfaces.round[self.surface] * np.int64(self.keyframe.max(initial=0) + 1) + self.keyframe
+        key = surfaces.round[self.surface] * WIDE(self.keyframe.max(initial=0) + 1) + self.keyframe
         return self.rows(np.argsort(key * len(surfaces.round) + self.surface, kind="stable"))
 
     def in_parts(self, surfaces: Surfaces) -> Iterator["SurfaceRays"]:
@@ -173,7 +173,7 @@ def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: S
     if not len(clouds.points) or not len(stretch):
         return stretch
     x, y = (rays.points[:, k : k + 1].astype(np.float64) for k in range(2))
-    nearest = look_up(raster, rays.keyframe, x, y)[:, 0].astype(np.int64)
+    nearest = look_up(raster, rays.keyframe, x, y)[:, 0].astype(np.intp)
     of = found.of_point[np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)]
     near = np.flatnonzero((nearest >= 0) & found.straight[of])
     near = near[_ends_on(rays.rows(near), found, of[near])]
@@ -195,7 +195,7 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
     if not len(columns):
-        return rays.rows(np.zeros(0, dtype=np.int64))
+        return rays.rows(np.zeros(0, dtype=np.intp))
     at, direction = in_map(rays, poses)
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
@@ -229,7 +229,7 @@ def without_columns(kind: NDArray[np.int8], clouds: Clouds, poses: Floats, colum
 
 def _around(clouds: Clouds, poses: Floats, columns: Floats) -> Ints:
     """Return the numbers (n,) of the clouds' points on columns (c, 3)."""
-    near, found = surroundings(columns, _ROUND), [np.zeros(0, dtype=np.int64)]
+    near, found = surroundings(columns, _ROUND), [np.zeros(0, dtype=np.intp)]
     for first in range(0, len(clouds.points) if len(columns) else 0, _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         rows, which, away = near.nearest(se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64)))

@@ -37,9 +37,9 @@ _NEIGHBOURS = 64
 def nearest_by_bearing(clouds: Clouds) -> Floats:
     """Return how far (k, bearings), m, the nearest point of each cloud is in every direction; inf where there is none."""
     distance, bearing = np.hypot(clouds.points[:, 0], clouds.points[:, 1]), se2.bearing(clouds.points)
-    bins = np.clip(((bearing + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.int64), 0, _BEARINGS - 1)
+    bins = np.clip(((bearing + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.intp), 0, _BEARINGS - 1)
     nearest = np.full(len(clouds) * _BEARINGS, np.inf)
-    np.minimum.at(nearest, clouds.owner.astype(np.int64) * _BEARINGS + bins, distance)
+    np.minimum.at(nearest, clouds.owner.astype(np.intp) * _BEARINGS + bins, distance)
     return nearest.reshape(-1, _BEARINGS)
 
 
@@ -53,7 +53,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
     nearest = nearest_by_bearing(clouds)
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
-        views = np.unique(np.linspace(first, last - 1, _VIEWS).round().astype(np.int64))
+        views = np.unique(np.linspace(first, last - 1, _VIEWS).round().astype(np.intp))
         free.append(free_space(se2.between(poses[reference], poses[views]), nearest[views]))
     return free
 
@@ -153,5 +153,5 @@ def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]
     again = (np.abs(path[other] - path[:, None]) > _APART) | (recording[other] != recording[:, None])
     again &= np.isfinite(distance)
     i = np.flatnonzero(again.any(axis=1))
-    i = i[np.unique(np.linspace(0, len(i) - 1, min(_REVISITS, len(i))).round().astype(np.int64))]
-    return i, other[i, np.argmax(again[i], axis=1)].astype(np.int64)
+    i = i[np.unique(np.linspace(0, len(i) - 1, min(_REVISITS, len(i))).round().astype(np.intp))]
+    return i, other[i, np.argmax(again[i], axis=1)].astype(np.intp)

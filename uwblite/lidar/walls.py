@@ -46,7 +46,7 @@ def find_walls(clouds: Clouds, found: Stretches, poses: Floats) -> Walls:
 
 def _places(found: Stretches) -> Ints:
     """Return rows of points on straight stretches, one every so often, none near an end."""
-    return np.concatenate([_places_among(found, part) for part in _parts(found.of_point)] or [np.zeros(0, dtype=np.int64)])
+    return np.concatenate([_places_among(found, part) for part in _parts(found.of_point)] or [np.zeros(0, dtype=np.intp)])
 
 
 def _parts(of_point: Ints) -> Iterator[slice]:
@@ -64,7 +64,7 @@ _POINTS_AT_ONCE = 1 << 17
 def _places_among(found: Stretches, part: slice) -> Ints:
     stretch, along = found.of_point[part], found.along[part]
     rows = np.flatnonzero(found.straight[stretch] & found.inside(stretch, along))
-    key = np.stack([stretch[rows], np.floor(along[rows] / _EVERY).astype(np.int64)], axis=1)
+    key = np.stack([stretch[rows], np.floor(along[rows] / _EVERY).astype(np.intp)], axis=1)
     number = unique_rows(key)[1]
     return part.start + rows[np.unique(number, return_index=True)[1]]
 
@@ -72,7 +72,7 @@ def _places_among(found: Stretches, part: slice) -> Ints:
 def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
     """Return the number (s,) of the set of each of many stretches: those are one whose places (m, 2), with normals (m, 2), lie
     on one line and face the same way."""
-    one, other = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    one, other = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
     for rows in _strips(at):
         of_place = stretch[rows]
         # Linking each place with its first neighbour joins the same sets as all of its links, of which there may be thousands.

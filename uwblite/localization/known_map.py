@@ -116,7 +116,7 @@ def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
     """Return the anchors with the remaining errors of the result's own ranges to them."""
     stored = result.ranges
     index = {name: k for k, name in enumerate(map(last_places({a.id for a in result.anchors}).get, anchors.ids))}
-    anchor = np.array([index.get(name, -1) for name in stored.anchors], dtype=np.int64)
+    anchor = np.array([index.get(name, -1) for name in stored.anchors], dtype=np.intp)
     own = np.flatnonzero(anchor >= 0)
     if not len(own):
         return anchors

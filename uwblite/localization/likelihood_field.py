@@ -67,4 +67,4 @@ def _squares(free: Bools) -> Ints:
     top = 2**LEVELS
     rows, cols = (n // top for n in free.shape)
     some = free[: rows * top, : cols * top].reshape(rows, top, cols, top).any(axis=(1, 3))
-    return np.argwhere(some).astype(np.int64) * top
+    return np.argwhere(some).astype(np.intp) * top

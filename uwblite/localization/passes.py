@@ -56,7 +56,7 @@ def _way(log: SensorLog) -> Floats:
 
 
 def _first_of_each(way: Floats) -> Ints:
-    return np.unique(np.floor(way), return_index=True)[1].astype(np.int64)
+    return np.unique(np.floor(way), return_index=True)[1].astype(np.intp)
 
 
 def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, report: Callable[[int, int], None]) -> Pass:

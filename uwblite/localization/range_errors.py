@@ -95,7 +95,7 @@ def _squares(tags: Floats) -> Ints:
     """Return in which of at most _MOST_CELLS squares of the floor each place (m, 2) lies."""
     cell = _CELL
     while True:
-        member = np.unique(np.floor(tags / cell), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        member = np.unique(np.floor(tags / cell), axis=0, return_inverse=True)[1].reshape(-1).astype(np.intp)
         if member.max(initial=0) < _MOST_CELLS:
             return member
         cell *= 2.0**0.5

@@ -72,7 +72,7 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """
     axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
     off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    few = np.unique(np.linspace(0, len(ranges) - 1, _MOST_MOMENTS).astype(np.int64))
+    few = np.unique(np.linspace(0, len(ranges) - 1, _MOST_MOMENTS).astype(np.intp))
     some, parts = ranges.rows(few), np.array_split(pose + off, len(off) // _AT_ONCE)
     weight = np.concatenate([range_likelihood(part, some) for part in parts]) * (len(ranges) / len(few))
     weight = np.exp(weight - weight.max())

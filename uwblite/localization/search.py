@@ -81,9 +81,9 @@ def _thinned(rays: Rays) -> Floats:
     """Return points (p, 2) on walls, no two in one cell of the field, at most _POINTS of them."""
     near = rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)
     points = rays.ends[near]
-    _, first = np.unique(np.floor(points / (1.5 * CELL)).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(points / (1.5 * CELL)).astype(np.intp), axis=0, return_index=True)
     chosen = np.sort(first)
-    return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.int64))]] if len(chosen) else points[:0]
+    return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.intp))]] if len(chosen) else points[:0]
 
 
 def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
@@ -155,7 +155,7 @@ def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[None, None, N
 def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     """Return by how many cells of the flat field (h, p) each point lies from the robot's cell."""
     laid = se2.rotate(headings[:, None], points[None])
-    cells = np.rint(laid / field.cell).astype(np.int64)
+    cells = np.rint(laid / field.cell).astype(np.intp)
     return cells[..., 1] * field.free.shape[1] + cells[..., 0]
 
 
@@ -165,9 +165,9 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
     scores = np.empty(len(nodes))
     for start in range(0, len(nodes), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        heading, row, col = nodes[part].T.astype(np.int64)
+        heading, row, col = nodes[part].T.astype(np.intp)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
-        scores[part] = values.sum(axis=1, dtype=np.int64) / (255.0 * offsets.shape[1])
+        scores[part] = values.sum(axis=1, dtype=np.intp) / (255.0 * offsets.shape[1])
         yield
     return scores
 
@@ -259,7 +259,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
 
 def _some(ranges: Ranges) -> Ranges:
     """Return forty of the ranges, for the time that all would take."""
-    return ranges.rows(np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64)))
+    return ranges.rows(np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.intp)))
 
 
 _PER_SCORE = 30.0

@@ -102,7 +102,7 @@ def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
     ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
     first = se2.between(odometer.pose, ends[:1])
     sweep = se2.between(ends[:1], ends[1:])
-    laser = beam_origins(first, sweep, np.zeros(len(ray), np.int64), ray / max(count - 1, 1), mounting)
+    laser = beam_origins(first, sweep, np.zeros(len(ray), np.intp), ray / max(count - 1, 1), mounting)
     sign = -1.0 if mounting.laser_flipped else 1.0
     bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
     reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))

@@ -47,7 +47,7 @@ class Rays(Table):
 
     def spread(self, count: int) -> "Rays":
         """Return at most so many rays, evenly spread."""
-        return self if len(self.hit) <= count else self.rows(np.linspace(0, len(self.hit) - 1, count).astype(np.int64))
+        return self if len(self.hit) <= count else self.rows(np.linspace(0, len(self.hit) - 1, count).astype(np.intp))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,7 +234,7 @@ def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
     near[:, 1:] |= free[:, :-1]
     near[:, :-1] |= free[:, 1:]
     row, col = np.nonzero((states == OCCUPIED) & near)
-    return geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
+    return geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
 
 
 def _facing_free_space(walls: Walls) -> Walls:
@@ -242,7 +242,7 @@ def _facing_free_space(walls: Walls) -> Walls:
     free = []
     for sign in (1.0, -1.0):
         places = [walls.points + sign * offset * walls.normals for offset in _SIDE]
-        free.append(sum((walls.state_at(p[:, 0], p[:, 1]) == FREE).astype(np.int64) for p in places))
+        free.append(sum((walls.state_at(p[:, 0], p[:, 1]) == FREE).astype(np.intp) for p in places))
     turned = np.where((free[1] > free[0])[:, None], -walls.normals, walls.normals)
     one_sided = np.minimum(free[0], free[1]) == 0
     points = walls.points - _BEHIND * turned * one_sided[:, None]
@@ -250,4 +250,4 @@ def _facing_free_space(walls: Walls) -> Walls:
 
 
 def _cells(values: Floats, origin: float, size: float) -> Ints:
-    return np.floor((values - origin) * (1.0 / size)).astype(np.int64)
+    return np.floor((values - origin) * (1.0 / size)).astype(np.intp)

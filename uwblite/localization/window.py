@@ -137,7 +137,7 @@ class Window:
         measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
         level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
         sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + _SLOW**2 + (_DRIFT * ago) ** 2)
-        anchor = np.array([r.fact.anchor for r in rows], dtype=np.int64)
+        anchor = np.array([r.fact.anchor for r in rows], dtype=np.intp)
         return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma)
 
 

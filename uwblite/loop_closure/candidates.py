@@ -85,7 +85,7 @@ def propose(
 
 def _among(columns: Ints, names: Set[tuple[int, ...]]) -> Bools:
     """Return which columns (d, p) of numbers, 0 or more, are among names, tuples of d such numbers."""
-    named = np.array(sorted(names), dtype=np.int64).reshape(-1, len(columns)).T
+    named = np.array(sorted(names), dtype=np.intp).reshape(-1, len(columns)).T
     places = (1 + max(int(columns.max(initial=0)), int(named.max(initial=0)))) ** np.arange(len(columns))
     return np.isin(places @ columns, places @ named)
 
@@ -118,7 +118,7 @@ def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
         order = np.lexsort((-worth, one))
         rank = np.arange(len(order)) - np.searchsorted(one[order], one[order])
         kept.update(order[(rank < limit) & (worth[order] > 0.0)].tolist())
-    return np.array(sorted(kept), dtype=np.int64)
+    return np.array(sorted(kept), dtype=np.intp)
 
 
 def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -> set[tuple[int, int]]:

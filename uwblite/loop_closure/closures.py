@@ -94,7 +94,7 @@ def collected(records: Sequence[LoopClosure], sqrt_information: Floats) -> Closu
     """Return candidates, those accepted as edges, too, with the square roots (c, 3, 3) of their information."""
     good = np.array([closure.accepted for closure in records], dtype=bool)
     kept = [closure for closure in records if closure.accepted]
-    i, j = (np.array([getattr(closure, end) for closure in kept], dtype=np.int64) for end in ("i", "j"))
+    i, j = (np.array([getattr(closure, end) for closure in kept], dtype=np.intp) for end in ("i", "j"))
     T_i_j = np.array([closure.T_i_j for closure in kept]).reshape(-1, 3)
     return Closures(RelativePoseEdges(i, j, T_i_j, sqrt_information[good]), tuple(records))
 

@@ -135,7 +135,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
             poses = search(target, source, poses[0], (half_width, half_width, turn), search_config).poses[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
-    return np.concatenate(rows).astype(np.int64), np.concatenate(guesses)
+    return np.concatenate(rows).astype(np.intp), np.concatenate(guesses)
 
 
 def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
@@ -151,7 +151,7 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     ----------
     row : (g,) candidate of each try. pose : (g, 3). share : (g,) that matches.
     """
-    best, second = np.full(candidates, -1, dtype=np.int64), np.zeros(candidates)
+    best, second = np.full(candidates, -1, dtype=np.intp), np.zeros(candidates)
     order = np.lexsort((-share, row))
     tried, first = np.unique(row[order], return_index=True)
     best[tried] = order[first]

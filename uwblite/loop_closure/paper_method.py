@@ -71,12 +71,12 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
     order = np.lexsort((b, a, -worth))
     order = order[worth[order] >= _LEAST_SHARED]
     # Best pairs first: a pair is kept while either of its sub-maps has fewer partners than the limit.
-    used, kept = np.zeros(len(submaps), dtype=np.int64), []
+    used, kept = np.zeros(len(submaps), dtype=np.intp), []
     for row in order.tolist():
         if min(used[a[row]], used[b[row]]) < limit:
             used[[a[row], b[row]]] += 1
             kept.append(row)
-    rows = np.array(sorted(kept), dtype=np.int64)
+    rows = np.array(sorted(kept), dtype=np.intp)
     return a[rows], b[rows]
 
 
@@ -84,7 +84,7 @@ def _shared(poses: Floats, submaps: Submaps) -> Floats:
     """Return the share (s, s) of the squares of the smaller sub-map in which the larger one has points, too."""
     owner = submaps.clouds.owner
     points = se2.transform_each(poses, owner, submaps.clouds.points)
-    cell = np.floor(points / _CELL).astype(np.int64)
+    cell = np.floor(points / _CELL).astype(np.intp)
     cell -= cell.min(axis=0, initial=0)
     _, column = np.unique(cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1], return_inverse=True)
     seen = np.zeros((len(submaps), int(column.max(initial=-1)) + 1), dtype=np.float32)

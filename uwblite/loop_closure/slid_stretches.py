@@ -42,7 +42,7 @@ def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
 
 def scans_fixing(graph: Graph) -> Ints:
     """Return how many scan edges of the same visit fix, in all directions, the step from each keyframe (k,) and agree."""
-    count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
+    count = np.zeros(len(graph.poses) + 1, dtype=np.intp)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
             good = (np.abs(edges.i - edges.j) <= NEAR) & (_fixed(edges) == _ALL) & _agrees(edges, graph)
@@ -53,7 +53,7 @@ def scans_fixing(graph: Graph) -> Ints:
 
 def directions_constrained(graph: Graph) -> Ints:
     """Return in how many directions, 0 to 3, the best scan edge of the same visit fixes the step from each keyframe (k,)."""
-    constrained = np.zeros(len(graph.poses), dtype=np.int64)
+    constrained = np.zeros(len(graph.poses), dtype=np.intp)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
             first, span = np.minimum(edges.i, edges.j), np.abs(edges.i - edges.j)

@@ -65,7 +65,7 @@ class ClearanceMap:
         place = (points - grid.origin) / grid.resolution - 0.5
         low = np.floor(place)
         u, v = np.moveaxis(place - low, -1, 0)
-        col, row = np.moveaxis(low.astype(np.int64), -1, 0)
+        col, row = np.moveaxis(low.astype(np.intp), -1, 0)
         inside = (row >= 0) & (row < grid.rows - 1) & (col >= 0) & (col < grid.cols - 1)
         first = np.where(inside, row * grid.cols + col, 0)
         flat = self.squared.ravel()

@@ -157,7 +157,7 @@ class Planner:
         row, col = (int(v) for v in grid.cell_of(np.clip(place, grid.origin - reach, grid.corner + reach)))
         cells = int(np.ceil(reach / grid.resolution))
         window = self.node_of[max(row - cells, 0) : row + cells + 1, max(col - cells, 0) : col + cells + 1]
-        nodes = window[window >= 0].astype(np.int64)
+        nodes = window[window >= 0].astype(np.intp)
         places = self._places(nodes)
         near = np.hypot(*(places - place).T) <= reach
         return nodes[near], places[near]

@@ -50,7 +50,7 @@ def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
     begin, end : (n, 2) m, map frame.
     """
     lengths = np.hypot(*(end - begin).T)
-    pieces = np.ceil(lengths * (_SAMPLES_PER_CELL / clearance.geometry.resolution)).astype(np.int64) + 1
+    pieces = np.ceil(lengths * (_SAMPLES_PER_CELL / clearance.geometry.resolution)).astype(np.intp) + 1
     ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // _SAMPLES_AT_A_TIME)) + 1
     found = [
         _along(clearance, b, e, length, count)
@@ -145,7 +145,7 @@ def _divided(line: Floats, step: float) -> Floats:
 
 def _cuts(line: Floats, step: float) -> tuple[Ints, Ints, Ints]:
     """Return, of all equal cuts (k,) of a line's pieces, the piece, the cut's number in it, and how many it is cut into."""
-    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - 1e-9), 1).astype(np.int64)
+    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - 1e-9), 1).astype(np.intp)
     piece = np.repeat(np.arange(len(cuts)), cuts)
     return piece, np.arange(len(piece)) - (np.cumsum(cuts) - cuts)[piece], cuts[piece]
 
@@ -173,7 +173,7 @@ def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
     """
     piece, number, cuts = _cuts(line, step)
     away = np.minimum(number, cuts - number)
-    coarseness = 2 ** np.log2(np.maximum(away / _PLACES_PER_OCTAVE, 1.0)).astype(np.int64)
+    coarseness = 2 ** np.log2(np.maximum(away / _PLACES_PER_OCTAVE, 1.0)).astype(np.intp)
     kept = away % coarseness == 0
     return _at(line, piece[kept], (number / cuts)[kept]), piece[kept]
 

@@ -74,7 +74,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
     in_base = np.stack([twist[:, 0] - twist[:, 2] * tag[:, 1], twist[:, 1] + twist[:, 2] * tag[:, 0]], axis=1)
     beside = tag - mounting.tag_position
     return AttachedRanges(
-        keyframe.astype(np.int64),
+        keyframe.astype(np.intp),
         log_ranges.stamps,
         log_ranges.anchor,
         log_ranges.ranges,
@@ -101,7 +101,7 @@ def choose_scans(scans: LaserScans, keyframes: Keyframes, config: KeyframeConfig
     rank = np.arange(len(order)) - np.searchsorted(owner[order], owner[order])
     each = config.scans_each(float(keyframes.path.sum()), scans.ranges.shape[1])
     kept = np.sort(order[rank < np.where(keyframes.alone, 1, each)[owner[order]]])
-    return owner[kept].astype(np.int64), kept
+    return owner[kept].astype(np.intp), kept
 
 
 def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints, range_max: float = np.inf) -> ScanPoints:
@@ -127,7 +127,7 @@ def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints,
     bearing = laser[:, 2] + sign * scans.angles[ray]
     reach = readings[scan, ray].astype(np.float64)
     points = laser[:, :2] + reach[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    return ScanPoints(owner[scan], points, laser[:, :2], ray.astype(np.int64), chosen[scan])
+    return ScanPoints(owner[scan], points, laser[:, :2], ray.astype(np.intp), chosen[scan])
 
 
 def beam_origins(first: Floats, sweep: Floats, scan: Ints, fraction: Floats, mounting: SensorMounting) -> Floats:

@@ -130,7 +130,7 @@ def _keyframes(odometry: Odometry, stamps: Floats, index: Ints, breaks: Odometry
 
 def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
     """Return the number (b,) of the odometry sample before each break; the last sample has no step behind it."""
-    return np.clip(np.searchsorted(stamps, breaks.stamps, "right") - 1, 0, max(len(stamps) - 2, 0)).astype(np.int64)
+    return np.clip(np.searchsorted(stamps, breaks.stamps, "right") - 1, 0, max(len(stamps) - 2, 0)).astype(np.intp)
 
 
 def _slack(stamps: Floats, odometry: Floats, breaks: OdometryBreaks | None) -> Floats:
@@ -209,7 +209,7 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
         chosen.append(min(stop, last))
     if len(chosen) > 2 and (ways[:2, last] - ways[:2, chosen[-2]] < 0.5).all():
         del chosen[-2]
-    return np.array(chosen, dtype=np.int64)
+    return np.array(chosen, dtype=np.intp)
 
 
 _AT_REST = 0.05

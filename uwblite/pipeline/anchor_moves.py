@@ -211,7 +211,7 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
     before = log.screening or Screening((), OdometryBreaks.none())
     return replace(
         log,
-        ranges=replace(ranges, ranges=measured, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())),
+        ranges=replace(ranges, ranges=measured, anchor=anchor.astype(np.intp), anchor_ids=tuple(ids.tolist())),
         mounting=replace(log.mounting, anchor_heights=heights),
         screening=replace(before, findings=(*before.findings, *remarks)),
     )

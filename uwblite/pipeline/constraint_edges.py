@@ -144,7 +144,7 @@ def _anchor_priors(given: Constraints, index: dict[str, int], moved: dict[str, f
     for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
         anchors = [a for a in given.anchors if a.movable == movable and a.id not in moved]
         if anchors:
-            place = np.array([index[a.id] for a in anchors], dtype=np.int64)
+            place = np.array([index[a.id] for a in anchors], dtype=np.intp)
             value = np.array([a.position for a in anchors])
             root = np.array([np.eye(2) / a.sigma for a in anchors])
             edges.append(PriorEdges("anchors", place, value, root, kernel))
@@ -154,7 +154,7 @@ def _anchor_priors(given: Constraints, index: dict[str, int], moved: dict[str, f
 def _pose_priors(given: Constraints, clock: Clock) -> list[Edges]:
     if not given.poses:
         return []
-    place = np.array([clock.nearest(p.stamp, p.recording) for p in given.poses], dtype=np.int64)
+    place = np.array([clock.nearest(p.stamp, p.recording) for p in given.poses], dtype=np.intp)
     root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in given.poses])
     return [PriorEdges("poses", place, np.array([p.pose for p in given.poses]), root)]
 
@@ -162,7 +162,7 @@ def _pose_priors(given: Constraints, clock: Clock) -> list[Edges]:
 def _distances(given: Constraints, index: dict[str, int]) -> list[Edges]:
     if not given.distances:
         return []
-    ends = np.array([[index[name] for name in d.anchors] for d in given.distances], dtype=np.int64)
+    ends = np.array([[index[name] for name in d.anchors] for d in given.distances], dtype=np.intp)
     values = np.array([[d.distance, d.sigma] for d in given.distances])
     return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
 
@@ -171,7 +171,7 @@ def _closures(given: Constraints, clock: Clock) -> list[Edges]:
     if not given.closures:
         return []
     ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in given.closures]
-    i, j = np.array(ends, dtype=np.int64).T
+    i, j = np.array(ends, dtype=np.intp).T
     root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in given.closures])
     return [RelativePoseEdges(i, j, np.array([c.pose for c in given.closures]), root)]
 
@@ -181,4 +181,4 @@ def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Ed
     if given.poses or sum(a.id not in moved for a in given.anchors) > 1:
         return []
     root = np.diag([0.0, 0.0, 1e4])[None]
-    return [PriorEdges("poses", np.zeros(1, dtype=np.int64), graph.poses[:1].copy(), root)]
+    return [PriorEdges("poses", np.zeros(1, dtype=np.intp), graph.poses[:1].copy(), root)]

@@ -57,7 +57,7 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
     These contain the correlated errors of the lidar's ranges and of the radio's.
     """
     poses = len(estimate.graph.poses)
-    along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
+    along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.intp))
     graph, rays, certainty = with_fewer_pairs(estimate.graph), None, None
     if estimate.surfaces is not None:
         graph, on_surfaces = for_covariances(estimate.surfaces, graph, task)

@@ -95,7 +95,7 @@ def _one_graph(
     """Make the estimates one, each moved by its motion, its anchors under the given names."""
     # Second places stand last: they may be found to be none, and what the user gives is counted by number.
     ids = tuple(sorted(dict.fromkeys(name for own in names for name in own), key=lambda name: name != first_place(name)))
-    place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
+    place = [np.array([ids.index(name) for name in own], dtype=np.intp) for own in names]
     block, priors, fixed, at = _one_calibration([estimate.graph for estimate in estimates])
     poses = np.concatenate([se2.compose(m, estimate.graph.poses) for m, estimate in zip(motions, estimates, strict=True)])
     joined = _one_bootstrap(estimates, motions, place, len(ids))
@@ -116,7 +116,7 @@ def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, 
     keyed = [[calibration.of_recording(key, n) for key in graph.calibration.keys] for n, graph in enumerate(graphs)]
     keys = tuple(dict.fromkeys(key for own in keyed for key in own))
     block, place = Calibration(keys, np.zeros(len(keys))), {key: k for k, key in enumerate(keys)}
-    at = [np.array([place[key] for key in own], dtype=np.int64) for own in keyed]
+    at = [np.array([place[key] for key in own], dtype=np.intp) for own in keyed]
     values, roots, fixed = block.values, np.zeros((len(keys), 1, 1)), np.ones(len(keys), dtype=bool)
     for graph, own in zip(reversed(graphs), reversed(at), strict=True):
         fixed[own] &= graph.fixed_calibration

@@ -74,7 +74,7 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > _ONE_VISIT]))
     weight = np.bincount(visit, count[seen])
     best = np.sort(np.argsort(-weight, kind="stable")[:_VISITS])
-    best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.int64)
+    best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.intp)
     position = se2.transform(se2.inverse(poses[best_view]), place)
     if landmark.radius > 0.0:
         views = zip(best_view.tolist(), position, strict=True)

@@ -35,7 +35,7 @@ def wall_direction(normals: Floats) -> float:
     if not len(normals):
         raise DataError("no walls were seen to align the map with; choose another --align")
     angle = np.arctan2(normals[:, 1], normals[:, 0])
-    bins = np.bincount(((angle % (np.pi / 2)) / (np.pi / 2) * _BINS).astype(np.int64) % _BINS, minlength=_BINS)
+    bins = np.bincount(((angle % (np.pi / 2)) / (np.pi / 2) * _BINS).astype(np.intp) % _BINS, minlength=_BINS)
     smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
     main = (int(np.argmax(smooth)) + 0.5) / _BINS * np.pi / 2
     for width in (np.radians(5.0), np.radians(2.0)):
@@ -130,8 +130,8 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
     """
     x0, y0, x1, y1 = box
     geometry = grid.geometry
-    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + 1e-6), 0, None).astype(np.int64)
-    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - 1e-6).astype(np.int64)
+    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + 1e-6), 0, None).astype(np.intp)
+    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - 1e-6).astype(np.intp)
     high = np.minimum(high, [geometry.cols, geometry.rows])
     if not np.all(high > low):
         (west, south), (east, north) = geometry.origin, geometry.corner

@@ -43,7 +43,7 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
     place, covariance, pairs = _places_by_recording(estimate, recording_of, task.config.solver, task.config.ranges)
     ids, anchors, anchor = list(estimate.anchor_ids), estimate.graph.anchors.copy(), estimate.ranges.anchor.copy()
     source = list(range(len(ids)))
-    first = np.array([ids.index(name) for name in map(_first_of(ids, task), ids)], dtype=np.int64)
+    first = np.array([ids.index(name) for name in map(_first_of(ids, task), ids)], dtype=np.intp)
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)).tolist()
     task.stages.withdraw("moved-anchor", "new_id")
     for k in np.unique(first).tolist():
@@ -90,7 +90,7 @@ def _solved_again(estimate: Estimate, task: Task) -> Estimate:
     It starts at the place from all ranges of an anchor: from the place of one recording, ranges of others look like outliers.
     """
     assert estimate.ranges is not None
-    together = np.zeros(len(estimate.ranges), dtype=np.int64)
+    together = np.zeros(len(estimate.ranges), dtype=np.intp)
     place, _, pairs = _places_by_recording(estimate, together, task.config.solver, task.config.ranges)
     anchors = estimate.graph.anchors.copy()
     anchors[pairs[:, 0]] = place
@@ -131,7 +131,7 @@ def _places_by_recording(
     )  # fmt: skip
     # Outliers of the joint map may be of an anchor that was moved: first all ranges have the same weight.
     alike = np.ones(len(alive))
-    edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike)
+    edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.intp), kernel=Kernel("cauchy", 2.5), weights=alike)
     optimizer = Optimizer()
     edges, _ = learn_noise(edges, optimizer.optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
     solved = optimizer.optimize(alone.with_edges(edges), solver)[0]
@@ -148,7 +148,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
     # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
     heard = np.flatnonzero(ranges.ranges > 0.0)
-    counts = np.zeros((len(names), number), dtype=np.int64)
+    counts = np.zeros((len(names), number), dtype=np.intp)
     np.add.at(counts, (ranges.anchor[heard], recording_of[ranges.pose[heard]]), 1)
     for k in np.flatnonzero(estimate.placed).tolist():
         present = counts[names == names[k]].sum(axis=0) > 0

@@ -174,7 +174,7 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
     within = stamps[np.searchsorted(stamps, begin, "right") : np.searchsorted(stamps, end, "left")]
-    return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.int64)[1:-1]]
+    return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:

@@ -48,8 +48,8 @@ def _blocks(recording: Recording, which: Ints, config: MappingConfig, delay: flo
     """Return the clouds of some keyframes (w,) of a recording, a block at a time; empty ones without lidar."""
     log, frames = recording.log.with_later_scans(delay), recording.frames
     if log.scans is None:
-        none = np.zeros(0, dtype=np.int64)
-        return [Clouds(np.zeros(len(which) + 1, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
+        none = np.zeros(0, dtype=np.intp)
+        return [Clouds(np.zeros(len(which) + 1, dtype=np.intp), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
     owner, chosen = choose_scans(log.scans, frames, config.keyframes)
     blocks = []
     for first in range(0, len(which), _BLOCK):

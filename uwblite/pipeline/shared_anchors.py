@@ -109,7 +109,7 @@ def together(placed: Places, found: Places, names: Sequence[str]) -> Places:
 
 def fitted(found: Places, placed: Places, pairs: Pairs) -> tuple[Floats, float]:
     """Return the motion (3,) of places into the frame of others that fits pairs of them best, and chi2 there."""
-    mine, theirs = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    mine, theirs = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
     here, there = found.at[mine], placed.at[theirs]
     own, others = (p.covariance[np.ix_(_scalars(k), _scalars(k))] for p, k in ((found, mine), (placed, theirs)))
     others = others + _SYSTEMATIC**2 * np.eye(len(others))

@@ -178,7 +178,7 @@ def _scatter(
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.flatnonzero(weights > 0.0)
     most = _OUTLYING * max(spread(residuals[alive]), config.steady)
-    some = alive[np.linspace(0, len(alive) - 1, min(len(alive), _SAMPLE)).round().astype(np.int64)]
+    some = alive[np.linspace(0, len(alive) - 1, min(len(alive), _SAMPLE)).round().astype(np.intp)]
     variance = _variance(edges, weights)
     jacobian = factors[some].multiply(variance[some, None]).toarray()
     moved = found.solve(jacobian.T)

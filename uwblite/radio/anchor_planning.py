@@ -68,7 +68,7 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
         return low + cell * (cells[:, ::-1] + 0.5)
 
     at, offered = metres(points), metres(candidates)
-    here = np.floor((anchors - low) / cell).astype(np.int64)[:, ::-1]
+    here = np.floor((anchors - low) / cell).astype(np.intp)[:, ::-1]
     today = _information(at, anchors, _line_of_sight(blocked, here, points), reach).sum(axis=0)
     gains = _information(at, offered, _line_of_sight(blocked, candidates, points), reach)
     offered_too_near = _near(offered, anchors)
@@ -110,7 +110,7 @@ def _choose(today: Floats, gains: Floats, places: Floats, taken: Bools, count: i
     while left := [k for k in chosen if k not in ordered]:
         base = today + gains[ordered].sum(axis=0)
         ordered.append(min(left, key=lambda k: float(position_errors(base + gains[k]).mean())))
-    return np.array(ordered, dtype=np.int64)
+    return np.array(ordered, dtype=np.intp)
 
 
 def _best(base: Floats, gains: Floats, taken: Bools) -> int:
@@ -171,7 +171,7 @@ def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
         length = np.abs(step).max(axis=1)
         along = np.arange(2, max(int(length.max(initial=0)), 2))
         share = along[None] / np.maximum(length, 1)[:, None]
-        cells = np.rint(source + step[:, None] * share[..., None]).astype(np.int64)
+        cells = np.rint(source + step[:, None] * share[..., None]).astype(np.intp)
         cells = np.clip(cells, 0, np.array(blocked.shape) - 1)
         line_of_sight[k] = ~(blocked[cells[..., 0], cells[..., 1]] & (share < 1.0)).any(axis=1)
     return line_of_sight

@@ -165,7 +165,7 @@ def find_move(
     alone = float(_misfit(path, ranges, _fitted([(path, ranges)], width, config)[0], width).sum())
     if alone < gain:
         return None
-    starts = np.unique(np.linspace(least, len(ranges) - least, _SPLITS).astype(np.int64)).tolist()
+    starts = np.unique(np.linspace(least, len(ranges) - least, _SPLITS).astype(np.intp)).tolist()
     tried = _splits(path, ranges, [(k, k) for k in starts[1::2] or starts], width, config, least)
     if alone - min(found.unexplained for found in tried.values()) < _PROMISING * gain:
         return None

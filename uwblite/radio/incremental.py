@@ -126,7 +126,7 @@ class _Incremental:
         self.ranged &= ~given
         self.joined = ~self.ranged
         self.joined_at = np.where(self.joined, -1, len(graph.poses))
-        self.tried = np.zeros(count, dtype=np.int64)
+        self.tried = np.zeros(count, dtype=np.intp)
         self.first_seen = self._first_seen(given)
         self.usual = 1.0
 

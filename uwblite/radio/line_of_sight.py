@@ -58,7 +58,7 @@ def _over_map(start: Floats, ahead: Floats, length: Floats, cell: float, size: F
     enter = np.fmin(np.fmax.reduce([np.full(len(length), _NEAR_TAG), *np.fmin(*edges).T]), length)
     leave = np.fmin.reduce([length - _NEAR_ANCHOR, *np.fmax(*edges).T])
     first, last = (np.ceil((at - _NEAR_TAG) / (0.5 * cell)) for at in (enter, leave))
-    return first.astype(np.int64), np.maximum(last - first, 0.0).astype(np.int64)
+    return first.astype(np.intp), np.maximum(last - first, 0.0).astype(np.intp)
 
 
 def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
@@ -68,7 +68,7 @@ def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
     low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
     cell = max(_CELL, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
     shape = tuple(int(_cells(high[axis], low[axis], cell)) + 1 for axis in (0, 1))
-    number = np.empty(len(surfaces), dtype=np.int64)
+    number = np.empty(len(surfaces), dtype=np.intp)
     for block in blocks:
         x, y = surfaces[block].T
         number[block] = _cells(x, low[0], cell) * shape[1] + _cells(y, low[1], cell)
@@ -77,7 +77,7 @@ def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
 
 
 def _cells(places: Floats, low: float, cell: float) -> Ints:
-    return np.floor((places - low) / cell).astype(np.int64)
+    return np.floor((places - low) / cell).astype(np.intp)
 
 
 def _look_up(x: Floats, y: Floats, low: Floats, cell: float, occupied: Bools) -> Bools:

@@ -213,7 +213,7 @@ def _correlation_sum(positions: Floats, length: float, weights: Floats | None) -
 
 def _correlated_sums(positions: Floats, length: float, values: Floats) -> Floats:
     """Return the sums (m, q) of exp(-distance / length) times values (m, q) over all ranges; places binned to length / 4."""
-    cells, inverse = unique_rows(np.round(positions * (4.0 / length)).astype(np.int64))
+    cells, inverse = unique_rows(np.round(positions * (4.0 / length)).astype(np.intp))
     tree = cKDTree(cells / 4.0)
     correlated = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
     correlated.data = np.exp(-correlated.data)

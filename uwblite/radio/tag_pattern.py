@@ -43,7 +43,7 @@ def without_pattern(edges: RangeEdges, graph: Graph, around: Marginals) -> Range
     each = waves.shape[1]
     edge, error = np.repeat(np.arange(len(edges)), each), each * tag.reshape(-1, 1) + np.arange(each)
     shift = PATTERN_SIGMA * waves / edges.sigma[:, None]
-    kind = np.zeros(each * len(tags), dtype=np.int64)
+    kind = np.zeros(each * len(tags), dtype=np.intp)
     found = around.estimated(CommonErrors(edges, edge, error.ravel(), shift.reshape(-1, 1), kind))
     late = PATTERN_SIGMA * np.sum(waves * found[error], axis=1)
     # The residuals show the remaining pattern where a part was subtracted before.

@@ -98,7 +98,7 @@ def _of_one_size(
     stretches: Sequence[tuple[Floats, Floats]], config: TrilaterationConfig, drift: float
 ) -> Iterator[list[AnchorHypothesis]]:
     """Yield the hypotheses of stretches of which equally many ranges are used."""
-    picks = [np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64)) for _, ranges in stretches]
+    picks = [np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.intp)) for _, ranges in stretches]
     picked = [(path[pick], ranges[pick]) for (path, ranges), pick in zip(stretches, picks, strict=True)]
     searched = [_raster_search(path, ranges, config) for path, ranges in picked]
     starts = [_starts(*found) for found in searched]

@@ -38,7 +38,7 @@ class Canvas:
             return
         length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
         # Points half a sub-pixel apart leave no gaps.
-        count = np.ceil(np.minimum(length, sum(self.image.shape[:2]) * 4) * 2 * _FINE).astype(np.int64) + 1
+        count = np.ceil(np.minimum(length, sum(self.image.shape[:2]) * 4) * 2 * _FINE).astype(np.intp) + 1
         owner = np.repeat(np.arange(len(segments)), count)
         step = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
         fraction = step / np.maximum(count - 1, 1)[owner]
@@ -87,7 +87,7 @@ class Canvas:
         near = (x > -radius) & (x < width + radius) & (y > -radius) & (y < height + radius)
         if not near.any():
             return
-        column, row = (np.floor(v[near] * _FINE).astype(np.int64) for v in (x, y))
+        column, row = (np.floor(v[near] * _FINE).astype(np.intp) for v in (x, y))
         reach = int(np.ceil(radius * _FINE))
         low_x, low_y = column.min() - reach, row.min() - reach
         low_x, low_y = low_x - low_x % _FINE, low_y - low_y % _FINE

@@ -28,7 +28,7 @@ def number(value: float, digits: int = 3, sign: bool = False) -> str:
 
 def thin(n: int, most: int) -> Ints:
     """Return at most about `most` of n indices, evenly spread, the last included."""
-    return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.int64)
+    return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.intp)
 
 
 def _coordinates(points: Floats) -> str:

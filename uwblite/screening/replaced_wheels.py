@@ -34,7 +34,7 @@ def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b
     middle = scans.middles
     period = max(float(np.median(np.diff(middle))), 1e-3)
     first_scan, last_scan = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
-    inside = np.unique([*range(first_scan, last_scan, max(1, round(_SCANS_APART / period))), last_scan]).astype(np.int64)
+    inside = np.unique([*range(first_scan, last_scan, max(1, round(_SCANS_APART / period))), last_scan]).astype(np.intp)
     inside = inside[(middle[inside] >= odometry.stamps[0]) & (middle[inside] <= odometry.stamps[-1])]
     if len(inside) < 2:
         return odometry, OdometryBreaks.none()

@@ -123,7 +123,7 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
     apart = max(1, round(_span(odometry) / period))
     first = np.flatnonzero(inside[:-apart] & inside[apart:] & (middle[apart:] - middle[:-apart] < 3.0 * apart * period))
     spread = first[:: max(1, len(first) // _PAIRS)]
-    extra = [np.zeros(0, dtype=np.int64)]
+    extra = [np.zeros(0, dtype=np.intp)]
     for a, b in sorted(standing(odometry), key=lambda run: run[0] - run[1])[:_STRETCHES]:
         own = first[(middle[first] > a) & (middle[first + apart] < b)]
         extra.append(own[:: max(1, len(own) // _PAIRS_STANDING)])

@@ -76,7 +76,7 @@ class UwbRanges:
     @property
     def tags(self) -> Ints:
         """(m,) which of the robot's tags measured."""
-        return np.zeros(len(self.stamps), dtype=np.int64) if self.tag is None else self.tag
+        return np.zeros(len(self.stamps), dtype=np.intp) if self.tag is None else self.tag
 
     def by_pair(self, among: Bools) -> list[tuple[int, Ints]]:
         """Return for each pair of an anchor and a tag the anchor and the rows of its ranges among some (m,)."""
@@ -88,7 +88,7 @@ class UwbRanges:
         used, anchor = np.unique(self.anchor[which], return_inverse=True)
         ids = tuple(self.anchor_ids[k] for k in used)
         tag = None if self.tag is None else self.tag[which]
-        return UwbRanges(self.stamps[which], anchor.astype(np.int64), self.ranges[which], self.quality[which], ids, tag)
+        return UwbRanges(self.stamps[which], anchor.astype(np.intp), self.ranges[which], self.quality[which], ids, tag)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
