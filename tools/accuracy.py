@@ -425,7 +425,7 @@ def halves(config: MappingConfig) -> str:
         ranges = whole.range_table
         own = (ranges["anchor"] == k) & (ranges["weight"] > 0)
         first, second = (
-            anchor.bias - float(np.median(ranges["residual"][own & half]))
+            anchor.bias + float(np.median(ranges["residual"][own & half]))
             for half in (ranges["stamp"] < middle, ranges["stamp"] >= middle)
         )
         figures_text = [f"{alone[n][anchor.id][0]:.2f} ± {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]

@@ -138,7 +138,7 @@ class MapResult:
     closures: tuple[LoopClosure, ...]
     """Accepted and rejected."""
     range_table: dict[str, Floats]
-    """Per range: stamp, anchor (index into anchors), range, residual (m), weight (0..1) in the
+    """Per range: stamp (s), anchor (index into anchors), range (m), residual (m, measured minus expected), weight (0..1) in the
     last optimisation, agrees (1 or 0) as anchors' used_share counts it, x and y of the tag (m) and heading theta of the base
     (rad), map frame, recording (from 0)."""
     grid: OccupancyGrid | None

@@ -25,7 +25,7 @@ def doubts(errors, beside=(0.0, 0.0), count=4, lidar=True):
     ranges = np.hypot(*(true - PLACES[numbers]).T) + noise + errors(x, numbers)
     table = {
         "stamp": 100.0 + x, "anchor": numbers.astype(float), "range": ranges, "weight": np.ones(200),
-        "recording": np.zeros(200), "residual": np.hypot(*(tags - PLACES[numbers]).T) - ranges,
+        "recording": np.zeros(200), "residual": ranges - np.hypot(*(tags - PLACES[numbers]).T),
         "x": tags[:, 0], "y": tags[:, 1],
     }  # fmt: skip
     recording = SimpleNamespace(number=0, has_scans=lidar, frames=SimpleNamespace(stamps=np.array([100.0])))

@@ -290,7 +290,7 @@ def test_readings_that_are_left_out_are_not_too_short(left_out, status):
     covariance = SimpleNamespace(anchors=0.04 * np.eye(2)[None], calibration=np.zeros(0))
     no = np.zeros(1, dtype=bool)
     estimate = Estimate(graph, None, ranges, ("A",), BootstrapResult(None, ~no, ((),), no))
-    assert _anchor(0, estimate, None, covariance, np.where(short, 5.0, 0.0), 0.2).status == status
+    assert _anchor(0, estimate, None, covariance, np.where(short, -5.0, 0.0), 0.2).status == status
 
 
 def test_an_anchor_with_a_mirror_image_says_where_and_what_else_is_wrong():

@@ -53,19 +53,6 @@ def test_many_error_codes_are_noted(errors, said):
     assert ["error codes" in f.what for f in checked(ranges)[1]] == ([True] if said else [])
 
 
-@pytest.mark.parametrize(("scans", "beams", "said"), [
-    (21, 2, False), (21, 3, True), (21, 49, True), (21, 50, False), (20, 10, False),
-])  # fmt: skip
-def test_beams_that_hit_in_every_scan_are_noted(scans, beams, said):
-    """More than 2 and fewer than 50 of 100, in more than 20 scans; the other beams see nothing every second time."""
-    ranges = np.tile(np.linspace(1.0, 2.0, 100), (scans, 1))
-    ranges[::2, beams:] = np.inf
-    found = checked(ranges)[1]
-    assert [f"{beams} beams hit in every scan" in f.what for f in found if f.rank == "note" and "beams" in f.what] == (
-        [True] if said else []
-    )
-
-
 def turned(monkeypatch, **values):
     """Return the figures and findings of a comparison of turns that came out so."""
     plain = Turning(

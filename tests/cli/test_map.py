@@ -38,10 +38,10 @@ def test_the_sample_is_mapped_with_every_file(mapped):
 
 def test_what_is_reported_has_units_sigmas_paths_and_the_next_step(mapped):
     folder, _, output = mapped
-    number = r"[\u2212+]?\d+\.\d+"
+    number = r"[-+]?\d+\.\d+"
     assert re.search(rf"anchor 5C0B: x {number} \u00b1\d\.\d\d m, y {number} \u00b1\d\.\d\d m, bias .* m, 190 ranges", output)
     assert str(folder / "map.png") in output
-    assert "next: open" in output
+    assert f"next: open {folder / 'report.html'} in a browser, or: uwblite view {folder}" in output
 
 
 def test_the_trajectory_follows_the_truth(mapped, room_log):
@@ -74,18 +74,21 @@ def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_map,
 
 
 def test_the_command_in_the_report_makes_the_same_map(short_log, tmp_path, monkeypatch, capsys):
+    """It is pasted from the page, in the folder of the recording, where nothing but the recording is."""
+    import html
     import shlex
     import shutil
 
-    code = main(["map", str(short_log), "--out", str(tmp_path / "first"), "--resolution", "0.1", "--no-timings"])
+    options = ["--preset", "paper", "--resolution", "0.1", "--crop=-1,-1,2,3.5", "--without", "loops", "--scale-map"]
+    code = main(["map", str(short_log), "--out", str(tmp_path / "first"), *options, "--no-timings"])
     first = contents(tmp_path / "first")
-    words = shlex.split(json.loads(first["report.json"])["command"])
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(short_log, tmp_path)
-    (tmp_path / "config.toml").write_bytes(first["config.toml"])
-    assert main(words[1:]) == code
-    assert (tmp_path / "map_again" / "map.pgm").read_bytes() == first["map.pgm"]
-    assert (tmp_path / "map_again" / "trajectory.tum").read_bytes() == first["trajectory.tum"]
+    where, command = re.search(r"<p>(The command[^<]*)</p><pre>(.*?)</pre>", first["report.html"].decode()).groups()
+    assert where.endswith(f"in the folder of {short_log.name}:")
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copy(short_log, tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert main([*shlex.split(html.unescape(command))[1:], "--no-timings"]) == code
+    assert contents("map_again") == first
 
 
 def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_path, monkeypatch, capsys):
@@ -170,7 +173,15 @@ def test_check_of_the_sample(room_log, capsys):
     text = capsys.readouterr().out
     assert "bias guess" in text
     assert "next: uwblite map" in text
-    assert "SERIOUS" not in text
+    assert "nothing to complain about" in text
+    assert re.search(r"relative error of travelled distance: \+2\.\d\d \u00b10\.\d\d % \(odometry_scale\)", text)
+    assert "\u2212" not in text
+
+
+def test_there_is_nothing_to_complain_about_in_what_the_readme_cuts_off_the_sample(room_log, tmp_path, capsys):
+    assert main(["convert", str(room_log), str(tmp_path / "run.log"), "--end", "60", "-q"]) == 0
+    assert main(["check", str(tmp_path / "run.log"), "--quick"]) == 0
+    assert "nothing to complain about" in capsys.readouterr().out
 
 
 def test_check_shows_programs_figures_and_cost(short_log, capsys):

@@ -14,12 +14,12 @@ from uwblite.localization.known_map import from_result, known_anchors
 
 def test_ranges_are_corrected_by_what_the_maps_own_left_over(tmp_path):
     result = small_result()
-    table = {**result.range_table, "residual": np.full(len(result.range_table["stamp"]), -0.3)}
+    table = {**result.range_table, "residual": np.full(len(result.range_table["stamp"]), 0.3)}
     write_result(tmp_path / "map", [small_log()], replace(result, range_table=table), RunRecord("", ""))
     known = from_result(read_result(tmp_path / "map"))
     assert known.anchors.ids == ("5C0B",)
     on_path = known.anchors.errors[0].at(result.graph.poses[:5, :2])
-    # Expected minus measured of -0.3 m: ranges were 0.3 m long.
+    # Measured minus expected of 0.3 m: ranges were 0.3 m long.
     np.testing.assert_allclose(on_path, 0.3, atol=0.05)
     (tmp_path / "map" / "range_errors.csv").write_text("stamp,anchor,error,x,y,theta\n1,5C0B,oops,0,0,0\n")
     with pytest.raises(FormatError, match="oops"):

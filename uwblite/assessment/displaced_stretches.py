@@ -81,18 +81,18 @@ def _path_beside(tags: Floats, places: Floats, residuals: Floats, numbers: Ints)
 
     Parameters
     ----------
-    tags, places : (m, 2) both ends of the ranges, m. residuals : (m,) expected minus measured, m. numbers : (m,) anchors.
+    tags, places : (m, 2) both ends of the ranges, m. residuals : (m,) measured minus expected, m. numbers : (m,) anchors.
     """
     away = tags - places
     reach, beside = np.hypot(*away.T), np.zeros(2)
     for _ in range(_ROUNDS):
         moved = away + beside
         length = np.maximum(np.hypot(*moved.T), _NEAR)
-        left = residuals + length - reach
+        left = length - reach - residuals
         slopes, weights = moved / length[:, None], 1.0 / np.maximum(np.abs(left), _NEAR)
         normal = (slopes * weights[:, None]).T @ slopes + _NEAR * np.eye(2)
         beside = beside - np.linalg.solve(normal, (slopes * weights[:, None]).T @ left)
-    near = np.abs(residuals + np.hypot(*(away + beside).T) - reach) < _NEAR
+    near = np.abs(np.hypot(*(away + beside).T) - reach - residuals) < _NEAR
     alike = np.abs(residuals - np.median(residuals)) < _NEAR
     clear = near.mean() >= _MOST > alike.mean() and len(np.unique(numbers[near])) >= _ANCHORS
     return beside if clear and np.hypot(*beside) > _OFF else None

@@ -68,7 +68,7 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
 
     Parameters
     ----------
-    residuals : (m,) expected minus measured, m.
+    residuals : (m,) measured minus expected, m.
     """
     ranges = estimate.ranges
     if ranges is None or not (alive := ranges.alive).any():
@@ -78,7 +78,7 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
     short = short_term_sigma(ranges.stamps[alive], apart[alive], ranges.ranges[alive], task.config.ranges)
     most = min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES)
     typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
-    if most < typical < NO_DISTANCES and grid is not None and np.mean(residuals[alive] > most) < _EARLY:
+    if most < typical < NO_DISTANCES and grid is not None and np.mean(residuals[alive] < -most) < _EARLY:
         free = alive & ~_through_walls(estimate.graph, ranges, grid)
         if free.sum() > _FREE * alive.sum():
             typical = float(np.median(_spread_by_anchor(residuals[free], ranges.anchor[free])))

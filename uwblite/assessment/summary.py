@@ -90,11 +90,11 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Finding]) 
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:
-    """Return residuals (m,), m, and final weights (m,) of all ranges."""
+    """Return residuals (m,), measured minus expected, m, and final weights (m,) of all ranges."""
     if ranges is None:
         return np.zeros(0), np.zeros(0)
     whitened = ranges.residuals(graph)[:, 0]
-    return whitened * ranges.sigma, ranges.own_weights * ranges.kernel.weight(whitened**2)
+    return -whitened * ranges.sigma, ranges.own_weights * ranges.kernel.weight(whitened**2)
 
 
 def _range_table(
@@ -104,7 +104,7 @@ def _range_table(
     x, y = ranges.tag_positions(graph.poses).T
     return {
         "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
-        "residual": residuals + ranges.corrected - ranges.ranges, "weight": weights, "agrees": agrees.astype(np.float64),
+        "residual": residuals + ranges.ranges - ranges.corrected, "weight": weights, "agrees": agrees.astype(np.float64),
         "x": x, "y": y, "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
         "recording": recordings.of_keyframe[ranges.pose].astype(np.float64),
     }  # fmt: skip
@@ -134,7 +134,7 @@ def _anchor(
     scatter = spread_about_median(own)
     # Readings that are no distances, or were left out as made on the way from place to place, are not short.
     measured = own[ranges.alive[ranges.anchor == k]]
-    short = int(np.sum(measured - max(bias, 0.0) > max(limit, SHORT)))
+    short = int(np.sum(measured + max(bias, 0.0) < -max(limit, SHORT)))
     if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(

@@ -28,7 +28,7 @@ def check_scans(log: SensorLog, found: Findings) -> dict[str, Any]:
     figures["share that saw nothing"] = round(float(np.isposinf(sample).mean()), 3)
     figures["share that is invalid"] = round(float(np.isnan(sample).mean()), 3)
     _check_units(sample[hit], found)
-    _check_valid(hit, figures, found)
+    _check_valid(figures, found)
     if beams >= 30 and len(scans.stamps) >= 20:
         figures["turning"] = _check_turning(log, found)
     return figures
@@ -41,7 +41,7 @@ def _check_units(seen: Floats, found: Findings) -> None:
         found.serious("lidar", "all readings are equal", "the laser is off, covered, or not the laser")
 
 
-def _check_valid(hit: np.ndarray[Any, np.dtype[np.bool_]], figures: dict[str, Any], found: Findings) -> None:
+def _check_valid(figures: dict[str, Any], found: Findings) -> None:
     share = figures["share of beams that hit"]
     if share < 0.1:
         found.warning(
@@ -54,13 +54,6 @@ def _check_valid(hit: np.ndarray[Any, np.dtype[np.bool_]], figures: dict[str, An
             "lidar",
             f"{100 * figures['share that is invalid']:.0f} % of the readings are error codes",
             "dark or slanting surfaces; they are left out and clear no space",
-        )
-    blocked = (hit.mean(axis=0) > 0.999) if len(hit) > 20 else np.zeros(1, dtype=bool)
-    if 0.02 < float(blocked.mean()) < 0.5 and share < 0.95:
-        found.note(
-            "lidar",
-            f"{int(blocked.sum())} beams hit in every scan",
-            "parts of the robot may stand in the laser's view; readings below range_min are left out",
         )
 
 

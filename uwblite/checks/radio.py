@@ -152,7 +152,9 @@ def check_calibration(
     for value in calibration:
         if value.state != "estimated":
             continue
-        figures[value.name] = {"value": round(value.value, 5), "sigma": round(value.sigma, 5), "unit": value.unit}
+        figures[value.name] = {
+            "value": round(value.value, 5), "sigma": round(value.sigma, 5), "unit": value.unit, "meaning": value.meaning,
+        }  # fmt: skip
         limit, text, advice = limits.get(value.name, (np.inf, "", ""))
         if abs(value.value) > max(limit, 5.0 * value.sigma):
             found.warning("radio" if "range" in value.name else "odometry", text.format(value.value), advice)

@@ -138,9 +138,10 @@ def is_finished(task: argparse.Namespace) -> bool:
     report = _report(task.out)
     if not report or not os.path.exists(task.logs[0]):
         return False
+    config = settings(task)
     return (
-        report.get("command") == repeat_command(task)
-        and report.get("config_sha256") == _hash_of_settings(settings(task))
+        report.get("command") == repeat_command(task, config)
+        and report.get("config_sha256") == _hash_of_settings(config)
         and report.get("given") == given_files(task)
         and report.get("versions") == versions()
         and [entry.get("sha256") for entry in report.get("inputs", ())] == [sha256_of(task.logs[0])]

@@ -5,7 +5,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from .options import add_bag_arguments, add_mounting_arguments
-from .wording import signed
+from .wording import calibration_text, signed
 
 if TYPE_CHECKING:
     from ..checks.recording import Diagnosis
@@ -169,8 +169,4 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
 
 def _calibration_lines(figures: dict[str, Any]) -> list[str]:
     values = {k: v for k, v in figures.get("radio calibration", {}).items() if "value" in v and ":" not in k}
-    lines = []
-    for name, v in values.items():
-        unit = "" if v["unit"] == "1" else f" {v['unit']}"
-        lines.append(f"{name}: {signed(v['value'], 4, plus=True)} \u00b1{v['sigma']:.4f}{unit}")
-    return lines
+    return [calibration_text(name, **value) for name, value in values.items()]

@@ -54,9 +54,7 @@ def make(
     """
     from ..io.result_text import RunRecord
     from ..io.results import write_result
-    from ..io.settings_toml import differences
-    from ..mapping import MappingConfig, build_map
-    from ..pipeline.mapping_config import preset
+    from ..mapping import build_map
     from ..pipeline.scan_selection import prepared
     from .freed_memory import FreedMemory
 
@@ -71,12 +69,12 @@ def make(
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
     record = RunRecord(
-        command=repeat_command(args),
+        command=repeat_command(args, config),
         config=config_text(config),
         versions=versions(),
         given=given_files(args),
         preset=args.preset or "",
-        changed=tuple(differences(config, preset(args.preset) if args.preset else MappingConfig())),
+        changed=changed_settings(args, config),
         seconds=0.0 if args.no_timings else reading + time.perf_counter() - began,
         reading_seconds=reading,
         peak_rss_bytes=peak_memory(),
@@ -116,6 +114,15 @@ def settings(args: argparse.Namespace) -> "MappingConfig":
     return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
 
 
+def changed_settings(args: argparse.Namespace, config: "MappingConfig") -> tuple[str, ...]:
+    """Return the settings that differ from those of the command line's preset, as --set takes them."""
+    from ..io.settings_toml import differences
+    from ..mapping import MappingConfig
+    from ..pipeline.mapping_config import preset
+
+    return tuple(differences(config, preset(args.preset) if args.preset else MappingConfig()))
+
+
 def known(args: argparse.Namespace) -> "Constraints":
     from ..constraints import Constraints
     from ..io.constraints_file import parse_constraints, read_anchors
@@ -127,14 +134,20 @@ def known(args: argparse.Namespace) -> "Constraints":
     return earlier + parse_constraints(read_settings(args.constraints), args.constraints)
 
 
-def repeat_command(args: argparse.Namespace) -> str:
-    """Return the command that makes the same map again, with the recordings and the result's config.toml at hand.
+def repeat_command(args: argparse.Namespace, config: "MappingConfig") -> str:
+    """Return the command that makes the same map again, in a folder with the recordings and other files that it names.
 
     Files stand with their names alone: the result is the same wherever they lie.
+
+    Parameters
+    ----------
+    config : the settings in force.
     """
     from ..io.result_text import base_name
 
-    words = ["uwblite", "map", *map(base_name, args.logs), "--config", "config.toml"]
+    words = ["uwblite", "map", *map(base_name, args.logs)]
+    words += [f"--preset={args.preset}"] if args.preset else []
+    words += [f"--set={setting}" for setting in changed_settings(args, config)]
     if args.every_nth_scan > 1:
         words.append(f"--every-nth-scan={args.every_nth_scan}")
     for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
@@ -151,6 +164,7 @@ def repeat_command(args: argparse.Namespace) -> str:
         words.append("--tag=" + ",".join(map(repr, args.tag)))
     if args.anchor_height is not None:
         words.append(f"--anchor-height={args.anchor_height!r}")
+    words += ["--scale-map"] if args.scale_map else []
     return shlex.join([*words, "--out", "map_again"])
 
 

@@ -231,6 +231,6 @@ def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     lines += [f"warning: {text}" for text in result.warnings]
     lines += [f"DOUBT: {text}" for text in result.doubts]
     lines.append("files: " + " ".join(os.path.join(args.out, name) for name in made.names))
-    page = shlex.quote(os.path.join(args.out, "report.html"))
-    lines.append(f"next: open {page} in a browser, or: uwblite evaluate {shlex.quote(args.out)} --truth truth.tum")
+    page, out = shlex.quote(os.path.join(args.out, "report.html")), shlex.quote(args.out)
+    lines.append(f"next: open {page} in a browser, or: uwblite view {out}")
     return lines

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 def anchor_line(anchor: "AnchorEstimate") -> str:
     """Return one line about an anchor, such as
 
-    ``anchor 5C0B: x 12.31 ±0.04 m, y −3.20 ±0.05 m, bias +0.46 ±0.02 m, 812 ranges, 6 % down-weighted (NLOS?)``.
+    ``anchor 5C0B: x 12.31 ±0.04 m, y -3.20 ±0.05 m, bias +0.46 ±0.02 m, 812 ranges, 6 % down-weighted (NLOS?)``.
     """
     x, y = (float(v) for v in anchor.position)
     if x != x or y != y:
@@ -35,14 +35,16 @@ def anchor_line(anchor: "AnchorEstimate") -> str:
 
 def calibration_line(value: "CalibrationEstimate") -> str:
     """Return one line about a calibration value; ratios in per cent."""
-    if value.unit == "1":
-        percent, sigma = signed(100 * value.value, plus=True), sigma_text(100 * value.sigma, 2)
-        return f"{value.meaning}: {percent} \u00b1{sigma} % ({value.name})"
-    digits = 4 if value.unit.startswith("rad") else 3
-    number = signed(value.value, digits, plus=True)
-    return f"{value.meaning}: {number} \u00b1{sigma_text(value.sigma, digits)} {value.unit} ({value.name})"
+    return calibration_text(value.name, value.value, value.sigma, value.unit, value.meaning)
+
+
+def calibration_text(name: str, value: float, sigma: float, unit: str, meaning: str) -> str:
+    """Return the same of its fields."""
+    value, sigma, unit, digits = (100 * value, 100 * sigma, "%", 2) if unit == "1" else (value, sigma, unit, 3)
+    digits = 4 if unit.startswith("rad") else digits
+    return f"{meaning}: {signed(value, digits, plus=True)} \u00b1{sigma_text(sigma, digits)} {unit} ({name})"
 
 
 def signed(value: float, digits: int = 2, *, plus: bool = False) -> str:
-    """Return a number with a true minus sign."""
-    return f"{round(value, digits) + 0.0:{'+' if plus else ''}.{digits}f}".replace("-", "\u2212")
+    """Return a number; what rounds to zero has no minus sign."""
+    return f"{round(value, digits) + 0.0:{'+' if plus else ''}.{digits}f}"

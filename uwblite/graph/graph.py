@@ -8,7 +8,9 @@ one more dataclass and one more row in the numeric-Jacobian test; the solver doe
 Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) in the map frame and ``calibration``
 (c,), a vector of named scalars. A step moves poses along arcs of constant twist and is added to the rest, see
 ``unknowns``; Jacobians are by the coordinates x, y, theta, to which such an arc is the sum to first order. Pose
-residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
+residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's: every edge's residual is the
+estimate as seen from the measurement, expected minus measured. What a MapResult states about ranges is the error of the
+measurement, measured minus expected.
 """
 
 from collections.abc import Sequence

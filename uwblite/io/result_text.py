@@ -117,7 +117,7 @@ def range_errors_csv(result: MapResult) -> str:
     for stamp, anchor, metres, residual, weight, x, y, theta, recording in zip(*columns, strict=True):
         name = names[int(anchor)]
         if name is not None and math.isfinite(residual):
-            values = f"{metres:.4f},{-residual:.4f},{weight:.4f},{x:.4f},{y:.4f},{theta:.5f},{int(recording) + 1}"
+            values = f"{metres:.4f},{residual:.4f},{weight:.4f},{x:.4f},{y:.4f},{theta:.5f},{int(recording) + 1}"
             lines.append(f"{stamp:.6f},{name},{values}")
     return "\n".join(lines) + "\n"
 

@@ -52,11 +52,14 @@ def render(
         _section("Calibration", _calibration_table(result)),
         _section("Loop closures", _closure_table(result)),
         _section("Stages", _stage_table(result, timings)),
-        _section("Again", f"<p>The exact command that makes this map again:</p><pre>{escape(command)}</pre>"),
+        _section("Again", f"<p>{escape(_WHERE.format(title))}</p><pre>{escape(command)}</pre>"),
     )
     table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
     body = f"<h1>{escape(title)}</h1><div class=scroll><table class=facts>{table}</table></div>" + "".join(sections)
     return PAGE.format(title=escape(title), style=STYLE, script=SCRIPT, body=body)
+
+
+_WHERE = "The command that makes this map again, byte for byte, in the folder of {}:"
 
 
 def _section(title: str, content: str) -> str:
@@ -180,8 +183,9 @@ def _residuals(result: MapResult) -> str:
     span = max(float(time.max()), 1e-9)
     ends = ("first recording", "last recording") if several else ("0 s", f"{span:.0f} s")
     parts = [
-        "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: does not agree with the"
-        " map, as where something blocks the line of sight (NLOS). What lies beyond the scale is drawn at its edge.</p>"
+        "<p class=hint>Measured minus expected range over time: above zero the range is too long;"
+        " <span class=nlos-text>marked</span>: does not agree with the map, as where something blocks the line of sight (NLOS)."
+        " What lies beyond the scale is drawn at its edge.</p>"
     ]
     for index, anchor in enumerate(result.anchors):
         mine = np.flatnonzero(table["anchor"] == index)
