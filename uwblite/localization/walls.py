@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import make_cloud
 
 REACH = 0.5
@@ -86,7 +86,7 @@ class Walls:
     origin: Floats
     """(2,) m, its lower left corner."""
     nearest: NDArray[np.signedinteger]
-    """(x, y) nearest wall point of each of its cells, -1 = none within reach."""
+    """(x, y) nearest wall point of each of its cells, with a line or without one; -1 = none within reach."""
 
     @property
     def rounding(self) -> float:
@@ -211,14 +211,23 @@ def walls_of(grid: OccupancyGrid) -> Walls:
         empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
         return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
     cloud = make_cloud(occupied, normal_radius=max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
-    extent = np.ptp(occupied, axis=0) + 2.0 * REACH
-    cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
-    raster = rasterize(cloud, cell, REACH)
+    cell = max(grid.geometry.resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
+    points, normals = cloud.cloud(0)
     bare = Walls(
-        grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cloud.normal_variance.astype(np.float64),
-        cell, raster.origin[0], raster.cells(0),
+        grid.geometry, states, points, normals, np.zeros(len(points), bool), cloud.normal_variance.astype(np.float64),
+        cell, *_nearest(points, cell),
     )  # fmt: skip
     return _facing_free_space(bare)
+
+
+def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
+    """Return the lower left corner (2,) of a table around points (n, 2), m, and the nearest point of each of its cells (x, y)."""
+    origin = points.min(axis=0) - REACH - cell
+    wide, high = (np.ceil((points.max(axis=0) + REACH - origin) / cell).astype(int) + 1).tolist()
+    holder = np.full((wide, high), -1, dtype=np.int32)
+    holder[tuple(((points - origin) / cell).astype(np.int64).T)] = np.arange(len(points))
+    distance, (x, y) = distance_transform_edt(holder < 0, sampling=cell, return_indices=True)
+    return origin, np.where(distance <= REACH, holder[x, y], np.int32(-1))
 
 
 def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
