@@ -19,12 +19,16 @@ from .walls import Rays, Walls
 
 POSE, WHEELS = slice(0, 3), slice(3, 6)
 """Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
-FIRST_ANCHOR = 6 + 2 * HARMONICS
-PATTERN = slice(6, FIRST_ANCHOR)
+PATTERN = slice(6, 6 + 2 * HARMONICS)
 """Of the state: m, range error as a function of the anchor's direction in the robot's frame (tag_pattern.pattern_waves): the
 tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
+LASER = PATTERN.stop
+"""Of the state: rad, heading of the laser on the base against the mounting that the map's robot showed."""
+FIRST_ANCHOR = LASER + 1
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
+LASER_SIGMA = 0.02
+"""rad, its prior standard deviation: screws a few centimetres apart, each within a millimetre. A map may be of another robot."""
 SLOW_SIGMA = 0.12
 """m; common error of ranges to one anchor, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
 SLOW_LEFT = 0.08
@@ -50,9 +54,9 @@ class Hypotheses(Table):
     """Places where the robot may be."""
 
     mean: Floats
-    """(h, 12 + a)."""
+    """(h, FIRST_ANCHOR + a)."""
     covariance: Floats
-    """(h, 12 + a, 12 + a)."""
+    """(h, FIRST_ANCHOR + a, FIRST_ANCHOR + a)."""
     log_weight: Floats
     """(h,) the largest is 0."""
 
@@ -88,7 +92,7 @@ def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW
     mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
     mean[:, POSE] = poses
     covariance[:, POSE, POSE] = covariances
-    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(anchors, slow)]) ** 2
+    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), [LASER_SIGMA], np.full(anchors, slow)]) ** 2
     covariance[:, np.arange(3, n), np.arange(3, n)] = prior
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
@@ -153,31 +157,31 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: 
 
     Notes
     -----
-    The scan measures the pose alone, so that the update is made for it, with prior information I and the scan's H and
-    gradient, and transferred to the rest of the state by its covariance with the pose. Along an aisle H comes from the scatter
+    The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
+    information I and the scan's H and gradient, and transferred to the state by its covariance with it. Along an aisle H comes from the scatter
     of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would seem to measure a direction that none has
     measured. Until the pose is certain it is kept, since a search has compared the places along the aisle and another one must
     agree before any is accepted; without it a robot beside a single wall is found late.
     """
     if not len(bank):
         return bank
-    prior, cross = bank.pose_covariances, bank.covariance[:, :, POSE]
+    cross = bank.covariance[:, :, POSE].copy()
+    cross[:, :, 2] += bank.covariance[:, :, LASER]
+    prior = cross[:, POSE].copy()
+    prior[:, 2] += cross[:, LASER]
     information = np.linalg.inv(prior)
-    pose = bank.poses.copy()
+    start = bank.poses + np.multiply.outer(bank.mean[:, LASER], (0.0, 0.0, 1.0))
+    away = np.zeros_like(start)
     hessian = np.zeros_like(prior)
     for gate, scale in _GATES:
-        hessian, spurious, gradient, weight = walls.factors(pose, rays, gate, scale)
+        hessian, spurious, gradient, weight = walls.factors(start + away, rays, gate, scale)
         if found:
             hessian, gradient = measured_part(hessian, spurious, gradient)
         share = fresh * np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
         hessian, gradient = hessian * share[:, None, None], gradient * share[:, None]
-        away = pose - bank.poses
-        away[:, 2] = se2.wrap_angle(away[:, 2])
         gradient += np.einsum("hij,hj->hi", information, away)
-        pose -= np.linalg.solve(information + hessian, gradient[:, :, None])[:, :, 0]
+        away -= np.linalg.solve(information + hessian, gradient[:, :, None])[:, :, 0]
     posterior = np.linalg.inv(information + hessian)
-    away = pose - bank.poses
-    away[:, 2] = se2.wrap_angle(away[:, 2])
     gain = cross @ information
     mean = bank.mean + np.einsum("hij,hj->hi", gain, away)
     mean[:, 2] = se2.wrap_angle(mean[:, 2])

@@ -99,9 +99,10 @@ class PoseEstimator:
 
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
+        turned = rays.moved(self._laser_turn())
         doubted_since = self._running.matched if self._certain and self._running.in_doubt() else -np.inf
         if self._window.wants_look(self._way, self._odometer.stamp, doubted_since) and len(rays.hit):
-            self._window.add_look(WindowLook(rays.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
+            self._window.add_look(WindowLook(turned.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
         walls = self.known.walls
         if not len(self._bank) or walls is None or not len(rays.hit):
             return
@@ -110,7 +111,7 @@ class PoseEstimator:
         before = self._bank
         fresh = float(np.clip(driven / _FRESH_WAY, least, 1.0))
         self._bank = hypotheses.matched(before, walls, rays, fresh, found=self._certain)
-        some = rays.spread(RAYS)
+        some = turned.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
@@ -164,6 +165,12 @@ class PoseEstimator:
         reason = "" if self._certain else self._reason
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance
         return LocalizerState(stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], far)
+
+    def _laser_turn(self) -> Floats:
+        """Return the pose (3,) of the base as the laser's stated mounting shows it, in its own frame; m, m, rad."""
+        mean = self._bank.mean
+        turn = float(mean[np.argmax(self._bank.log_weight), hypotheses.LASER]) if len(mean) else 0.0
+        return np.array([0.0, 0.0, turn])
 
     def _sees(self) -> bool:
         return self.known.walls is not None and bool(self._window.looks)

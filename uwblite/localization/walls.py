@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import make_cloud
+from ..lidar.point_cloud import Lines, estimate_normals, make_tree
 
 REACH = 0.5
 """m; largest distance of a neighbouring wall."""
@@ -86,7 +86,7 @@ class Walls:
     origin: Floats
     """(2,) m, its lower left corner."""
     nearest: NDArray[np.signedinteger]
-    """(x, y) nearest wall point of each of its cells, -1 = none within reach."""
+    """(x, y) nearest wall point of each of its cells, with a line or without one; -1 = none within reach."""
 
     @property
     def rounding(self) -> float:
@@ -210,15 +210,46 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     if not len(occupied):
         empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
         return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
-    cloud = make_cloud(occupied, normal_radius=max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
-    extent = np.ptp(occupied, axis=0) + 2.0 * REACH
-    cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
-    raster = rasterize(cloud, cell, REACH)
+    lines = _lines(occupied, _free_side(grid.geometry, states, occupied), max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
+    cell = max(grid.geometry.resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
     bare = Walls(
-        grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cloud.normal_variance.astype(np.float64),
-        cell, raster.origin[0], raster.cells(0),
+        grid.geometry, states, lines.centers, lines.normals, np.zeros(len(occupied), bool), lines.normal_variance,
+        cell, *_nearest(lines.centers, cell),
     )  # fmt: skip
     return _facing_free_space(bare)
+
+
+def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats) -> Floats:
+    """Return the direction (n, 2) in which free space lies from points (n, 2); 0 where it lies on either side alike."""
+    free = (states == FREE).astype(np.float64)
+    row, col = geometry.cell_of(points)
+    slope = np.stack([gaussian_filter(free, 1.5, order)[row, col] for order in ((0, 1), (1, 0))], axis=1)
+    return slope / np.maximum(np.hypot(*slope.T), _ONE_SIDE)[:, None]
+
+
+def _lines(points: Floats, sides: Floats, radius: float) -> Lines:
+    """Fit a line to each point's neighbours within a radius, m, on its own side of the wall: a thin wall has two surfaces."""
+    lines = estimate_normals(points, make_tree(np.column_stack([points, radius * sides])), radius)
+    straight = lines.linearity >= _STRAIGHT
+    normals = np.where(straight[:, None], lines.normals, 0.0)
+    centers = np.where(straight[:, None], lines.centers, points)
+    return replace(lines, centers=centers, normals=normals, normal_variance=np.where(straight, lines.normal_variance, 0.0))
+
+
+_STRAIGHT = 0.6
+"""Least linearity of a line through single cells."""
+_ONE_SIDE = 0.1
+"""Slope of the smoothed free space, per cell, from which on it lies to one side; at the surface of a thick wall it is 0.27."""
+
+
+def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
+    """Return the lower left corner (2,) of a table around points (n, 2), m, and the nearest point of each of its cells (x, y)."""
+    origin = points.min(axis=0) - REACH - cell
+    wide, high = (np.ceil((points.max(axis=0) + REACH - origin) / cell).astype(int) + 1).tolist()
+    holder = np.full((wide, high), -1, dtype=np.int32)
+    holder[tuple(((points - origin) / cell).astype(np.int64).T)] = np.arange(len(points))
+    distance, (x, y) = distance_transform_edt(holder < 0, sampling=cell, return_indices=True)
+    return origin, np.where(distance <= REACH, holder[x, y], np.int32(-1))
 
 
 def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
