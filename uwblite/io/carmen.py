@@ -30,6 +30,7 @@ from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
 from .carmen_readings import Block
+from .carmen_stamps import LineClock, judged
 from .carmen_writer import write_log
 from .log_parts import parts_of
 from .source import OVERLONG_LINE, open_source
@@ -98,6 +99,7 @@ class LogReader:
         self.laser = LaserMessages(every_nth_scan, scan_message)
         self.odometry = array("d")
         self.uwb = array("d")
+        self.number = 0
         self.tags = 1
         self.gyro = array("d")
         self.uwb_ids: dict[bytes, int] = {}
@@ -130,7 +132,7 @@ class LogReader:
         broken: list[tuple[int, str]] = []
         rows = zip(line_numbers.tolist(), starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
         for number, start, name_end, end, gap in rows:
-            name = block[start:name_end]
+            name, self.number = block[start:name_end], number
             try:
                 handler = self.handlers.get(name)
                 if handler is not None:
@@ -166,7 +168,7 @@ class LogReader:
 
     def _odom(self, tokens: list[bytes]) -> None:
         x, y, theta = numbers(tokens[1:4], "ODOM", 3)
-        self.odometry.extend((self._stamp(tokens, 7, "ODOM"), x, y, theta))
+        self.odometry.extend((self._stamp(tokens, 7, "ODOM"), x, y, theta, self.number))
 
     def _uwb(self, tokens: list[bytes]) -> None:
         stamp = self._stamp(tokens, 4, "UWB")
@@ -177,11 +179,11 @@ class LogReader:
             if fault := fault_of_id(name):
                 raise BrokenLine(f"UWB anchor_id {fault}")
             anchor = self.uwb_ids.setdefault(tokens[1], len(self.uwb_ids))
-        self.uwb.extend((stamp, anchor, distance, quality, int(tokens[0][3:] or b"1") - 1))
+        self.uwb.extend((stamp, anchor, distance, quality, int(tokens[0][3:] or b"1") - 1, self.number))
 
     def _gyro(self, tokens: list[bytes]) -> None:
         heading, _ = numbers(tokens[1:3], "GYRO", 2)
-        self.gyro.extend((self._stamp(tokens, 3, "GYRO"), heading))
+        self.gyro.extend((self._stamp(tokens, 3, "GYRO"), heading, self.number))
 
     def _stamp(self, tokens: list[bytes], fields: int, name: str) -> float:
         """Return ipc_timestamp behind the name and contents (`fields` tokens); logger_timestamp where it is left out."""
@@ -217,10 +219,10 @@ class LogReader:
         if self.broken - self.ends_broken > self.max_broken_share * self.messages:
             self._refuse()
         warnings = [f"part {missing} of this recording is not there: put it beside the others"] if missing else []
-        odometry = self._finish_odometry(warnings)
-        ranges = self._finish_ranges(warnings)
-        scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back)
-        gyro = self._finish_gyro(warnings)
+        odometry, clock = self._finish_odometry(warnings)
+        ranges = self._finish_ranges(clock, warnings)
+        scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back, clock)
+        gyro = self._finish_gyro(clock, warnings)
         others = {name: self.skipped[name] for name in _LIDARS if name in self.skipped}
         if self.scan_message and scans is None:
             there = f"; it has {', '.join(others)}" if others else ""
@@ -243,10 +245,11 @@ class LogReader:
         mounting = self.params.mounting(T_base_laser, self.tags)
         return SensorLog(odometry, ranges, scans, mounting, notes, gyro=gyro)
 
-    def _finish_odometry(self, warnings: list[str]) -> Odometry:
-        rows = np.array(self.odometry).reshape(-1, 4)
+    def _finish_odometry(self, warnings: list[str]) -> tuple[Odometry, LineClock]:
+        rows, (laser, laser_lines) = np.array(self.odometry).reshape(-1, 5), self.laser.robot_poses()
+        rows, lines = rows[:, :4], rows[:, 4].astype(np.int64)
         if len(rows) == 0:
-            rows = self.laser.robot_poses()
+            rows, lines = laser, laser_lines
             if len(rows) == 0:
                 raise FormatError(
                     f"no odometry in {self.lines} lines: neither ODOM messages nor ROBOTLASER1 with robot poses. "
@@ -254,20 +257,25 @@ class LogReader:
                     self.path,
                 )
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
-        order = time_order(rows[:, 0], "odometry", warnings, self.set_back)
-        return Odometry(rows[order, 0], rows[order, 1:])
+            laser, laser_lines = laser[:0], laser_lines[:0]
+        clock = judged(rows, lines, laser, laser_lines, warnings)
+        stamps, rows = clock.stamps[~clock.twice], rows[~clock.twice]
+        order = time_order(stamps, "odometry", warnings, self.set_back)
+        return Odometry(stamps[order], rows[order, 1:]), clock
 
-    def _finish_gyro(self, warnings: list[str]) -> Gyro | None:
+    def _finish_gyro(self, clock: LineClock, warnings: list[str]) -> Gyro | None:
         if not self.gyro:
             return None
-        rows = np.array(self.gyro).reshape(-1, 2)
+        rows = np.array(self.gyro).reshape(-1, 3)
+        rows[:, 0] = clock.sound(rows[:, 2].astype(np.int64), rows[:, 0], "GYRO", warnings)
         order = time_order(rows[:, 0], "gyro", warnings, self.set_back)
         return Gyro(rows[order, 0], np.unwrap(rows[order, 1]))
 
-    def _finish_ranges(self, warnings: list[str]) -> UwbRanges | None:
+    def _finish_ranges(self, clock: LineClock, warnings: list[str]) -> UwbRanges | None:
         if not self.uwb:
             return None
-        rows = np.array(self.uwb).reshape(-1, 5)
+        rows = np.array(self.uwb).reshape(-1, 6)
+        rows[:, 0] = clock.sound(rows[:, 5].astype(np.int64), rows[:, 0], "UWB", warnings)
         names = [name.decode() for name in self.uwb_ids]
         ids = sorted(names)
         place = {name: i for i, name in enumerate(ids)}

@@ -15,6 +15,7 @@ from .carmen_laser_words import HEAD, RANK, Layout, kinds_of, parse_head, split_
 from .carmen_messages import BrokenLine, numbers, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
+from .carmen_stamps import LineClock
 from .scan_geometry import ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
@@ -57,6 +58,7 @@ class LaserMessages:
         self._scans: dict[Layout, _Scans] = {}
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
+        self._pose_lines = array("q")
 
     def begin(self, block: Block) -> None:
         """Start a block of lines."""
@@ -69,7 +71,7 @@ class LaserMessages:
             if self._kind and RANK[name] < RANK[self._kind]:
                 return
             self._kind = name
-            self._scans, self._poses, self._layouts = {}, array("d"), {}
+            self._scans, self._poses, self._pose_lines, self._layouts = {}, array("d"), array("q"), {}
         try:
             self._take_evenly_spaced(name, number, start, end, gap)
         except ValueError:
@@ -84,7 +86,7 @@ class LaserMessages:
         last = head + layout.beams
         if last >= len(gaps) or gaps[last] >= end:
             raise BrokenLine("too short")
-        stamp = self._tail(name, self._block.text[gaps[last] + 1 : end].split())
+        stamp = self._tail(name, number, self._block.text[gaps[last] + 1 : end].split())
         self._queue(layout, Pending(number, head + 1, None, stamp))
 
     def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
@@ -96,7 +98,7 @@ class LaserMessages:
         if len(tokens) <= head + layout.beams:
             raise BrokenLine(f"{what} announces {layout.beams} readings but the line is too short for them")
         readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
-        stamp = self._tail(name, tokens[head + layout.beams :])
+        stamp = self._tail(name, number, tokens[head + layout.beams :])
         self._queue(layout, Pending(number, 0, readings, stamp))
 
     def _queue(self, layout: Layout, pending: Pending) -> None:
@@ -115,11 +117,12 @@ class LaserMessages:
                 self._layouts[head] = layout
         return layout
 
-    def _tail(self, name: bytes, tail: list[bytes]) -> float:
+    def _tail(self, name: bytes, number: int, tail: list[bytes]) -> float:
         """Read what follows the readings; remember the poses, return the stamp."""
         at, stamp = split_tail(name, tail, self.ipc_left_out)
         if name != b"RAWLASER1":
             self._poses.extend((stamp, *numbers(tail[at : at + 6], name.decode(), 6)))
+            self._pose_lines.append(number)
         return stamp
 
     def decode(self) -> Iterator[tuple[int, ValueError]]:
@@ -136,12 +139,12 @@ class LaserMessages:
                 scans.numbers.extend(p.number for p in sound)
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
 
-    def robot_poses(self) -> Floats:
-        """Return (k, 4) stamp and pose of the robot of every message that gives them."""
-        return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]]
+    def robot_poses(self) -> tuple[Floats, Ints]:
+        """Return stamp and pose of the robot (k, 4) of every message that gives them, and its line (k,)."""
+        return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]], np.array(self._pose_lines, dtype=np.int64)
 
     def finish(
-        self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float] | None = None
+        self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float], clock: LineClock
     ) -> tuple[LaserScans | None, Floats | None]:
         """Return the scans in the geometry of most of them, sorted by time, and T_base_laser where the messages give it."""
         for name, count in self._counts.items():
@@ -156,6 +159,7 @@ class LaserMessages:
         range_max = self._reach(kept, params)
         stamps, ranges, lines = self._merged(kept, params, range_min, skipped, warnings)
         as_written = np.argsort(lines)
+        stamps[as_written] = clock.sound(lines[as_written], stamps[as_written], what, warnings)
         order = as_written[time_order(stamps[as_written], what, warnings, set_back)]
         time_increment = params.get("laser_time_increment")
         if time_increment is None:

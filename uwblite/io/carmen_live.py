@@ -7,6 +7,7 @@ import numpy as np
 from ..arrays import Floats
 from ..sensor_log import LaserScans, SensorMounting
 from .carmen import LogReader
+from .carmen_stamps import AS_WRITTEN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,19 +94,19 @@ class LiveReader:
         reader.laser.ipc_left_out = before.laser.ipc_left_out
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
-        poses, turns = np.array(reader.odometry).reshape(-1, 4), np.array(reader.gyro).reshape(-1, 2).tolist()
+        poses, turns = np.array(reader.odometry).reshape(-1, 5)[:, :4], np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
         found: list[Measured] = [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in poses]
         found += [*self._ranges(reader), *self._scans(reader), *(LiveGyro(t, heading, t) for t, heading in turns)]
         return sorted(found, key=lambda measured: measured.order)
 
     def _ranges(self, reader: LogReader) -> list[LiveRange]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}
-        rows = np.array(reader.uwb).reshape(-1, 5).tolist()
+        rows = np.array(reader.uwb).reshape(-1, 6)[:, :5].tolist()
         reader.tags = max([reader.tags, *(int(row[4]) + 1 for row in rows)])
         return [LiveRange(t, names[int(anchor)], metres, int(tag), t) for t, anchor, metres, _, tag in rows]
 
     def _scans(self, reader: LogReader) -> list[LiveScan]:
-        scans, mounted = reader.laser.finish(reader.params, {}, [])
+        scans, mounted = reader.laser.finish(reader.params, {}, [], {}, AS_WRITTEN)
         if scans is None:
             return []
         if self._T_base_laser is None:

@@ -48,7 +48,7 @@ def why_broken(error: ValueError) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-_CONFIRMED = 0.5
+CONFIRMED = 0.5
 """s; a recorder may hold a range back until the next one confirms it."""
 _NEXT = 2.0
 """s; a part of a log that follows another begins so much later at most."""
@@ -61,7 +61,7 @@ def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[st
     ----------
     set_back : takes by how much the clock was set back at most, s, by what.
     """
-    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - _CONFIRMED))
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - CONFIRMED))
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
         if set_back is not None:
@@ -75,8 +75,8 @@ def _in_parts(stamps: Floats) -> bool:
     Sorted, one part follows the other; a clock that was set back goes through the same time again, or leaves a gap.
     """
     steps = np.diff(stamps, prepend=np.inf)
-    begins = np.flatnonzero((steps < -_CONFIRMED) | (steps > _NEXT))
+    begins = np.flatnonzero((steps < -CONFIRMED) | (steps > _NEXT))
     first, last = np.minimum.reduceat(stamps, begins), np.maximum.reduceat(stamps, begins)
     order = np.argsort(first)
     gap, as_written = first[order][1:] - last[order][:-1], np.diff(order) == 1
-    return bool(np.all((gap >= -_CONFIRMED) & (as_written | (gap <= _NEXT))))
+    return bool(np.all((gap >= -CONFIRMED) & (as_written | (gap <= _NEXT))))

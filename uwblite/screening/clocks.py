@@ -25,14 +25,40 @@ _SOME, _MOST = 0.02, 0.5
 doubt."""
 
 
+def stand_still(stamps: Floats, travelled: Floats) -> bool:
+    """Return whether stamps (n,), s, in the order of the readings, stand still while the robot drives.
+
+    Readings that waited in a buffer share a stamp as well, and then a robot drives no farther within one than it does while a
+    buffer fills.
+
+    Parameters
+    ----------
+    travelled : (n,) m, distance driven until each reading.
+    """
+    if len(stamps) < _FEW_STAMPS or travelled[-1] - travelled[0] <= 0.0:
+        return False
+    way = np.diff(travelled)
+    group = np.concatenate([[0], np.cumsum(np.diff(stamps) != 0.0)])
+    within = np.where(group[1:] == group[:-1], way, 0.0)
+    far = np.bincount(group[1:], within) > min(_BUFFERED, _HALF * float(way.sum()))
+    return float(within[far[group[1:]]].sum()) > _HALF * float(way.sum())
+
+
+_BUFFERED = 10.0
+"""m; more than a robot drives while readings wait in a buffer: a few seconds at 3 m/s at most."""
+_HALF = 0.5
+
+
 def refuse_without_stamps(log: SensorLog) -> None:
-    """Refuse a recording of a moving robot whose readings all have one time."""
+    """Refuse a recording of a moving robot whose stamps stand still."""
     stamps, poses = log.odometry.stamps, log.odometry.poses
-    if len(stamps) > 2 and np.ptp(stamps) == 0.0 and np.any(np.ptp(poses, axis=0) > 0.0):
+    same = len(stamps) > 2 and np.ptp(stamps) == 0.0 and bool(np.any(np.ptp(poses, axis=0) > 0.0))
+    if same or stand_still(stamps, log.odometry.travelled):
+        count = int(np.sum(np.diff(stamps) == 0.0)) + 1
+        which = f"all {count} of the odometry are of" if same else f"{count} of {len(stamps)} of the odometry share one, as"
         raise DataError(
-            f"the readings have no stamps: all {len(stamps)} of the odometry are of t = {stamps[0]:g} s; write the time of "
-            "each, or, where it is lost and messages came in a steady rhythm, one that grows from message to message (of a "
-            "CARMEN log: awk '{$NF = $(NF-2) = NR / 10; print}')"
+            f"the readings have no stamps: {which} t = {np.median(stamps):g} s; write the time of each, or, where it is lost"
+            " and messages came in a steady rhythm, one that grows from reading to reading"
         )
 
 

@@ -1,0 +1,174 @@
+"""Stamps of a CARMEN log judged by the order of its lines: false ones, and those that stand still while the robot drives.
+
+A recorder writes messages as they come, so lines tell which was first even where stamps do not: stamps written with six
+digits, or GMapping's corrected logs, which repeat each laser message as an ODOM whose stamp was never set.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints, runs_of
+from ..screening.clocks import stand_still
+from .carmen_messages import CONFIRMED
+
+_FAR = 10.0
+"""s; no message waits so long for its line."""
+_IN_A_ROW = 3
+"""Messages; a clock that was set back gives more."""
+_PERIODS = 10.0
+"""Times between readings by which a stamp of 0 must be too early to be one that was never set."""
+_SPEED, _TURN_RATE, _PERIOD = 0.5, 0.5, 0.1
+"""m/s and rad/s at which robots usually move, s between messages of one that stands: made-up stamps are of such a robot."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineClock:
+    """The time of the odometry by line, by which the stamps of other messages are judged."""
+
+    lines: Ints
+    """(n,) ascending."""
+    stamps: Floats
+    """(n,) s."""
+    travelled: Floats
+    """(n,) m, distance driven until then."""
+    twice: Bools
+    """(n,) readings that are there twice: the odometry repeats a laser message that repeats the odometry before it."""
+    made: bool
+    """Whether the stamps are made up, and no stamp of the log counts."""
+
+    def sound(self, lines: Ints, stamps: Floats, what: str, warnings: list[str]) -> Floats:
+        """Return stamps (m,), s, of other messages in the order of their lines (m,), those that cannot be placed by lines."""
+        if len(lines) == 0 or len(self.lines) == 0:
+            return stamps
+        by_line = np.interp(lines, self.lines, self.stamps)
+        if self.made:
+            return by_line
+        if stand_still(stamps, np.interp(lines, self.lines, self.travelled)):
+            warnings.append(
+                f"the stamps of {len(stamps)} {what} messages stand still while the robot drives: the messages are placed by"
+                " their lines among the odometry"
+            )
+            return by_line
+        return _placed(lines, stamps, false_stamps(stamps), what, warnings)
+
+
+AS_WRITTEN = LineClock(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), False)
+"""Without odometry every stamp stays."""
+
+
+def judged(odometry: Floats, odometry_lines: Ints, laser: Floats, laser_lines: Ints, warnings: list[str]) -> LineClock:
+    """Judge the stamps of the odometry.
+
+    Parameters
+    ----------
+    odometry : (n, 4) s, m, m, rad: stamp and pose, in the order of lines.
+    laser : (m, 4) the same of laser messages, where they give the odometry's pose.
+    """
+    if len(odometry) == 0:
+        return AS_WRITTEN
+    rows, lines = np.concatenate([odometry, laser]), np.concatenate([odometry_lines, laser_lines])
+    order = np.argsort(lines, kind="stable")
+    rows, lines, own = rows[order], lines[order], order < len(odometry)
+    again = np.zeros(len(rows), dtype=bool)
+    again[1:] = own[1:] & ~own[:-1] & np.all(rows[1:, 1:] == rows[:-1, 1:], axis=1)
+    steps = np.diff(rows[:, 1:], axis=0, prepend=rows[:1, 1:])
+    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(np.angle(np.exp(1j * steps[:, 2])))
+    travelled, twice = np.cumsum(way), np.zeros(len(rows), dtype=bool)
+    twice[2:] = again[2:] & own[:-2] & np.all(rows[2:, 1:] == rows[:-2, 1:], axis=1)
+    if stand_still(rows[~again, 0], travelled[~again]):
+        still = int(np.sum((np.diff(rows[~again, 0]) <= 0.0) & (np.diff(travelled[~again]) > 0.0)))
+        warnings.append(
+            f"the stamps of this log cannot be used: {still} of {len(rows)} messages have the stamp of the one before while the"
+            f" robot drives on. The messages are taken in the order of the lines, as of a robot at {_SPEED:g} m/s; speeds,"
+            " durations and delays say nothing"
+        )
+        time = np.maximum.reduce([way / _SPEED, turn / _TURN_RATE, np.full(len(rows), _PERIOD)])
+        # A laser message and the odometry beside it with the same pose are of one moment.
+        moment = again | (~own & (way == 0.0) & (turn == 0.0))
+        made = np.cumsum(np.where(moment, 0.0, time))
+        return LineClock(lines[own], made[own], travelled[own], twice[own], True)
+    lent = np.concatenate([[np.nan], rows[:-1, 0]])[own]
+    stamps = _placed_odometry(lines[own], rows[own, 0], again[own], lent, warnings)
+    return LineClock(lines[own], stamps, travelled[own], twice[own] & (stamps == lent), False)
+
+
+def _placed_odometry(lines: Ints, stamps: Floats, again: Bools, lent: Floats, warnings: list[str]) -> Floats:
+    """Return the stamps (n,), s, with false ones replaced.
+
+    Parameters
+    ----------
+    again : (n,) which messages repeat the pose of the laser message before them. lent : (n,) s, stamps of these.
+    """
+    others = np.flatnonzero(~again)
+    if len(others) < len(stamps):
+        before, after = _neighbours(lines, lines[others], stamps[others])
+        unordered = again & ((stamps < before) | (stamps > after))
+        fits = unordered & (lent >= before) & (lent <= after)
+        if fits.any():
+            warnings.append(
+                f"{int(fits.sum())} ODOM messages repeat the pose of the laser message before them with a stamp that no clock"
+                " gives, as in logs that GMapping corrected: they take its stamp"
+            )
+        stamps = np.where(fits, lent, stamps)
+    return _placed(lines, stamps, false_stamps(stamps), "ODOM", warnings)
+
+
+def _neighbours(lines: Ints, other_lines: Ints, other_stamps: Floats) -> tuple[Floats, Floats]:
+    """Return the stamps, s, of the others (m,) before and behind each line (n,); infinite where there is none."""
+    place = np.searchsorted(other_lines, lines)
+    padded = np.concatenate([[-np.inf], other_stamps, [np.inf]])
+    own = np.append(other_lines, -1)[np.minimum(place, len(other_lines))] == lines
+    return padded[place], padded[place + 1 + own]
+
+
+def false_stamps(stamps: Floats) -> Bools:
+    """Return which stamps (n,), s, as they were written, cannot be: a few in a row, far off those before and after them.
+
+    A stamp of 0 was never set, unless it is in order itself. Where the rest is not in order, as in logs whose lines were
+    mixed, none is called false.
+    """
+    false = np.zeros(len(stamps), dtype=bool)
+    zero = stamps == 0.0
+    if zero.any() and not zero.all():
+        set_ones = np.flatnonzero(~zero)
+        before, after = _neighbours(np.arange(len(stamps)), set_ones, stamps[set_ones])
+        steps = np.abs(np.diff(stamps[set_ones]))
+        late = max(CONFIRMED, _PERIODS * float(np.median(steps))) if len(steps) else _FAR
+        false = zero & ((before > late) | (np.isfinite(after) & (after > _FAR)))
+    rest = np.flatnonzero(~false)
+    if np.any(np.diff(stamps[rest]) < -_FAR):
+        ordered = longest_ascent(stamps[rest])
+        before, after = _neighbours(np.arange(len(rest)), np.flatnonzero(ordered), stamps[rest[ordered]])
+        far = ~ordered & ((stamps[rest] < before - _FAR) | (stamps[rest] > after + _FAR))
+        for first, last in runs_of(far):
+            false[rest[first:last]] = last - first <= _IN_A_ROW
+    left = int(np.sum(np.diff(stamps[~false]) < -CONFIRMED))
+    sound = 10 * left <= int(false.sum()) <= len(stamps) // 3
+    return false if sound else np.zeros(len(stamps), dtype=bool)
+
+
+def longest_ascent(values: Floats) -> Bools:
+    """Return which values (n,) make up the longest subsequence that never falls (patience sorting, Fredman 1975)."""
+    tops, piles, below = list[float](), list[int](), np.full(len(values), -1)
+    for k, value in enumerate(values.tolist()):
+        place = bisect_right(tops, value)
+        below[k] = piles[place - 1] if place else -1
+        tops[place : place + 1], piles[place : place + 1] = [value], [k]
+    chosen, k = np.zeros(len(values), dtype=bool), piles[-1] if piles else -1
+    while k >= 0:
+        chosen[k], k = True, int(below[k])
+    return chosen
+
+
+def _placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[str]) -> Floats:
+    """Return stamps (n,), s, with the false ones between those of the lines before and after."""
+    if not false.any():
+        return stamps
+    first = int(np.argmax(false))
+    warnings.append(
+        f"{int(false.sum())} of {len(stamps)} {what} messages have a stamp that no clock gives (the first is"
+        f" {stamps[first]:.4g} s in line {lines[first]}): they are placed by the order of the lines"
+    )
+    return np.where(false, np.interp(lines, lines[~false], stamps[~false]), stamps)
