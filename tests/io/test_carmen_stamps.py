@@ -68,7 +68,7 @@ def test_stamps_that_stand_still_give_way_to_the_order_of_lines(tmp_path, stamp)
     np.testing.assert_allclose(log.odometry.travelled_at(log.scans.stamps), 0.04 * np.arange(9, 600, 10), atol=1e-3)
     np.testing.assert_allclose(log.odometry.travelled_at(log.ranges.stamps), 0.04 * np.arange(9, 600, 10), atol=0.04)
     done = screen(log.without(lidar=True, uwb=True))  # neither another unit, nor two robots, nor a clock that was set back
-    assert done.screening.remarks == ()
+    assert done.screening.findings == ()
     np.testing.assert_array_equal(done.odometry.poses, log.odometry.poses)
 
 

@@ -247,7 +247,7 @@ class LogReader:
 
     def _finish_odometry(self, warnings: list[str]) -> tuple[Odometry, LineClock]:
         rows, (laser, laser_lines) = np.array(self.odometry).reshape(-1, 5), self.laser.robot_poses()
-        rows, lines = rows[:, :4], rows[:, 4].astype(np.int64)
+        rows, lines = rows[:, :4], rows[:, 4].astype(np.intp)
         if len(rows) == 0:
             rows, lines = laser, laser_lines
             if len(rows) == 0:
@@ -267,7 +267,7 @@ class LogReader:
         if not self.gyro:
             return None
         rows = np.array(self.gyro).reshape(-1, 3)
-        rows[:, 0] = clock.sound(rows[:, 2].astype(np.int64), rows[:, 0], "GYRO", warnings)
+        rows[:, 0] = clock.sound(rows[:, 2].astype(np.intp), rows[:, 0], "GYRO", warnings)
         order = time_order(rows[:, 0], "gyro", warnings, self.set_back)
         return Gyro(rows[order, 0], np.unwrap(rows[order, 1]))
 
@@ -275,7 +275,7 @@ class LogReader:
         if not self.uwb:
             return None
         rows = np.array(self.uwb).reshape(-1, 6)
-        rows[:, 0] = clock.sound(rows[:, 5].astype(np.int64), rows[:, 0], "UWB", warnings)
+        rows[:, 0] = clock.sound(rows[:, 5].astype(np.intp), rows[:, 0], "UWB", warnings)
         names = [name.decode() for name in self.uwb_ids]
         ids = sorted(names)
         place = {name: i for i, name in enumerate(ids)}

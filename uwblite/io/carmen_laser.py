@@ -141,7 +141,7 @@ class LaserMessages:
 
     def robot_poses(self) -> tuple[Floats, Ints]:
         """Return stamp and pose of the robot (k, 4) of every message that gives them, and its line (k,)."""
-        return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]], np.array(self._pose_lines, dtype=np.int64)
+        return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]], np.array(self._pose_lines, dtype=np.intp)
 
     def finish(
         self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float], clock: LineClock

@@ -54,7 +54,7 @@ class LineClock:
         return _placed(lines, stamps, false_stamps(stamps), what, warnings)
 
 
-AS_WRITTEN = LineClock(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), False)
+AS_WRITTEN = LineClock(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), False)
 """Without odometry every stamp stays."""
 
 

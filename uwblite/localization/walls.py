@@ -247,7 +247,7 @@ def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
     origin = points.min(axis=0) - REACH - cell
     wide, high = (np.ceil((points.max(axis=0) + REACH - origin) / cell).astype(int) + 1).tolist()
     holder = np.full((wide, high), -1, dtype=np.int32)
-    holder[tuple(((points - origin) / cell).astype(np.int64).T)] = np.arange(len(points))
+    holder[tuple(((points - origin) / cell).astype(np.intp).T)] = np.arange(len(points))
     distance, (x, y) = distance_transform_edt(holder < 0, sampling=cell, return_indices=True)
     return origin, np.where(distance <= REACH, holder[x, y], np.int32(-1))
 
