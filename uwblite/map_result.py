@@ -3,7 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from .arrays import Floats, Ints
+import numpy as np
+
+from .arrays import Bools, Floats, Ints
 from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
@@ -156,3 +158,29 @@ class MapResult:
     def doubts(self) -> tuple[Finding, ...]:
         """Reasons not to trust the result; non-empty means exit code 3."""
         return of_severity(self.findings, DOUBT)
+
+    @property
+    def doubted_stretches(self) -> tuple[tuple[int, float, float], ...]:
+        """(recording from 1, first and last time, s) of the stretches that doubts are about, in the order of time.
+
+        Empty where nothing is doubted, and where a doubt is about the map as a whole.
+        """
+        if not all(finding.stretches for finding in self.doubts):
+            return ()
+        return tuple(sorted({(finding.recording, *span) for finding in self.doubts for span in finding.stretches}))
+
+    def doubted_paths(self) -> list[Floats]:
+        """Return x, y (n, 2), m, of the trajectory along each doubted stretch."""
+        return [
+            self.trajectory[(self.recording == number - 1) & (self.stamps >= first) & (self.stamps <= last), :2]
+            for number, first, last in self.doubted_stretches
+        ]
+
+    def trusted(self, stamps: Floats, recording: Ints) -> Bools:
+        """Return at which times (n,), s, of recordings (n,), from 0, no doubt concerns the pose."""
+        if self.doubts and not self.doubted_stretches:
+            return np.zeros(len(stamps), dtype=bool)
+        trusted = np.ones(len(stamps), dtype=bool)
+        for number, first, last in self.doubted_stretches:
+            trusted &= (recording != number - 1) | (stamps < first) | (stamps > last)
+        return trusted

@@ -68,6 +68,10 @@ def test_odometry_alone_drifts(sound):
     assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone", "uncertain"}
 
 
+def keyframes_at(stamps):
+    return SimpleNamespace(stamps=stamps, of_keyframe=np.zeros(len(stamps), dtype=int))
+
+
 def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
     """Judge a chain that follows the lidar, its wheels off for 15 steps; spans: keyframes between which scan edges stand."""
     truth = np.column_stack([np.arange(80) * (0.0 if standing else 0.3), np.zeros(80), np.zeros(80)])
@@ -81,7 +85,9 @@ def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
     stages = Stages(None, None)
     for kind in doubts:
         stages.doubt(kind, "")
-    recordings = SimpleNamespace(stamps=50.0 + np.arange(80.0), path=np.arange(80.0))
+    recordings = SimpleNamespace(
+        stamps=50.0 + np.arange(80.0), path=np.arange(80.0), of_keyframe=np.zeros(80, dtype=int)
+    )
     stages.findings.extend(check_odometry_steps(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,))),
         SimpleNamespace(recordings=recordings, stages=stages),
@@ -116,6 +122,9 @@ def test_wheels_that_slip_are_a_warning_where_the_lidar_fixes_every_pose(spans):
     assert notice.kind == "odometry-steps"
     assert 25 <= notice.figures["start"] <= 30
     assert 44 <= notice.figures["end"] <= 50
+    assert notice.recording == 1
+    assert notice.stretches == ((50.0 + notice.figures["start"], 50.0 + notice.figures["end"]),)
+    assert f"--end {notice.figures['start']:.0f}`" in notice.cure
 
 
 @pytest.mark.parametrize("placed", [False, True])
@@ -135,7 +144,7 @@ def test_a_jump_that_no_scan_measures_is_a_doubt(placed, along):
     stages = Stages(None, None)
     stages.findings.extend(check_odometry_jumps(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=edges), placed=np.array([placed])),
-        SimpleNamespace(recordings=SimpleNamespace(stamps=50.0 + np.arange(80.0)), stages=stages),
+        SimpleNamespace(recordings=keyframes_at(50.0 + np.arange(80.0)), stages=stages),
     ))
     assert [n.kind for n in stages.doubts] == ([] if along == 100.0 or (placed and along is None) else ["odometry-jumps"])
     assert all(n.figures["at"] == 39.0 and abs(n.figures["metres"] - 3.0) < 1e-6 for n in stages.doubts)
@@ -153,7 +162,7 @@ def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, 
     stages = Stages(None, None)
     stages.findings.extend(check_slips(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,) if lidar else ()), placed=np.array([True])),
-        SimpleNamespace(recordings=SimpleNamespace(stamps=50.0 + np.arange(40.0)), stages=stages),
+        SimpleNamespace(recordings=keyframes_at(50.0 + np.arange(40.0)), stages=stages),
     ))
     said = [("doubt", n) for n in stages.doubts] + [("warning", n) for n in stages.warnings]
     assert [rank for rank, _ in said] == ([] if lidar or kind is None else [kind])
@@ -169,7 +178,7 @@ def test_a_slip_is_the_longest_way_and_turn_of_all_steps_that_slipped():
     stages = Stages(None, None)
     stages.findings.extend(check_slips(
         SimpleNamespace(odometry=wheels, graph=Graph(truth), placed=np.array([True])),
-        SimpleNamespace(recordings=SimpleNamespace(stamps=100.0 + np.arange(40.0)), stages=stages),
+        SimpleNamespace(recordings=keyframes_at(100.0 + np.arange(40.0)), stages=stages),
     ))
     (notice,) = stages.doubts + stages.warnings
     assert notice.figures["way"] == pytest.approx(0.5, abs=0.01)

@@ -42,7 +42,7 @@ def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
     lengths = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     frames = SimpleNamespace(stamps=STAMPS, path=lengths, duration=np.diff(STAMPS))
     recording = SimpleNamespace(
-        log=log, frames=frames, rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
+        log=log, frames=frames, number=0, rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
         has_scans=scans is not None,
     )  # fmt: skip
     stages = Stages(None, None)

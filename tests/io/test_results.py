@@ -91,8 +91,8 @@ def test_an_unplaced_anchor_has_empty_fields():
 def test_covariances_are_the_upper_triangle():
     result = small_result()
     lines = covariance_csv(result.keyframe_stamps, result.keyframe_covariances, result.keyframe_recording).splitlines()
-    assert lines[0] == "stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"
-    assert [float(v) for v in lines[1].split(",")] == pytest.approx([1000.0, 1e-4, 0, 0, 2e-4, 0, 1e-5, 1])
+    assert lines[0] == "stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording,trusted"
+    assert [float(v) for v in lines[1].split(",")] == pytest.approx([1000.0, 1e-4, 0, 0, 2e-4, 0, 1e-5, 1, 1])
     assert len(lines) == 25
 
 

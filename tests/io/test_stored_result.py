@@ -66,7 +66,7 @@ def test_closures_of_unknown_keyframes_are_left_out(written):
 def test_tables_that_do_not_fit_are_named(written):
     folder = written[1]
     table = (folder / "trajectory_covariance.csv").read_text()
-    (folder / "trajectory_covariance.csv").write_text(table.replace(",1\n", ",7\n"))
+    (folder / "trajectory_covariance.csv").write_text(table.replace(",1,1\n", ",7,1\n"))
     with pytest.raises(FormatError, match="recording 7"):
         read_result(folder)
     (folder / "trajectory_covariance.csv").write_text(table.replace("1000.000000", "soon"))

@@ -5,6 +5,7 @@ robust kernel treats the ranges of that stretch as outliers. They disagree with 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ..arrays import Bools, Floats, Ints
 from ..findings import Finding, doubt
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
+from .moments import parts_beside
 
 _WAY, _STEP = 5.0, 1.0
 """m; length of the stretches that are tested, and distance from one to the next."""
@@ -51,12 +53,14 @@ def check_displaced_stretches(table: dict[str, Floats], anchors: Sequence[Anchor
             stamps, start = table["stamp"][own], float(recording.frames.stamps[0])
             first, last = min(found)[0], max(last for _, last, _ in found) - 1
             off = float(max(np.hypot(*beside) for *_, beside in found))
-            yield doubt(
+            displaced = doubt(
                 "ranges-disagree",
                 f"from t = {stamps[first] - start:.0f} to {stamps[last] - start:.0f} s the ranges agree with a path "
                 f"{off:.1f} m beside that of the map: did the wheels slip where the lidar sees bare walls only?",
                 start=float(stamps[first]), end=float(stamps[last]), off=off,
             )  # fmt: skip
+            span, cure = (float(stamps[first]), float(stamps[last])), parts_beside(stamps[first] - start, stamps[last] - start)
+            yield replace(displaced, recording=recording.number + 1, stretches=(span,), cure=cure)
 
 
 def _stretches(tags: Floats, off: Bools) -> list[tuple[int, int]]:

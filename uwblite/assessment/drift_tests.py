@@ -19,6 +19,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
+from .moments import between_keyframes, seconds
 
 _SIGMAS = 2.5
 """Standard deviations that a drift must exceed, in addition to its limit."""
@@ -64,7 +65,7 @@ def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             if abs(value) > max(limit, _SIGMAS * sigma):
                 why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
                 yield doubt("drift", why, value=float(value), sigma=float(sigma))
-    yield from _check_turns(graph, wheels, rec.stamps, task)
+    yield from _check_turns(graph, wheels, rec)
 
 
 def _scale_text(by: float) -> str:
@@ -110,7 +111,7 @@ def _bent(places: Floats, moved: Floats) -> float:
     return float(np.sqrt(np.sum(left**2) / len(places)))
 
 
-def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task) -> Iterator[Finding]:
+def _check_turns(graph: Graph, wheels: OdometryEdges, rec: Recordings) -> Iterator[Finding]:
     """Doubt a map in which, by the ranges, the odometry turns wrongly over a short stretch."""
     steps = np.arange(0, len(wheels) - _WAY + 1, _WAY // 2)[:, None] + np.arange(_WAY)
     # The numerators of the test, with the graph at its optimum: a stretch that fits well needs no other turn.
@@ -122,9 +123,10 @@ def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task
     wrong = np.flatnonzero(np.abs(turns) > np.maximum(_TURN, _TURN_SIGMAS * sigmas))
     if len(wrong):
         worst = wrong[np.argmax(np.abs(turns[wrong]) / sigmas[wrong])]
-        at, turn = float(stamps[wheels.i[steps[worst, 0]]] - stamps[0]), float(np.abs(turns[worst]))
+        span, turn = (int(wheels.i[steps[worst, 0]]), int(wheels.j[steps[worst, -1]])), float(np.abs(turns[worst]))
+        at = seconds(rec, span[0])
         why = f"from t = {at:.0f} s the ranges contradict the odometry by {turn:.1f} rad within some metres: did a wheel slip?"
-        yield doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at)
+        yield between_keyframes(doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at), rec, span)
 
 
 def _change(graph: Graph, edges: Edges, changed: Edges) -> Floats:

@@ -21,6 +21,7 @@ from ..loop_closure.slid_stretches import jumps, scans_fixing
 from ..pipeline.estimate import Estimate, Task
 from ..radio.line_of_sight import LEAST_POINTS, blocked
 from ..radio.range_noise import short_term_sigma
+from .moments import between_keyframes, seconds
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -105,7 +106,7 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     They are a doubt of the map, unless the lidar fixes the poses there by itself: from other visits, or from clear and
     redundant matches of the neighbouring clouds in a map without other contradictions. Then only the odometry is wrong.
     """
-    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    wheels, graph = estimate.odometry, estimate.graph
     if len(wheels) < _WINDOW:
         return
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
@@ -119,8 +120,10 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     if stretch is None and (stretch := _stretch(off)) is not None:
         say, text = warning, text + "; the map follows the lidar, which determines every pose there: check them"
     if stretch is not None:
-        a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
-        yield say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
+        span = int(wheels.i[stretch[0]]), int(wheels.j[stretch[1]])
+        a, b = (seconds(task.recordings, k) for k in span)
+        found = say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
+        yield between_keyframes(found, task.recordings, span)
 
 
 def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
@@ -128,7 +131,7 @@ def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
 
     A robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
-    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    wheels, graph = estimate.odometry, estimate.graph
     if not len(wheels) or not estimate.placed.any():
         return
     whitened = wheels.residuals(graph)
@@ -137,14 +140,15 @@ def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
     far &= ~np.isin(wheels.i, _measured_by_lidar(graph))
     at = np.flatnonzero(far)
     if len(at):
-        when = ", ".join(f"{stamps[wheels.i[k]] - stamps[0]:.0f}" for k in at[:5])
+        when = ", ".join(f"{seconds(task.recordings, int(wheels.i[k])):.0f}" for k in at[:5])
         way, turn = float(np.hypot(off[at, 0], off[at, 1]).max()), float(off[at, 2].max())
         text = (
             f"at t = {when}{' ...' if len(at) > 5 else ''} s the ranges contradict the odometry by up to {way:.2f} m and "
             f"{turn:.2f} rad: the wheels slipped or were stuck, or the robot was carried"
         )
         say = doubt if max(way, turn) > _CARRIED else warning
-        yield say("odometry-slips", text, way=way, turn=turn)
+        spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
+        yield between_keyframes(say("odometry-slips", text, way=way, turn=turn), task.recordings, *spans)
 
 
 def _measured_by_lidar(graph: Graph) -> Ints:
@@ -179,7 +183,7 @@ def check_odometry_jumps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     without scan edges are left to check_slips. At the others, scan edges that fix no place let one step absorb the errors
     of many, and displaced anchors agree with that.
     """
-    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    wheels, graph = estimate.odometry, estimate.graph
     rows, by = jumps(wheels, graph)
     tested = 1.0 / wheels.sqrt_information[rows, 0, 0] < _MEASURED_BREAK
     if estimate.placed.any():
@@ -188,13 +192,14 @@ def check_odometry_jumps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     if far.max(initial=0.0) < _FAR:
         return
     worst = int(np.argmax(far))
-    when = float(stamps[wheels.i[rows[worst]]] - stamps[0])
-    yield doubt(
+    when = seconds(task.recordings, int(wheels.i[rows[worst]]))
+    found = doubt(
         "odometry-jumps",
         f"at t = {when:.0f} s map and odometry differ by {far[worst]:.1f} m over one step, and no scan "
         f"measures it ({len(rows)} such steps): loop closures there may join different places that look the same",
         steps=len(rows), metres=float(far[worst]), at=when,
     )  # fmt: skip
+    yield between_keyframes(found, task.recordings, *((int(wheels.i[k]), int(wheels.j[k])) for k in rows.tolist()))
 
 
 _FAR = 1.0

@@ -6,6 +6,7 @@ continues in another building) leave no residual. Where all other sensors end, t
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,13 +73,17 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
         for word, at, way, lengths, durations in ends:
             off, seconds = float(dead_reckoning_error(way, lengths, durations).max()), frames.stamps[at] - frames.stamps[0]
             if off > _ASTRAY:
-                yield doubt(
+                loose = doubt(
                     "untied-parts",
                     f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
                     f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "
                     "why no sensor measured there",
                     at=float(frames.stamps[at]), way=float(lengths.sum()), error=off,
                 )  # fmt: skip
+                ends_at = sorted((float(frames.stamps[at]), float(frames.stamps[0 if word == "until" else -1])))
+                option = "--start" if word == "until" else "--end"
+                cure = f"`uwblite convert run.log part.log {option} {seconds:.0f}` leaves that part out"
+                yield replace(loose, recording=recording.number + 1, stretches=((ends_at[0], ends_at[1]),), cure=cure)
 
 
 def _held(graph: Graph, ranges: RangeEdges | None) -> Ints:

@@ -229,7 +229,10 @@ def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     shown = (c for c in result.calibration if c.state == "estimated" and c.key.anchor is None and abs(c.value) > 2.0 * c.sigma)
     lines += [calibration_line(c) for c in shown]
     lines += [f"warning: {text}" for text in result.warnings]
-    lines += [f"DOUBT: {text}" for text in result.doubts]
+    for found in result.doubts:
+        lines += [f"DOUBT: {found}", *([f"  {found.cure}"] if found.cure else [])]
+    if result.doubted_stretches:
+        lines.append("the rest of the map is as good as it states; map.png marks the stretches that are not")
     lines.append("files: " + " ".join(os.path.join(args.out, name) for name in made.names))
     page, out = shlex.quote(os.path.join(args.out, "report.html")), shlex.quote(args.out)
     lines.append(f"next: open {page} in a browser, or: uwblite view {out}")

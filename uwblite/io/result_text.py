@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..findings import Finding
 from ..map_result import MapResult
 from ..report.printable import csv_field, encodable
 from ..sensor_log import LogNotes, SensorLog
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of report.json; it grows when a field changes its meaning or goes."""
 
 _ANCHOR_FIELDS = (
@@ -61,18 +61,22 @@ def _decimal(value: float, digits: int = 6) -> str:
     return f"{value + 0.0:.{digits}f}" if np.isfinite(value) else ""
 
 
-def covariance_csv(stamps: Floats, covariances: Floats, recordings: Ints | None = None) -> str:
-    """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) and recording of every pose as CSV.
+def covariance_csv(
+    stamps: Floats, covariances: Floats, recordings: Ints | None = None, trusted: Bools | None = None
+) -> str:
+    """Return stamp, covariance (upper triangle; m^2, m rad, rad^2; map frame), recording and trust of every pose as CSV.
 
     Parameters
     ----------
     stamps : (n,) s. covariances : (n, 3, 3). recordings : (n,) of each pose, from 0; None = there is one.
+    trusted : (n,) poses that no doubt concerns; None = all.
     """
-    lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"]
+    lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording,trusted"]
     upper = np.triu_indices(3)
     owners = [0] * len(stamps) if recordings is None else recordings.tolist()
-    for stamp, matrix, recording in zip(stamps.tolist(), covariances, owners, strict=True):
-        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{recording + 1}")
+    sound = [True] * len(stamps) if trusted is None else trusted.tolist()
+    for stamp, matrix, recording, trust in zip(stamps.tolist(), covariances, owners, sound, strict=True):
+        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{recording + 1},{trust:d}")
     return "\n".join(lines) + "\n"
 
 
@@ -140,6 +144,9 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "recording": recording_figures(logs, result),
         "trusted": not result.doubts,
         "doubts": notices(result.doubts),
+        "doubted_stretches": [
+            {"recording": number, "start": first, "end": last} for number, first, last in result.doubted_stretches
+        ],
         "warnings": notices(result.warnings),
         "anchors": [{name: getattr(a, name) for name in _ANCHOR_FIELDS} for a in result.anchors],
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
@@ -169,7 +176,18 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
 
 def notices(found: Sequence[Finding]) -> list[dict[str, Any]]:
     """Return warnings or doubts as JSON-ready records."""
-    return [{"kind": n.kind, "text": n.text, "figures": n.figures} for n in found]
+    return [
+        {
+            "kind": n.kind,
+            "text": n.text,
+            "cure": n.cure,
+            "recording": n.recording,
+            "stretches": [list(span) for span in n.stretches],
+            "explained_by": list(n.explained_by),
+            "figures": n.figures,
+        }
+        for n in found
+    ]
 
 
 def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 | file | what |
 |---|---|
 | trajectory.tum | pose at every odometry stamp, map frame; trajectory_2.tum ... for further recordings |
-| trajectory_covariance.csv | stamp, covariance and recording of every keyframe |
+| trajectory_covariance.csv | stamp, covariance, recording and trust of every keyframe |
 | anchors.csv | anchors with sigmas, biases, shares of ranges used |
 | range_errors.csv | by how much each range was wrong, and where |
 | map.pgm, map.yaml | the map for map_server and nav2 |
@@ -108,8 +108,9 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     """
     with replacing_folder(folder, is_of_result) as waiting:
         _write_trajectories(waiting, result)
-        frames = (result.keyframe_stamps, result.keyframe_covariances, result.keyframe_recording)
-        write_text(waiting / "trajectory_covariance.csv", covariance_csv(*frames))
+        stamps, recording = result.keyframe_stamps, result.keyframe_recording
+        table = covariance_csv(stamps, result.keyframe_covariances, recording, result.trusted(stamps, recording))
+        write_text(waiting / "trajectory_covariance.csv", table)
         write_text(waiting / "anchors.csv", anchors_csv(result))
         if result.range_table:
             write_text(waiting / "range_errors.csv", range_errors_csv(result))
@@ -174,7 +175,10 @@ def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     kept = [(*poses[c.i, :2], *poses[c.j, :2]) for c in result.closures if c.accepted]
     anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors]
     closures = np.array(kept, dtype=np.float64).reshape(-1, 4)
-    return draw_map(result.grid, np.vstack(parts), anchors=anchors, closures=closures, caption=caption)
+    doubted = result.doubted_paths()
+    return draw_map(
+        result.grid, np.vstack(parts), anchors=anchors, closures=closures, doubted=doubted, caption=caption
+    )
 
 
 def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:

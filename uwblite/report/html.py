@@ -4,6 +4,7 @@ Everything that comes from a log (names of files and anchors, reasons) is escape
 from elsewhere, and its script reads only the page itself.
 """
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from html import escape as escape_markup
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..findings import Finding
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .page import PAGE, SCRIPT, STYLE
 from .printable import printable, sigma_text
@@ -71,10 +73,16 @@ def _banner(result: MapResult) -> str:
         ('"box bad" role=alert', "Do not trust this map before these are resolved:", result.doubts),
         ('"box warn"', "Worth knowing:", result.warnings),
     )
-    items = ((kind, head, "".join(f"<li>{escape(notice.text)}</li>" for notice in found)) for kind, head, found in boxes)
+    items = ((kind, head, "".join(_item(finding) for finding in found)) for kind, head, found in boxes)
     text = "".join(f"<div class={kind}><b>{head}</b><ul>{listed}</ul></div>" for kind, head, listed in items if listed)
     text = text or '<div class="box good">No warnings.</div>'
     return f'<section id="warnings">{text}</section>'
+
+
+def _item(finding: Finding) -> str:
+    """Return a finding as an item of a list: its text, and what to do, commands as code."""
+    cure = re.sub("`([^`]*)`", r"<code>\1</code>", escape(finding.cure))
+    return f"<li class={escape(finding.kind)}>{escape(finding.text)}{f'<br>{cure}' if cure else ''}</li>"
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:

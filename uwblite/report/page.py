@@ -47,6 +47,7 @@ pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wra
 #map-view{display:block;width:100%;max-height:80vh;touch-action:none;cursor:grab;background:#cdcdcd}
 image.grid{image-rendering:pixelated}
 .trajectory polyline{fill:none;stroke:@path@;stroke-width:calc(var(--s)*2px);stroke-linejoin:round}
+.trajectory .doubted{stroke:@doubted@;stroke-width:calc(var(--s)*7px);opacity:.6}
 .trajectory .s1{stroke:@path1@}.trajectory .s2{stroke:@path2@}.trajectory .s3{stroke:@path3@}
 .end{fill:#fff;stroke:@path@;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*3px)}
 .start{fill:@start@;stroke:#fff;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*1px)}
@@ -78,7 +79,8 @@ figure{margin:.6rem 0}figcaption{font-weight:600}
 def coloured(style: str) -> str:
     """Return a style with the palette's colours in place of their names, such as @path@ and @path-dark@."""
     names = {
-        "path": palette.PATH, "accepted": palette.ACCEPTED, "rejected": palette.REJECTED, "anchor": palette.ANCHOR,
+        "path": palette.PATH, "doubted": palette.DOUBTED,
+        "accepted": palette.ACCEPTED, "rejected": palette.REJECTED, "anchor": palette.ANCHOR,
         "start": palette.START, "nlos": palette.NLOS, **{f"path{k}": c for k, c in enumerate(palette.PATHS)},
     }  # fmt: skip
     for name, colour in names.items():

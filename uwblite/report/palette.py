@@ -9,6 +9,8 @@ ACCEPTED: Colour = (234, 120, 20)
 REJECTED: Colour = (138, 147, 160)
 ANCHOR: Colour = (208, 28, 60)
 START: Colour = (22, 150, 80)
+DOUBTED: Colour = (250, 190, 20)
+"""Stretches of a path that are not to be trusted."""
 NLOS: Colour = (216, 27, 96)
 """Ranges that do not agree with the map."""
 

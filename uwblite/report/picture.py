@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
-from .palette import ACCEPTED, ANCHOR, PATHS, START
+from .palette import ACCEPTED, ANCHOR, DOUBTED, PATHS, START
 from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
 
 Image = NDArray[np.uint8]
@@ -45,6 +45,7 @@ def draw_map(
     *,
     anchors: Sequence[PictureAnchor] = (),
     closures: Floats | None = None,
+    doubted: Sequence[Floats] = (),
     caption: str = "",
     size: int = 1400,
     colours: Image | None = None,
@@ -58,6 +59,7 @@ def draw_map(
         which have colours of their own.
     anchors : those to draw; positions that are not finite are left out.
     closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
+    doubted : (n, 2) x, y along each stretch of the path that is not to be trusted, m.
     size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
     colours : (rows, cols, 3) of the cells; None = `shaded`.
 
@@ -74,6 +76,7 @@ def draw_map(
     width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
     tracks = _recordings(path)
     keys = _legend(len(tracks), bool(placed), any(a.covariance is not None for a in placed), closures)
+    keys += [Key("not to be trusted", DOUBTED, "line")] if doubted else []
     image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
@@ -89,6 +92,8 @@ def draw_map(
         canvas.lines(ends, 1.3, ACCEPTED, 0.75)
     for number, track in enumerate(map(pixel, tracks)):
         _draw_track(canvas, track, PATHS[number % len(PATHS)])
+    for stretch in doubted:
+        canvas.polyline(pixel(stretch), 6.0, DOUBTED, 0.6)
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)
     draw_foot(image, height, scale, caption, keys)

@@ -76,6 +76,8 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     for recording in np.unique(result.recording):
         path = result.trajectory[result.recording == recording, :2]
         parts.append(f'<polyline class="s{int(recording) % 4}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
+    for path in result.doubted_paths():
+        parts.append(f'<polyline class="doubted" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
     recordings = np.unique(result.recording).tolist()
     parts += [_end_marks(result, recording, size) for recording in recordings]
     parts.append("</g>")
@@ -92,6 +94,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
     buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
     unclear = "orange triangle: an anchor that is not certain; " if any(a.status != "ok" for a in result.anchors) else ""
+    unclear += "yellow: a stretch that is not to be trusted; " if result.doubted_stretches else ""
     words = f"Green: start; ring: end; {unclear}wheel or pinch zooms, dragging moves; point at things for details."
     paths = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
     hint = f'<p class=hint><output id="place"></output>{paths}{words}</p>'
