@@ -19,22 +19,45 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def source(tmp_path_factory):
+    """Folder with a copy of what git knows."""
+    folder = tmp_path_factory.mktemp("source")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
+    for name in filter(None, listed.split("\0")) if listed else pytest.skip("no git checkout: what is built is not known"):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(source, tmp_path_factory):
     """Folder with wheel and sdist, built from a copy of the sources."""
     for package in ("build", "setuptools", "wheel"):
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is absent")
-    source = tmp_path_factory.mktemp("source")
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
-    for name in filter(None, listed.split("\0")) if listed else pytest.skip("no git checkout: what is built is not known"):
-        if (ROOT / name).is_file():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, source / name)
     out = tmp_path_factory.mktemp("dist")
     subprocess.run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(source)], check=True, capture_output=True
     )
     return out
+
+
+def test_debians_own_tools_build_the_wheel_without_the_network(source, tmp_path):
+    """setuptools 66 of Debian 12 knows no `license` that is a string; the document's command is the one that is run."""
+    python = shutil.which("python3", path="/usr/bin")
+    code = "from importlib.util import find_spec; import sys; sys.exit(not all(map(find_spec, ('pip', 'setuptools', 'wheel'))))"
+    if python is None or subprocess.run([python, "-c", code], check=False).returncode:
+        pytest.skip("the system's Python has no pip, setuptools and wheel")
+    text = (ROOT / "docs" / "getting_started.md").read_text()
+    (words,) = re.findall(r"^python3 -m (pip wheel .*)$", text, re.MULTILINE)
+    copy, built = shutil.copytree(source, tmp_path / "copy"), tmp_path / "copy" / "out"
+    done = subprocess.run([python, "-m", *words.split(), "--no-index"], cwd=copy, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        assert "uwblite/py.typed" in packed.namelist()
+        assert any(n.endswith("LICENSE") for n in packed.namelist())
 
 
 def test_the_wheel_is_pure_and_complete(built):

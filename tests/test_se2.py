@@ -61,7 +61,7 @@ def test_transform_follows_compose(a, b, p):
 def test_points_of_several_poses_are_transformed_as_one_by_one(monkeypatch, at_once):
     monkeypatch.setattr(se2, "_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
-    poses, owner, points = rng.normal(size=(7, 3)) * 4.0, rng.integers(7, size=50), rng.normal(size=(50, 2))
+    poses, owner, points = rng.normal(size=(7, 3)) * 4.0, rng.integers(7, size=50, dtype=np.intp), rng.normal(size=(50, 2))
     one_by_one = np.array([se2.transform(poses[k], p) for k, p in zip(owner, points, strict=True)])
     np.testing.assert_allclose(se2.transform_each(poses, owner, points), one_by_one, rtol=1e-13, atol=1e-13)
 

@@ -54,6 +54,18 @@ def test_where_the_library_has_no_such_function_nothing_happens(monkeypatch):
     freed_memory.FreedMemory().give_back(over=True)
 
 
+def test_without_proc_it_is_given_back_where_a_stage_is_over(monkeypatch, tmp_path):
+    trimmed = []
+    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(freed_memory, "_OF_STATM", str(tmp_path / "statm"))
+    freed = freed_memory.FreedMemory()
+    freed.give_back(over=False)
+    freed.give_back(over=True)
+    (tmp_path / "statm").write_text("no numbers")
+    freed.give_back(over=True)
+    assert trimmed == [0, 0]
+
+
 def test_memory_is_given_back_within_and_between_the_stages_of_a_map(monkeypatch, room_log, tmp_path):
     times = []
     monkeypatch.setattr(freed_memory.FreedMemory, "give_back", lambda self, *, over: times.append(over))

@@ -26,8 +26,8 @@ def near(seed):
     rng = np.random.default_rng(seed)
     graph, _ = every_kind(seed)
     poses, anchors, e = graph.poses, graph.anchors, 8
-    i = rng.integers(0, 6, e)
-    j, a = (i + rng.integers(1, 6, e)) % 6, rng.integers(0, 3, e)
+    i = rng.integers(0, 6, e, dtype=np.intp)
+    j, a = (i + rng.integers(1, 6, e, dtype=np.intp)) % 6, rng.integers(0, 3, e, dtype=np.intp)
 
     def noisy(values):
         return values + rng.normal(scale=0.2, size=values.shape)

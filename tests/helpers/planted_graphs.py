@@ -33,8 +33,8 @@ def every_kind(seed, calibrated=True, edges=8):
         (),
         Calibration(tuple(map(UnknownKey, every)), rng.normal(scale=0.1, size=len(every))),
     )
-    i = rng.integers(0, n, e)
-    j = (i + rng.integers(1, n, e)) % n
+    i = rng.integers(0, n, e, dtype=np.intp)
+    j = (i + rng.integers(1, n, e, dtype=np.intp)) % n
     poses, L = random_poses(rng, e, 1.0), rng.normal(size=(e, 3, 3))
 
     def which(*columns):
@@ -48,7 +48,7 @@ def every_kind(seed, calibrated=True, edges=8):
         "scan": ScanEdges(i, j, poses, L, rng.normal(size=(e, 3)), rng.normal(size=(e, 3)), laser, 0.3),
         "range": RangeEdges(
             pose=i,
-            anchor=rng.integers(0, a, e),
+            anchor=rng.integers(0, a, e, dtype=np.intp),
             ranges=rng.uniform(1.0, 4.0, e),
             sigma=rng.uniform(0.1, 1.0, e),
             lever_arm=rng.normal(size=(e, 2)),
@@ -58,9 +58,11 @@ def every_kind(seed, calibrated=True, edges=8):
             height=rng.uniform(size=e),
             calibration=which(8, 9, 10, 11, 12, 13),
         ),
-        "landmark": LandmarkEdges(i, rng.integers(0, a, e), rng.normal(size=(e, 2)), rng.normal(size=(e, 2, 2))),
+        "landmark": LandmarkEdges(i, rng.integers(0, a, e, dtype=np.intp), rng.normal(size=(e, 2)), rng.normal(size=(e, 2, 2))),
         "prior on poses": PriorEdges("poses", i, poses, L),
-        "prior on anchors": PriorEdges("anchors", rng.integers(0, a, e), rng.normal(size=(e, 2)), rng.normal(size=(e, 2, 2))),
+        "prior on anchors": PriorEdges(
+            "anchors", rng.integers(0, a, e, dtype=np.intp), rng.normal(size=(e, 2)), rng.normal(size=(e, 2, 2))
+        ),
         "prior on calibration": PriorEdges("calibration", i, rng.normal(size=(e, 1)), rng.uniform(size=(e, 1, 1))),
         "distance of anchors": AnchorDistanceEdges(i % a, (i + 1) % a, rng.uniform(1.0, 4.0, e), rng.uniform(0.1, 1.0, e)),
         "distance of points": PointDistanceEdges(

@@ -22,7 +22,7 @@ def drive(seed, pattern):
     angle = np.arange(n) * 4.0 * np.pi / n
     heading = np.arctan2(8.0 * np.cos(2.0 * angle), 6.0 * np.cos(angle))
     truth = np.column_stack([6.0 * np.sin(angle), 4.0 * np.sin(2.0 * angle), heading])
-    pose, anchor = np.arange(n), rng.integers(len(ANCHORS), size=n)
+    pose, anchor = np.arange(n), rng.integers(len(ANCHORS), size=n, dtype=np.intp)
     way = ANCHORS[anchor] - truth[:, :2]
     late = pattern(se2.wrap_angle(se2.bearing(way) - truth[:, 2]))
     ranges = plain_ranges(pose, anchor, np.hypot(*way.T) + late + NOISE * rng.standard_normal(n), NOISE)

@@ -39,8 +39,11 @@ def _trim() -> Callable[[int], Any] | None:
 
 
 def _resident() -> int:
-    """Return the memory of this process, bytes."""
+    """Return the memory of this process, bytes; 0 where it is not known, as where /proc is not mounted."""
     import os
 
-    with open(_OF_STATM, encoding="ascii") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    try:
+        with open(_OF_STATM, encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
