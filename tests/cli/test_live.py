@@ -108,7 +108,7 @@ def test_devices_on_serial_ports_say_where_the_robot_is(circle, capsys):
 def test_a_silent_lidar_is_named_and_ranges_go_on(circle, capsys):
     circle[1]["lidar"] = Mute()
     code, found, err, truth = driven(circle, 45.0, ("base", "lidar", "uwb"), capsys)
-    assert "nothing from lidar for 5 s; the pose rests on ranges and odometry" in err
+    assert "nothing from lidar for 6 s; the pose rests on ranges and odometry" in err
     assert "Traceback" not in err
     assert code == 0, found[-1]
     assert np.hypot(*(np.array(found[-1]["pose"]) - truth[-1])[:2]) < 0.3
@@ -195,6 +195,21 @@ def test_a_room_is_known_from_its_folder_as_from_its_parts(room):
     read, made = from_result(read_result(room[0])), known()
     np.testing.assert_allclose(read.anchors.positions, made.anchors.positions)
     np.testing.assert_allclose(read.walls.points, made.walls.points, atol=1e-9)
+
+
+def test_a_log_that_no_longer_grows_makes_the_pose_old_and_then_lost(room, capsys):
+    folder, log, _ = room
+    words = ["localize", str(log), "--live", "--map", str(folder), "--idle", "3.2", "--late", "0.2", "--lost-after", "1.5"]
+    assert main(words) == 3
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    old = [line for line in found if line["age"]]
+    assert not old[0]["lost"]
+    assert old[-1]["lost"]
+    assert old[-1]["reason"].startswith("no data for")
+    assert old[-1]["quality"] == 0.0
+    assert old[-1]["covariance"][0][0] > old[0]["covariance"][0][0] > found[-len(old) - 1]["covariance"][0][0]
+    assert err.count("warning: no data for") == 1
 
 
 def test_the_page_shows_the_map_and_the_robot_on_it(room, capsys, monkeypatch):

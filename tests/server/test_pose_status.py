@@ -45,3 +45,16 @@ def test_a_log_that_begins_again_is_shown_at_once():
     status = PoseStatus()
     status.take(replace(KNOWN, stamp=1e6))
     assert status.take(KNOWN) is not None
+
+
+def test_silence_is_shown_at_once_with_the_age_of_the_pose():
+    status = PoseStatus()
+    assert status.nothing["advice"]
+    status.take(KNOWN)
+    deaf = status.take(replace(KNOWN, stamp=10.5, silent={"uwb": 6.2}))
+    assert deaf["advice"] == ["nothing from uwb for 6 s: the pose rests on scans and odometry"]
+    old = status.take(replace(KNOWN, age=3.0, silent={"uwb": 9.2, "odometry": 3.0}))
+    assert "3 s old" in old["advice"][0]
+    assert "3 s old" in old["summary"]
+    assert not old["late"]
+    assert status.take(replace(KNOWN, age=12.0, lost=True, reason="no data for 12 s"))["late"]

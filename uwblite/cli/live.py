@@ -24,6 +24,10 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--live", action="store_true", help="follow the log, or devices, and say the pose as it becomes known")
     group.add_argument("--rate", metavar="HZ", type=number(above=0), default=10.0, help="lines per second of driving (10)")
     group.add_argument("--idle", metavar="S", type=number(above=0), help="end when the log has not grown for so long (never)")
+    late = "without data of a sensor for so long, and three of its periods, it is said to be silent (2)"
+    group.add_argument("--late", metavar="S", type=number(above=0), default=2.0, help=late)
+    lost = "without any data for so long the pose counts as lost (10)"
+    group.add_argument("--lost-after", metavar="S", type=number(above=0), default=10.0, help=lost)
     page = "show the pose on the map, on a page for this computer; an address opens it to others, such as 0.0.0.0:8000"
     group.add_argument("--serve", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
     for name, form in (("odometry", "NAME:PORT"), ("lidar", "[NAME:]PORT"), ("uwb", "[NAME:]PORT"), ("gyro", "NAME:PORT")):
@@ -61,11 +65,11 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
         if devices:
             from .live_devices import record_into
 
-            record_into(args, tracker.take, lambda: bool(stopped))
+            record_into(args, tracker.take, lambda: bool(stopped), tracker.wait)
         else:
             pieces = _stdin() if args.log == "-" else _growing(args.log, args.idle, lambda: bool(stopped))
             for data in pieces:
-                tracker.take(data)
+                tracker.take(data) if data else tracker.wait()
                 if stopped:
                     break
     finally:
@@ -78,11 +82,16 @@ class Tracker:
     """From pieces of a log to lines on stdout."""
 
     def __init__(self, known: "KnownMap", args: argparse.Namespace) -> None:
-        from ..localization.live_feed import LiveFeed
+        import time
+
+        from ..localization.live_feed import LiveFeed, Patience
 
         self.state: LocalizerState | None = None
         self.on_state: Callable[[LocalizerState], None] = lambda _: None
-        self._feed = LiveFeed(known, lambda own: mounted(own, args), lambda line: console.note(f"uwblite: {line}"))
+        patience = Patience(args.late, args.lost_after)
+        self._feed = LiveFeed(known, lambda own: mounted(own, args), lambda line: console.note(f"uwblite: {line}"), patience)
+        self._clock = time.monotonic
+        self._heard = self._waited = self._clock()
         self._period = 0.999 / args.rate
         self._said, self._was_lost = -float("inf"), True
 
@@ -90,13 +99,24 @@ class Tracker:
         """Use a piece of the log."""
         for state in self._feed.take(data):
             self._say(state)
+        self._heard = self._clock()
+
+    def wait(self) -> None:
+        """Say how old the pose is, once a second, where nothing comes."""
+        now = self._clock()
+        if now - max(self._waited, self._heard) < _WAITING:
+            return
+        self._waited = now
+        for state in self._feed.wait(now - self._heard):
+            self._say(state)
 
     def _say(self, state: "LocalizerState") -> None:
         self.state = state
         if not state.stamp > -float("inf"):
             return
         self.on_state(state)
-        if self._said <= state.stamp < self._said + self._period and state.lost == self._was_lost:
+        soon = self._said <= state.stamp < self._said + self._period and state.lost == self._was_lost
+        if soon and not state.age:
             return
         self._said, self._was_lost = state.stamp, state.lost
         console.say_lines(line_of(state))
@@ -124,6 +144,7 @@ def _shown(result: "StoredResult", tracker: Tracker, where: tuple[str, int] | No
 
     page, status = LivePage(f"uwblite localize: {result.folder.name}"), PoseStatus()
     page.show_map(result, paths=False)
+    page.show_status(status.nothing)
 
     def show(state: "LocalizerState") -> None:
         if (news := status.take(state)) is not None:
@@ -145,12 +166,15 @@ def line_of(state: "LocalizerState") -> str:
         "covariance": [[float(f"{v:.4g}") for v in row] for row in state.covariance.tolist()],
         "quality": round(state.quality, 3),
         "lost": state.lost,
+        "age": round(state.age, 1),
         "odometry": [round(v, 5) for v in state.odometry.tolist()],
     }
     if state.reason:
         fields["reason"] = state.reason
     if len(state.alternatives):
         fields["alternatives"] = [[round(v, 3) for v in row] for row in state.alternatives[:_MOST_ALTERNATIVES].tolist()]
+    if state.silent:
+        fields["silent"] = {name: round(age, 1) for name, age in state.silent.items()}
     if state.moved_anchors:
         fields["moved_anchors"] = list(state.moved_anchors)
     return json.dumps(console.plain(fields), allow_nan=False)
@@ -168,18 +192,24 @@ def _tell_map(known: "KnownMap") -> None:
 
 
 def _stdin() -> Iterator[bytes]:
-    """Yield what standard input holds, as it comes."""
+    """Yield what standard input holds, as it comes, and nothing from time to time where nothing comes."""
     import os
+    import select
 
     from ..io.source import open_input
 
     stream = open_input("-")
-    while data := os.read(stream.fileno(), 1 << 16):
-        yield data
+    while True:
+        if not select.select([stream], [], [], _WAITING)[0]:
+            yield b""
+        elif data := os.read(stream.fileno(), 1 << 16):
+            yield data
+        else:
+            return
 
 
 def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Iterator[bytes]:
-    """Yield what a log holds and what is added to it."""
+    """Yield what a log holds and what is added to it, and nothing where nothing is."""
     import time
 
     from ..io.growing_file import GrowingFile
@@ -197,6 +227,7 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
                 continue
             if idle is not None and quiet >= idle:
                 return
+            yield b""
             sys.stdout.flush()
             time.sleep(_PAUSE)
             quiet += _PAUSE
@@ -204,5 +235,5 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
         file.close()
 
 
-_PAUSE = 0.05
-"""s between looks at a log that does not grow."""
+_PAUSE, _WAITING = 0.05, 1.0
+"""s between looks at a log that does not grow, and between lines that say how old the pose is."""

@@ -32,10 +32,12 @@ class LinesTo(LogFile):
         """Nothing is open."""
 
 
-def record_into(args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool]) -> None:
-    """Read devices until asked to stop, and hand on what `uwblite record` would write."""
+def record_into(
+    args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool], wait: Callable[[], None]
+) -> None:
+    """Read devices until asked to stop, and hand on what `uwblite record` would write; wait is called meanwhile."""
     links = device_links(args)
     offset = time.time() - time.monotonic()
     recorder = Recorder(links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset, host=host_name(), on_note=show_note)
     recorder.begin([])
-    recorder.run(duration=None, stopping=stopping)
+    recorder.run(duration=None, stopping=stopping, on_status=wait)

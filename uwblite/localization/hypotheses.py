@@ -28,7 +28,7 @@ FIRST_ANCHOR = LASER + 1
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 LASER_SIGMA = 0.02
-"""rad, its prior standard deviation: screws a few centimetres apart, each within a millimetre. A map may be of another robot."""
+"""rad, its prior standard deviation: screws some centimetres apart, each within a millimetre. A map may be another robot's."""
 SLOW_SIGMA = 0.12
 """m; common error of ranges to one anchor, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
 SLOW_LEFT = 0.08
@@ -158,10 +158,10 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: 
     Notes
     -----
     The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
-    information I and the scan's H and gradient, and transferred to the state by its covariance with it. Along an aisle H comes from the scatter
-    of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would seem to measure a direction that none has
-    measured. Until the pose is certain it is kept, since a search has compared the places along the aisle and another one must
-    agree before any is accepted; without it a robot beside a single wall is found late.
+    information I and the scan's H and gradient, and transferred to the state by its covariance with it. Along an aisle H comes
+    from the scatter of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would seem to measure a
+    direction that none has measured. Until the pose is certain it is kept, since a search has compared the places along the
+    aisle and another one must agree before any is accepted; without it a robot beside a single wall is found late.
     """
     if not len(bank):
         return bank

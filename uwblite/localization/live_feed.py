@@ -1,24 +1,36 @@
 """Live localisation from a log while it is written: mounting of the sensors, and reports of silent sensors."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan, Measured
 from ..sensor_log import SensorMounting
 from .known_map import KnownMap
-from .localizer import Localizer
+from .localizer import UNSEEN_SPEED, Localizer
 from .records import LocalizerState, Scanner
+from .silence import Silence
 
 _NO_LIDAR = 2.0
 """s after which a robot counts as one without lidar."""
-_SILENCE = 5.0
-"""s."""
-_SENSORS = {
+CONSEQUENCES = {
     "odometry": "the pose is held and becomes unsure",
     "lidar": "the pose rests on ranges and odometry",
     "uwb": "the pose rests on scans and odometry",
     "gyro": "directions are the wheels' own",
 }
 """The consequence of each silent sensor; a gyro is reported only where one sent before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long nothing may come."""
+
+    late: float = 2.0
+    """s, and three periods, after which a sensor, or the whole log, is said to be silent."""
+    lost: float = 10.0
+    """s without any data after which the pose counts as lost."""
 
 
 class LiveFeed:
@@ -30,14 +42,16 @@ class LiveFeed:
     """
 
     def __init__(
-        self, known: KnownMap, mounting: Callable[[SensorMounting], SensorMounting], note: Callable[[str], None]
-    ) -> None:
-        self._known, self._mounting, self._note = known, mounting, note
+        self, known: KnownMap, mounting: Callable[[SensorMounting], SensorMounting], note: Callable[[str], None],
+        patience: Patience | None = None,
+    ) -> None:  # fmt: skip
+        self._known, self._mounting, self._note, self._patience = known, mounting, note, patience or Patience()
         self._reader = LiveReader()
         self._localizer: Localizer | None = None
         self._early: list[Measured] = []
-        self._seen: dict[str, float] = {}
-        self._silent: set[str] = set()
+        self.silence = Silence(self._patience.late, tuple(name for name in CONSEQUENCES if name != "gyro"))
+        self._reported: set[str] = set()
+        self._stopped = False
         self._sees = False
 
     def take(self, data: bytes) -> Iterator[LocalizerState]:
@@ -51,6 +65,17 @@ class LiveFeed:
             # The log contains the mounting before the first scan; or no scan comes for so long.
             if isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR:
                 yield from self._begin()
+
+    def wait(self, quiet: float) -> Iterator[LocalizerState]:
+        """Yield the state where nothing has come for so long, s, once that is too long."""
+        if not self.silence.all_late(quiet):
+            return
+        yield from self._begin()
+        if not self._stopped:
+            self._stopped = True
+            self._note(f"warning: no data for {quiet:.0f} s: the pose becomes old; is the recorder still running?")
+        if self._localizer is not None:
+            yield self._aged(self._localizer.state(), quiet)
 
     def end(self) -> Iterator[LocalizerState]:
         """Use the measurements that still wait, yield the states, and report what was left out."""
@@ -72,31 +97,41 @@ class LiveFeed:
 
     def _use(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
         if isinstance(measured, LiveOdometry):
-            yield localizer.add_odometry(measured.stamp, *measured.pose.tolist())
+            yield self._aged(localizer.add_odometry(measured.stamp, *measured.pose.tolist()))
         elif isinstance(measured, LiveGyro):
             localizer.add_gyro(measured.stamp, measured.heading)
         elif isinstance(measured, LiveRange):
-            yield localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag)
+            yield self._aged(localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag))
         else:
-            if not self._sees and localizer.scanner is None and "lidar" in self._silent:
+            if not self._sees and localizer.scanner is None and "lidar" in self._reported:
                 # It comes late: only now the log has said where the laser sits.
                 self._localizer = localizer = Localizer(self._known, self._mounting(self._reader.mounting))
             self._sees = True
             s = measured.scans
             scanner = Scanner(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
-            yield localizer.add_scan(measured.stamp, s.ranges[0], scanner)
+            yield self._aged(localizer.add_scan(measured.stamp, s.ranges[0], scanner))
 
     def _watch(self, measured: Measured) -> None:
-        """Report once when a sensor that was there, or should be, becomes silent."""
+        """Report once when a sensor that was there, or should be, becomes silent, and when it is back."""
         kind = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}.get(type(measured), "lidar")
-        now = measured.order if self._localizer is None else self._localizer.on_time(measured.order)
-        if not self._seen:
-            self._seen = {name: now for name in _SENSORS if name != "gyro"}
-        self._seen[kind] = max(self._seen.get(kind, now), now)
-        if kind in self._silent:
-            self._silent.discard(kind)
-            self._note(f"{kind} is back")
-        for other, last in self._seen.items():
-            if now - last > _SILENCE and other not in self._silent:
-                self._silent.add(other)
-                self._note(f"warning: nothing from {other} for {_SILENCE:.0f} s; {_SENSORS[other]}")
+        if self._stopped:
+            self._stopped = False
+            self._note("data come again")
+        self.silence.hear(kind, measured.order if self._localizer is None else self._localizer.on_time(measured.order))
+        silent = self.silence.silent()
+        for name in sorted(self._reported - set(silent)):
+            self._note(f"{name} is back")
+        for name in sorted(set(silent) - self._reported):
+            self._note(f"warning: nothing from {name} for {silent[name]:.0f} s; {CONSEQUENCES[name]}")
+        self._reported = set(silent)
+
+    def _aged(self, state: LocalizerState, quiet: float = 0.0) -> LocalizerState:
+        """Return a state with the silence of the sensors, where nothing at all has come for so long, s."""
+        silent = self.silence.silent(quiet)
+        if not quiet:
+            return replace(state, silent=silent) if silent else state
+        drift = np.diag(np.full(3, (UNSEEN_SPEED * quiet) ** 2))
+        state = replace(state, age=quiet, silent=silent, covariance=state.covariance + drift)
+        if quiet <= self._patience.lost:
+            return state
+        return replace(state, lost=True, quality=0.0, reason=f"no data for {quiet:.0f} s")

@@ -25,7 +25,7 @@ from .sensor_clock import JUMP, SensorClock
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""
-_UNSEEN_SPEED = 0.3
+UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
 _SET_BACK, _IN_A_ROW = 0.5, 4
 """s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
@@ -210,7 +210,7 @@ class Localizer:
         gap = latest - self._odometer.stamp
         if gap > self._patience:
             self._odometer.add(latest - 0.1, self._odometer.pose.copy())
-            self._estimator.wander(_UNSEEN_SPEED * min(gap, 3.0))
+            self._estimator.wander(UNSEEN_SPEED * min(gap, 3.0))
 
     def _use_range(self, entry: Range, stamp: float, then: Floats) -> None:
         anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor

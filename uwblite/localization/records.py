@@ -49,3 +49,7 @@ class LocalizerState:
     """(k, 3) other poses that are possible, the likeliest first."""
     moved_anchors: tuple[str, ...] = ()
     """Anchors whose ranges have disagreed for long with a pose on which all other measurements agree."""
+    age: float = 0.0
+    """s since anything was measured at all, where that is too long."""
+    silent: dict[str, float] = field(default_factory=dict)
+    """Sensors that send nothing while they should, and for how long, s."""

@@ -243,7 +243,7 @@ _ONE_SIDE = 0.1
 
 
 def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Return the lower left corner (2,) of a table around points (n, 2), m, and the nearest point of each of its cells (x, y)."""
+    """Return the corner (2,) of a table around points (n, 2), m, and the nearest point of each of its cells (x, y)."""
     origin = points.min(axis=0) - REACH - cell
     wide, high = (np.ceil((points.max(axis=0) + REACH - origin) / cell).astype(int) + 1).tolist()
     holder = np.full((wide, high), -1, dtype=np.int32)

@@ -77,7 +77,7 @@ function anchors() {
 function status() {
   at("summary").textContent = [now.summary, now.rounds].filter(Boolean).join(" · ");
   const box = at("advice"), list = now.advice || [];
-  box.className = list.length ? "advice" : "fine";
+  box.className = now.late ? "late" : list.length ? "advice" : "fine";
   box.replaceChildren(list.length ? el("ol", {}, ...list.map(t => el("li", {}, t)))
     : el("div", {}, now.fine || "Nothing to do: go on driving."));
   const sensors = now.sensors || [];
