@@ -47,9 +47,10 @@ DEVICES = {
     **{name: ("uwb", f"uwb-line:port?{LINES}" if name == "line" else f"{name}:port") for name in BOARDS if name != "line"},
     "uwb-line": ("uwb", f"uwb-line:port?{LINES}"),
 }  # fmt: skip
-LINKS = ("whole", "bytes", "noise", "loss", "replug", "reset", "slow")
+PAUSES = {f"{kind}-{seconds:g}": (kind, seconds) for kind in ("stop", "pause") for seconds in (0.3, 0.6, 6.0)}
+LINKS = ("whole", "bytes", "noise", "loss", "replug", "reset", "slow", *PAUSES)
 """As it comes; byte by byte; 1 byte in 2,000 changed; 1 in 2,000 lost; the cable pulled for 3 s; the device's clock or the
-device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter."""
+device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter; the host stopped, or the bytes held back, so many s."""
 HALFWAY = 0.5
 STEP, PAUSE = 0.02, 0.25
 """m or rad by which a pose may leave the truth from one reading to the next; s, of a gyro."""
@@ -228,6 +229,7 @@ def trial(name, link, seconds, seed=0):
         "bytes": {"piece": 1}, "noise": {"line": FaultyLine([parse_fault("noise=0.0005@3")], seed)},
         "loss": {"line": FaultyLine([parse_fault("drop=0.0005@3")], seed)}, "replug": {"replug": (HALFWAY * seconds, 3.0)},
         "slow": {"latency": 0.040, "tick": 0.016},
+        **{key: {kind: (HALFWAY * seconds, length)} for key, (kind, length) in PAUSES.items()},
     }.get(link, {})  # fmt: skip
     jitter = (lambda: rng.uniform(0, 0.010)) if link == "slow" else (lambda: rng.expovariate(1000.0))
     actions, _ = simulate(session, device, seconds, jitter=jitter, **options)

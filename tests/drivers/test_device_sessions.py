@@ -255,6 +255,7 @@ def test_tag_by_tlv_from_every_state(options):
     assert len(of_kind(actions, RangeEpoch)) > 150
     check_ranges(actions, sent, 1, 0.005)
     assert not of_kind(actions, Lost)
+    assert len(of_kind(actions, Corrupt)) <= 2 * bool(options.get("stream"))
     assert ("uwb-stream-left" in names(actions)) == ("stream" in options)
     assert {p.name: p.value for p in of_kind(actions, Param)}["uwb_tag_id"] == "1512"
 
@@ -265,6 +266,7 @@ def test_tag_by_shell_from_every_state(options):
     actions, reopens = simulate(Dwm1001Driver(shell=True), device, 20.0)
     assert reopens == 0
     assert len(of_kind(actions, RangeEpoch)) > 120
+    assert len(of_kind(actions, Corrupt)) <= 2 * bool(options.get("stream"))
     check_ranges(actions, sent, 10, 0.01)
 
 
@@ -331,6 +333,19 @@ def test_bytes_that_no_tag_sends_are_told_from_silence():
         now = round(now + 0.1, 1)
         actions += [*session.feed(b"\xf8\x00\x86\xfe\x1e", now), *session.tick(now)]
     assert [action.name for action in actions if isinstance(action, Note)] == ["uwb-unreadable"]
+
+
+@pytest.mark.parametrize("shell", [False, True])
+@pytest.mark.parametrize("seconds", [1.0, 10.0])
+def test_random_bytes_count_as_corrupt_in_either_mode_known_or_not(shell, seconds):
+    rng, session = random.Random(0), Session(Dwm1001Driver(shell=shell))
+    actions, now = session.start(START), START
+    while now < START + seconds:
+        now = round(now + 0.05, 2)
+        actions += [*session.feed(rng.randbytes(200), now), *session.tick(now)]
+    actions += session.stop()
+    assert sum(isinstance(action, Corrupt) for action in actions) >= 20 * seconds
+    assert not [action for action in actions if isinstance(action, RangeEpoch)]
 
 
 def test_tag_that_leaves_its_shell_in_mid_run_is_started_again_soon():

@@ -158,6 +158,16 @@ def test_a_base_that_was_switched_on_again_holds_its_pose():
     assert pose.stamp == pytest.approx(9.02)
 
 
+def test_a_base_whose_clock_leaps_while_its_wheels_count_on_did_not_restart():
+    """20 s of packets are lost, after 20 s in which the link held back those before: the base drives on at 0.2 m/s."""
+    step = 0.2 * 0.02 / kobuki.TICK
+    first = [feedback(k, 9000 + round(step * k), 9000 + round(step * k), 0.0) for k in range(50)]
+    late = [feedback(k, 9000 + round(step * k), 9000 + round(step * k), 0.0, stamp=1 + 1e-3 * k) for k in range(1000, 1050)]
+    actions = drive([*first, *late])
+    assert not [note for note in actions if isinstance(note, Note) and "restarted" in note.text]
+    assert poses(actions)[-1].x - poses(actions)[50].x == pytest.approx(0.2 * 0.02 * 49, abs=0.01)
+
+
 def test_a_part_that_comes_twice_counts_once():
     """Damage whose sum is right by chance makes another part out of two; the basic data have their length by the head."""
     (packet,) = packets(1)

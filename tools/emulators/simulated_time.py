@@ -4,11 +4,12 @@ import math
 
 from uwblite.drivers.events import Reopen, Send, SetBaud
 from uwblite.drivers.session import Session
+from uwblite.drivers.transport import CHUNK
 
 
 def simulate(
     session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0, tick=0.0,
-    replug=None, piece=1 << 20,
+    replug=None, piece=1 << 20, pause=None, stop=None,
 ):  # fmt: skip
     """Run a session, or a driver's, against an emulated device in simulated time, with a fault line between them.
 
@@ -17,6 +18,7 @@ def simulate(
     latency : s of a round trip without the device.
     jitter : s that bytes take to the host, called for each piece.
     replug : (s, s); when the cable is pulled, and for how long.
+    pause, stop : (s, s); when the link holds back all bytes, or the host does nothing, and for how long.
     piece : bytes that reach the host at once, at most.
     tick : s; bytes reach the host in steps of this length, as an FTDI adapter delivers them.
 
@@ -28,6 +30,7 @@ def simulate(
     session = session if isinstance(session, Session) else Session(session)
     now, end = start, start + seconds
     actions, to_host, to_device, reopens = [], [], [], 0
+    held, stopped = [(start + span[0], start + sum(span)) if span else (end, end) for span in (pause, stop)]
     device.power_up(now)
 
     def put(queue, data, due, rate=None):
@@ -36,6 +39,7 @@ def simulate(
         for at in range(0, len(data), size):
             part = data[at : at + size]
             due = max(due, queue[-1][0] if queue else due) + (10 * len(part) / rate if rate else 0.0)
+            due = held[1] if held[0] <= due < held[1] else due
             queue.append((math.ceil(due / tick) * tick if tick and queue is to_host else due, part))
 
     def do(new):
@@ -68,8 +72,13 @@ def simulate(
         put(to_host, device.advance(now), now + jitter(), rate)
         while to_device and to_device[0][0] <= now:
             put(to_host, device.receive(to_device.pop(0)[1], now), now + latency / 2 + jitter(), rate)
+        if stopped[0] <= now < stopped[1]:
+            now = min([now + 0.05, stopped[1], max(now, device.next_time(now))]) + step / 10
+            continue
         while to_host and to_host[0][0] <= now:
             data = to_host.pop(0)[1]
+            while to_host and to_host[0][0] <= now and piece > CHUNK > len(data) + len(to_host[0][1]):
+                data += to_host.pop(0)[1]  # one read
             if line is not None:
                 data = line.pass_on(data, now - start)
             if data:

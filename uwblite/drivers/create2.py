@@ -98,6 +98,10 @@ class Create2Driver(BaseDriver):
         super().begin()
         self._new_clock()
 
+    def spacing(self, event: Encoders | Corrupt) -> float | None:
+        """Return the time between two frames, s."""
+        return PERIOD if isinstance(event, Encoders) else None
+
     def script(self) -> Script[None]:
         """Ask for the stream, again whenever it stops: the robot falls asleep after five minutes, or was switched off."""
         while True:

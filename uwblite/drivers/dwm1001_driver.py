@@ -69,6 +69,8 @@ class Dwm1001Driver(Driver):
         self._tlv, self._lines = TlvProtocol(), ShellProtocol()
         self._text = self._binary = True
         self._streaming = self._heard = False
+        self._noise: list[Action] = []
+        """Bytes that neither mode explains, until the mode is known: what only one of them explains is no damage."""
 
     @property
     def period(self) -> float:
@@ -78,8 +80,8 @@ class Dwm1001Driver(Driver):
     def parse(self, data: bytes, now: float) -> list[Any]:
         """Return the events of the mode that the module is in, of both while that is not known."""
         self._heard = self._heard or bool(data)
-        events: list[Any] = self._lines.feed(data, now) if self._text else []
-        events += self._tlv.feed(data, now) if self._binary else []
+        noise: list[Any] = self._tlv.feed(data, now) if self._binary else []
+        events: list[Any] = [*(self._lines.feed(data, now) if self._text else []), *noise]
         for event in events:
             if isinstance(event, NodeConfig):
                 self.config = event
@@ -89,12 +91,19 @@ class Dwm1001Driver(Driver):
                 self.values[event.name] = event.value
             elif isinstance(event, Status):
                 self.joined = event.joined
-        unknown = self._text and self._binary
-        return [event for event in events if not (unknown and isinstance(event, Corrupt))]
+        if not (self._text and self._binary):
+            return events
+        self._noise += [event for event in noise if isinstance(event, Corrupt)]
+        return [event for event in events if not isinstance(event, Corrupt)]
+
+    def spacing(self, event: Any) -> float | None:
+        """Return the time between two lines of the stream, s."""
+        return self.period if self._streaming and isinstance(event, RangeLine) else None
 
     def stop(self) -> list[Action]:
         """Return what ends a stream; polling ends by itself."""
-        return [*self._guard.finish(), *([Send(b"lec\r")] if self._streaming else [])]
+        noise = self._noise if self._text and self._binary else []
+        return [*noise, *self._guard.finish(), *([Send(b"lec\r")] if self._streaming else [])]
 
     def script(self) -> Script[None]:
         """Find the module, learn who it is, and read fixes; begin again when it falls silent."""
@@ -109,6 +118,7 @@ class Dwm1001Driver(Driver):
                 self._poller = self._poller or FixPoller(self, self.period)
                 yield from self._poller.script()
             yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
+        yield from self._noise
         yield from self.say_once(UNREADABLE if self._heard else SILENT)
         yield Reopen("no answer")
 
@@ -122,6 +132,7 @@ class Dwm1001Driver(Driver):
             return False
         if self._shell:
             self._text, self._binary = True, False
+            self._lines = self._lines if shell else ShellProtocol()
             prompt = shell or (yield from self.ask(ENTER, lambda e: isinstance(e, Prompt), 1.2, 3))
             return prompt is not None
         if shell:

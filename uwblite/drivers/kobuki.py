@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 
-from .clock import DeviceClock
+from .clock import BACKWARD, DeviceClock
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
 from .framing import HeadedFrames
@@ -122,6 +122,11 @@ class KobukiDriver(BaseDriver):
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
         self._series = Continuity(_follows)
         self._packets = 0
+        self._last: Feedback | None = None
+
+    def spacing(self, event: Feedback | Corrupt) -> float | None:
+        """Return the time between two packets, s."""
+        return PERIOD if isinstance(event, Feedback) else None
 
     def take(self, event: Feedback) -> list[Action]:
         """Turn packets into poses. One that leaps, and the first, count only if the next one goes on from it."""
@@ -136,20 +141,34 @@ class KobukiDriver(BaseDriver):
     def _pose(self, event: Feedback) -> list[Action]:
         self._packets += 1
         self.ready = self._packets > 2
-        reading = self._clock.read(event.time, event.stamp)
+        reading, last, self._last = self._clock.read(event.time, event.stamp), self._last or event, event
         if reading.elapsed is not None and reading.elapsed <= 0:
             return [Corrupt(b"", "packet sent twice")]
-        if reading.elapsed is None:
-            self._odometer.forget()  # the base was switched on again
+        restarted = reading.reset and _began_again(last, event)
+        if restarted:
+            self._odometer.forget()
         # The gyro's angle is absolute, so the heading holds over any gap; the travel is ambiguous after a long one.
-        elapsed = reading.elapsed or math.inf
+        elapsed = reading.elapsed or max(event.stamp - last.stamp, PERIOD)
         travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
         actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
-        if reading.reset or (reading.elapsed or 0.0) > MAX_BLIND:
-            silent = f"sent nothing for {reading.elapsed or 0.0:.1f} s: how far it went"
-            actions.append(self.gap("restarted, the pose is held: its motion" if reading.reset else silent))
+        if restarted or elapsed > MAX_BLIND:
+            silent = f"sent nothing for {elapsed:.1f} s: how far it went"
+            actions.append(self.gap("restarted, the pose is held: its motion" if restarted else silent))
         actions += self.state(event.wheel_drop, event.battery)
         return [*actions, OdometryPose(reading.stamp, *self._odometer.pose, travel / elapsed, event.turn_rate)]
+
+
+def _began_again(last: Feedback, event: Feedback) -> bool:
+    """Return whether clock and wheels count from zero rather than go on: the base was switched on meanwhile."""
+    elapsed, seconds = event.stamp - last.stamp, event.time * 1e-3
+    further = (event.time - last.time) % STAMP_MODULUS * 1e-3
+    goes_on = further <= elapsed and _way(event.left - last.left, event.right - last.right) <= FASTEST * (further + PERIOD)
+    return not goes_on and seconds <= elapsed + BACKWARD and _way(event.left, event.right) <= FASTEST * (seconds + PERIOD)
+
+
+def _way(left: int, right: int) -> float:
+    """Return how far the wheels turned at least, m, by differences of their counters."""
+    return max(abs(wrapped(difference, ENCODER_MODULUS)) for difference in (left, right)) * TICK
 
 
 def _follows(before: Feedback, after: Feedback) -> bool:
@@ -157,8 +176,7 @@ def _follows(before: Feedback, after: Feedback) -> bool:
     seconds = device_time((after.time - before.time) * 1e-3, after.stamp - before.stamp, STAMP_MODULUS * 1e-3)
     if seconds is None:
         return False
-    ticks = (after.left - before.left, after.right - before.right)
-    moved = max(abs(wrapped(difference, ENCODER_MODULUS)) for difference in ticks) * TICK
+    moved = _way(after.left - before.left, after.right - before.right)
     turned = math.remainder((after.heading or 0.0) - (before.heading or 0.0), 2 * math.pi)
     most = max(seconds, 0.0) + PERIOD
     return moved <= FASTEST * most and abs(turned) <= FASTEST_TURN * most

@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
+from .backlog import Backlog
 from .events import Action, Corrupt, Note, Send
 
 
@@ -84,6 +85,13 @@ class Driver:
         """Return the events that bytes complete; Corrupt is counted, and shown to the script as well."""
         return self.protocol.feed(data, now)
 
+    def spacing(self, event: Any) -> float | None:
+        """Return by how many s the device sends a frame of a steady stream after the one before; 0 = that is not known.
+
+        None = the event is no such frame, or its time is known otherwise.
+        """
+        return None
+
     def script(self) -> Script[None]:
         """Hold the conversation; by default, listen."""
         while True:
@@ -143,6 +151,7 @@ class Session:
         self.driver = driver
         self._script: Script[None] | None = None
         self._due: float | None = None
+        self._backlog = Backlog()
         self.last_event = -math.inf
         """s, when the device last sent something that was understood."""
 
@@ -154,36 +163,43 @@ class Session:
     def start(self, now: float) -> list[Action]:
         """Begin, or begin again after a reconnect, at time `now`, s."""
         self.driver.now = now
+        actions = self._handle(self._backlog.release())
         self.driver.begin()
         self._script = self.driver.script()
-        return self._resume(None)
+        return [*actions, *self._resume(None)]
 
     def feed(self, data: bytes, now: float) -> list[Action]:
         """Take bytes that arrived at time `now`, s."""
         self.driver.now = now
         actions: list[Action] = []
         for event in self.driver.parse(data, now):
-            if isinstance(event, Corrupt):
-                actions.append(event)
-            else:
+            if not isinstance(event, Corrupt):
                 self.last_event = now
-            actions += self._resume(event)
+            actions += self._handle(self._backlog.take(event, now, self.driver.spacing(event)))
         return actions
 
     def tick(self, now: float) -> list[Action]:
         """Do what is due at time `now`, s."""
-        if self._due is None or now < self._due:
-            return []
         self.driver.now = now
-        return self._resume(None)
+        actions = self._handle(self._backlog.due(now))
+        due = self.deadline()
+        return [*actions, *self._resume(None)] if due is not None and now >= due else actions
 
     def deadline(self) -> float | None:
         """Return the time at which `tick` wants to be called, s; None = when bytes come."""
-        return self._due
+        held = self._backlog.deadline()  # the script does not know yet that they came
+        return self._due if held is None else held
 
     def stop(self) -> list[Action]:
         """Return what to send so that the device falls quiet."""
-        return self.driver.stop()
+        return [*self._handle(self._backlog.release()), *self.driver.stop()]
+
+    def _handle(self, events: list[Any]) -> list[Action]:
+        actions: list[Action] = []
+        for event in events:
+            actions += [event] if isinstance(event, Corrupt) else []
+            actions += self._resume(event)
+        return actions
 
     def _resume(self, event: Any) -> list[Action]:
         """Let the script go on to its next wait."""

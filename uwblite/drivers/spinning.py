@@ -1,6 +1,7 @@
 """What the drivers of spinning lidars share: the time of each reading, turns into scans, silence."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from .clock import DeviceClock
 from .clock_map import ClockMap
@@ -41,6 +42,7 @@ class SpinningDriver(Driver):
         self.facts = dict[str, str]()
         self._clock, self._map = clock, ClockMap(WINDOW, BUCKET, MOST_SKEW)
         self._assembler = SweepAssembler(fan)
+        self._received: Samples | None = None
         self._last: Samples | None = None
         self._time = 0.0
 
@@ -63,6 +65,13 @@ class SpinningDriver(Driver):
             else:
                 yield Reopen("it does not answer")
                 yield Wait(self.now + SILENCE)
+
+    def spacing(self, event: Any) -> float | None:
+        """Return how long after the last reading before it the last one of a frame was made, s, by how far the motor turned."""
+        if not isinstance(event, Samples):
+            return None
+        before, self._received = self._received, event
+        return 0.0 if before is None else _elapsed(before, event)[0]
 
     def start_up(self) -> Script[bool]:
         """Make the lidar stream; False = it does not answer."""

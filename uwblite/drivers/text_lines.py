@@ -121,6 +121,10 @@ class LineDriver(Driver, ABC):
         self._unit = unit
         self._series = Continuity(self.follows)
 
+    def spacing(self, event: Line | Corrupt) -> float | None:
+        """Return that the time between two lines without a time of their own is learnt."""
+        return 0.0 if isinstance(event, Line) and self.time_of(event.content) is None else None
+
     def script(self) -> Script[None]:
         """Pass over the first line, of which the port may have shown only the end; then listen."""
         if not self.first_is_whole:

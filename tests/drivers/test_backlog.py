@@ -1,0 +1,133 @@
+"""Frames that a link held back get the arrivals that they would have had."""
+
+import itertools
+import random
+from dataclasses import dataclass
+
+import pytest
+from emulators.kobuki_device import Create2Device, KobukiDevice
+from emulators.uwb_boards import BOARDS, UwbBoard
+from emulators.world import RoomWorld, WorldClock
+from helpers.driver_harness import of_kind, simulate
+
+from uwblite.drivers.backlog import Backlog
+from uwblite.drivers.create2 import Create2Driver
+from uwblite.drivers.devices import open_device
+from uwblite.drivers.events import Corrupt, Lost, Note, OdometryPose, RangeEpoch
+from uwblite.drivers.kobuki import KobukiDriver
+
+
+@dataclass(frozen=True)
+class Frame:
+    stamp: float
+    number: int
+
+
+def passed(arrivals, spacing, others=()):
+    """Return the frames, in the order in which they pass, of these arrivals, s; and when each passed."""
+    backlog, out, times = Backlog(), [], []
+    for number, now in enumerate(arrivals):
+        while (due := backlog.deadline()) is not None and due < now:
+            out += (ready := backlog.due(due))
+            times += [due] * len(ready)
+        ready = backlog.take(Frame(now, number), now, spacing)
+        if number in others:
+            ready += backlog.take("other", now, None)
+        out, times = out + ready, times + [now] * len(ready)
+    ready = backlog.release()
+    return out + ready, times + [arrivals[-1]] * len(ready)
+
+
+def held(sent, begin, end):
+    """Return when frames arrive that are held back from `begin` to `end`, s."""
+    return [end if begin < time < end else time for time in sent]
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.0])
+@pytest.mark.parametrize("pause", [0.3, 0.6, 6.0, 60.0])
+def test_frames_that_fill_a_pause_stand_on_their_rhythm(pause, spacing):
+    rng = random.Random(0)
+    sent = [0.02 * k for k in range(100 + round(pause / 0.02) + 100)]
+    arrivals = [time + rng.uniform(0.0, 0.004) for time in held(sent, 2.0, 2.0 + pause)]
+    out, _ = passed(sorted(arrivals), spacing)
+    assert [frame.number for frame in out] == list(range(len(sent)))
+    assert all(a.stamp <= b.stamp for a, b in itertools.pairwise(out))
+    most = 0.025 if spacing else 0.01 * pause + 0.025
+    assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < most
+
+
+def test_a_link_that_drains_slowly_is_waited_for():
+    """Ten times as fast as the device sends, as by a bit rate; and a lump that comes in two halves."""
+    sent = [0.015 * k for k in range(800)]
+    for drain in (lambda k: 4.5 + 0.0015 * (k - 101), lambda k: 4.5 + 0.03 * (k > 300)):
+        arrivals = [time if time < 1.5 else max(time, drain(k)) for k, time in enumerate(sent)]
+        out, _ = passed(arrivals, 0.015)
+        assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.02
+
+
+@pytest.mark.parametrize("spacing", [0.1, 0.0])
+def test_silence_stays_silence(spacing):
+    """The device sent nothing: every frame keeps its arrival, and waits for half a second at most."""
+    arrivals = [0.1 * k for k in (*range(50), *range(90, 140))]
+    out, times = passed(arrivals, spacing)
+    assert [frame.stamp for frame in out] == pytest.approx(arrivals)
+    assert max(time - frame.stamp for frame, time in zip(out, times, strict=True)) <= 0.5
+
+
+def test_a_pause_that_is_filled_in_part_ends_with_its_frames():
+    sent = [0.1 * k for k in (*range(50), *range(80, 140))]
+    out, _ = passed(held(sent, 5.0, 11.0), 0.1)
+    assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.101
+
+
+def test_rounds_that_come_as_several_lines_are_no_pause_and_fill_one():
+    """A board prints four lines in every round of 0.1 s."""
+    sent = [0.1 * (k // 4) for k in range(1200)]
+    out, _ = passed(sent, 0.0)
+    assert [frame.stamp for frame in out] == pytest.approx(sent)
+    out, _ = passed(held(sent, 20.05, 22.05), 0.0)
+    assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.11
+
+
+def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
+    out, _ = passed([0.0, 0.1, 0.2, 2.0, 2.0, 2.1, 2.2, 2.3, 2.4], 0.1, others=(1, 3))
+    assert [getattr(item, "number", item) for item in out] == [0, 1, "other", 2, 3, "other", 4, 5, 6, 7, 8]
+    assert Backlog().take("other", 1.0, None) == ["other"]
+
+
+def test_many_frames_do_not_wait_for_ever():
+    backlog, count = Backlog(), 0
+    for k in range(200_000):
+        count += len(backlog.take(Frame(0.0 if k == 0 else 5.0, k), 5.0, 0.02))
+    assert count > 130_000
+
+
+@pytest.mark.parametrize("what", ["pause", "stop"])
+@pytest.mark.parametrize("seconds", [0.3, 0.6, 6.0, 20.0])
+@pytest.mark.parametrize("kind", [Create2Device, KobukiDevice])
+def test_a_base_loses_nothing_in_a_pause_and_did_not_restart(kind, seconds, what):
+    """A link that holds the bytes back for long makes a Create 2 be asked for its stream again, which costs nothing."""
+    rng, sent, clock = random.Random(1), [], WorldClock()
+    clock.start(1000.0)
+    device = kind(RoomWorld().poses(), clock, on_packet=lambda *pose: sent.append(pose))
+    driver = Create2Driver((0.0, -1.5, 0.0)) if kind is Create2Device else KobukiDriver((0.0, -1.5, 0.0))
+    actions, _ = simulate(driver, device, 15.0 + seconds, jitter=lambda: rng.expovariate(1000.0), **{what: (8.0, seconds)})
+    assert not [action for _, action in actions if isinstance(action, Lost | Note | Corrupt)]
+    poses = of_kind(actions, OdometryPose)
+    assert len(poses) >= len(sent) - 10
+    for pose in poses:
+        true = min(sent, key=lambda row: abs(row[0] - pose.stamp))
+        assert abs(pose.stamp - true[0]) < 0.008
+        assert abs(pose.x - true[1]) + abs(pose.y - true[2]) < 0.03
+
+
+@pytest.mark.parametrize("board", ["makerfabs-at", "bu03"])
+def test_rounds_of_a_board_without_a_clock_stand_at_their_times(board):
+    clock, sent = WorldClock(), []
+    clock.start(1000.0)
+    device = UwbBoard(RoomWorld().epochs(), clock, BOARDS[board], lambda t, rows: sent.append(t))
+    actions, _ = simulate(open_device("uwb", f"{board}:port")[0].driver, device, 30.0, stop=(15.0, 6.0))
+    stamps = [epoch.stamp for epoch in of_kind(actions, RangeEpoch)]
+    assert len(stamps) >= len(sent) - 2
+    assert max(min(abs(stamp - time) for time in sent) for stamp in stamps) < 0.02
+    assert min(b - a for a, b in itertools.pairwise(stamps)) > 0.05
