@@ -32,14 +32,15 @@ class Table:
     __slots__ = ()
 
     def rows(self, which: slice | Ints | Bools) -> Self:
-        """Return some of the entries; fields that are no arrays are kept."""
+        """Return some of the entries, of tables within it, too; fields that are neither are kept."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        tables = {name: column.rows(which) for name, column in columns.items() if isinstance(column, Table)}
         arrays = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
         if isinstance(which, slice):
-            return replace(self, **{name: column[which] for name, column in arrays.items()})  # type: ignore[type-var]
+            return replace(self, **tables, **{name: column[which] for name, column in arrays.items()})  # type: ignore[type-var]
         # Flags are searched once, and `take` needs half the time of an index for tables of two columns.
         numbers = np.flatnonzero(which) if which.dtype == np.bool_ else which
-        return replace(self, **{name: column.take(numbers, axis=0) for name, column in arrays.items()})  # type: ignore[type-var]
+        return replace(self, **tables, **{name: column.take(numbers, axis=0) for name, column in arrays.items()})  # type: ignore[type-var]
 
 
 def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:

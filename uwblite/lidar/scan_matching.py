@@ -95,7 +95,9 @@ def match(
     root = None if weight is None else np.sqrt(weight)
     found = correspondences(clouds, raster, i, T_i_j, points, gate)
     scale = np.broadcast_to(scale, len(i))
-    return concatenated([_condensed(clouds, some, scale[some.pairs, None], root) for some in found])
+    return concatenated(
+        [condensed(clouds, some, scale[some.pairs, None], None if root is None else root.take(some.row)) for some in found]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,14 +154,14 @@ def _looked_up(
     return Correspondences(pairs, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
-def _condensed(
+def condensed(
     clouds: Clouds, found: Correspondences, scale: float | Floats, root_weight: Floats | None = None
 ) -> PairFactors:
-    """Condense the matches of each pair into the quadratic form of its relative pose; roots of weights are of points (p,)."""
+    """Condense the matches of each pair into the quadratic form of its relative pose; roots of weights are (e, n)."""
     row, good, r, (nx, ny), (rx, ry) = found.row, found.good, found.distance, found.normal, found.arm
     root = good / (1.0 + np.square(r * (1.0 / scale)))
     if root_weight is not None:
-        root *= root_weight.take(row)
+        root *= root_weight
     weighted = np.empty((len(row), 4, row.shape[1]))
     wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
     weighted[:, 2] = wy * rx - wx * ry
@@ -205,7 +207,7 @@ def shifts_by_range_error(
     """
     parts, slopes = [], np.zeros((len(i), 4, 3))
     for found in correspondences(clouds, raster, i, T_i_j, points, gate):
-        parts.append(_condensed(clouds, found, scale))
+        parts.append(condensed(clouds, found, scale))
         (nx, ny), (rx, ry) = found.normal, found.arm
         qx, qy = (column.take(found.target) for column in clouds.points.T)
         far_p, far_q = np.maximum(np.hypot(rx, ry), _NEAREST), np.maximum(np.hypot(qx, qy), _NEAREST)

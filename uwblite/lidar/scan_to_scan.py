@@ -13,13 +13,16 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
+from ..graph.solver import SolverConfig, optimize
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
+from ..odometry.slips import EVERY, LASTS, covariance_of, posterior, slip_sigma, with_slips
+from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
-from .scan_matching import match, measured, pair_points
-from .step_search import StepSearch
+from .registration import Placed, Registration, best_of
+from .scan_matching import PairPoints, match, measured, pair_points
+from .visibility import nearest_by_bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,10 @@ class ScanOdometry:
     """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
     """Number of steps that were searched for."""
+    slips: Floats
+    """(e,) probability that the wheels slipped over each."""
+    moving: Bools
+    """(p,) points of the clouds that belong to objects that moved by themselves."""
 
 
 _ELSEWHERE = 0.12
@@ -109,9 +116,10 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
 
 
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float, config: TrackingConfig
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float, config: TrackingConfig,
+    solver: SolverConfig,
 ) -> ScanOdometry:
-    """Turn steps between neighbouring keyframes into edges, searching where the guess may have been bad.
+    """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
     Parameters
     ----------
@@ -121,14 +129,48 @@ def follow(
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
-    certain = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
-    miss = _miss(clouds, reestimate_wheel_noise(wheels, certain, graph))
-    pose, lost, searched = _searched(clouds, i, steps, steps.enough & ~good, config)
-    further = steps.enough & ~lost & ~good
-    measured_steps = certain.followed_by(_edges(clouds, raster, i[further], pose[further], tight, config))
-    measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
-    learnt = with_uncounted_ways(reestimate_wheel_noise(wheels, measured_steps, graph), measured_steps, graph)
-    return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
+    certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
+    # Slips bend what ranges and wheels alone say of the calibration: it is taken from the steps.
+    graph = optimize(graph.with_edges(wheels, certain), solver)[0]
+    noise = reestimate_wheel_noise(wheels, certain, graph)
+    points, registration = pair_points(clouds, i + 1, config.points), Registration(clouds, raster, nearest_by_bearing(clouds), sigma)
+    placed, probability, searched = _placed(registration, noise, graph, steps.pose, points)
+    seen = np.flatnonzero(placed.factors.matched >= _FEWEST)
+    edges = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
+    miss = _miss(clouds, noise)
+    return ScanOdometry(
+        edges, with_slips(noise, probability), float(np.median(miss)) if len(miss) else 0.0, searched, probability,
+        registration.moving(i, i + 1, points, placed.pose),
+    )
+
+
+def _placed(
+    registration: Registration, wheels: OdometryEdges, graph: Graph, other: Floats, points: PairPoints
+) -> tuple[Placed, Floats, int]:
+    """Place each next cloud where the wheels counted it, or elsewhere if they slipped.
+
+    Parameters
+    ----------
+    other : (e, 3) further poses to start from. points : of the next clouds.
+
+    Returns
+    -------
+    Placements, probabilities of a slip (e,), and how many steps were searched for one.
+    """
+    i, mean, sound = wheels.i, wheels.corrected(graph), covariance_of(wheels, graph)
+    slips = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
+    placed = registration.descend(i, points, mean, mean, sound)
+    log_odds = registration.most_odds(placed, sound, slips)
+    asked = np.flatnonzero(log_odds > np.log(LASTS / EVERY))
+    starts = [mean[asked], 0.5 * mean[asked], 0.0 * mean[asked], other[asked]]
+    some = PairPoints(points.row[asked])
+    elsewhere = best_of([registration.descend(i[asked], some, start, mean[asked], slips[asked]) for start in starts])
+    log_odds[asked] = elsewhere.evidence - placed.evidence[asked]
+    probability = posterior(log_odds, wheels.duration)
+    return placed.replaced(asked, elsewhere, probability[asked] > 0.5), probability, len(asked)
+
+
+_FEWEST = 6
 
 
 def reattached(
@@ -173,46 +215,6 @@ def _lines_of(clouds: Clouds) -> Ints:
     return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
 
 
-def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools, int]:
-    """Search for doubtful steps (e,), each against the sub-map of those before it.
-
-    With noise of decimetres, foliage or few beams, every step has few matches. Where these are enough to measure the step, and
-    no surface stands in free space, no search is needed.
-
-    Returns
-    -------
-    Poses of all steps (e, 3), which were not found (e,), and how many were searched for.
-    """
-    pose, lost, searched = steps.pose.copy(), np.zeros(len(i), dtype=bool), 0
-    searching = StepSearch(clouds, config.distance, config.angle)
-    chain = np.zeros((len(clouds), 3))
-    chain[i] = pose
-    # Sub-maps begin after the last step that was not measured.
-    blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
-    first = 0
-    for row in np.flatnonzero(doubtful).tolist():
-        k, before = int(i[row]), blind[blind < i[row]]
-        first = max(first, int(before[-1]) + 1 if len(before) else 0)
-        guess, ended = steps.guess[row], steps.pose[row]
-        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _MOST_THROUGH:
-            continue
-        searched += 1
-        found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
-        # Where no search is clear, descent near the odometry's guess still measures the directions that the surfaces determine.
-        lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
-        if found.clear:
-            chain[k] = pose[row] = found.pose
-        elif lost[row]:
-            first = k + 1
-    return pose, lost, searched
-
-
-_LEAST_SHARE = 0.4
-"""Share of matching points from which on descent from the odometry's guess measures a step."""
-_MOST_THROUGH = 0.04
-"""Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
-
-
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
     """Return the error (e,) that the odometry may cause in points of the next cloud, 3 sigma, m."""
     sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
@@ -223,8 +225,14 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
 
 def _edges(
     clouds: Clouds, raster: CloudRasters, i: Ints, step: Floats, gate: float, config: TrackingConfig
-) -> RelativePoseEdges:
-    """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches."""
+) -> tuple[RelativePoseEdges, float]:
+    """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches, and the standard
+    deviation of a match, m."""
     factors = match(clouds, raster, i, step, pair_points(clouds, i + 1, config.points), gate, gate / 2.0)
-    z, sqrt_information = measured(factors, step, np.full(len(i), config.sigma**2 * config.correlation))
-    return RelativePoseEdges(i, i + 1, z, sqrt_information)
+    sigma = float(np.sqrt(factors.squared.sum() / max(factors.weight.sum(), 1.0))) if len(i) else config.sigma
+    sigma = max(sigma, _LEAST_SIGMA)
+    z, sqrt_information = measured(factors, step, np.full(len(i), sigma**2 * config.correlation))
+    return RelativePoseEdges(i, i + 1, z, sqrt_information), sigma
+
+
+_LEAST_SIGMA = 0.02

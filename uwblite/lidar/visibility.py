@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from .clouds import Clouds
 from .free_space import FreeSpace, contradiction, free_space, seen_beyond
 from .submaps import Submaps
@@ -41,6 +41,19 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
     nearest = np.full(len(clouds) * _BEARINGS, np.inf)
     np.minimum.at(nearest, clouds.owner.astype(np.intp) * _BEARINGS + bins, distance)
     return nearest.reshape(-1, _BEARINGS)
+
+
+def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> Bools:
+    """Return which points x, y (e, n), m, stand in the space that was free around the origins of clouds i (e,).
+
+    Parameters
+    ----------
+    free : (k, bearings) m, see FreeSpace.ranges; of all clouds.
+    """
+    distance = np.sqrt(x * x + y * y)
+    bins = ((np.arctan2(y, x) + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.int64)
+    bins *= bins < _BEARINGS
+    return np.asarray(distance < free[i[:, None], bins] - _MARGIN)
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:

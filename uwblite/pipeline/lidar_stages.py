@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Ints
+from ..arrays import Floats, Ints
 from ..graph.calibration import LASER, RADIO, optimize_with_heights, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
@@ -18,7 +18,7 @@ from ..graph.robust import SQUARED
 from ..graph.solver import SolverConfig, optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
-from ..lidar.scan_to_scan import Steps
+from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..radio.tag_pattern import without_pattern
 from . import scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
@@ -43,10 +43,12 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     the replaced ones in memory.
     """
     estimate, steps = _descended(make_clouds(estimate, task), task)
-    estimate, former = _with_keyframes_where_contradicted(estimate, steps, task)
+    track = _followed(estimate, steps, task)
+    estimate, former = _with_keyframes_where_slipped(replace(estimate, odometry=track.wheels), track.slips, task)
     if former is not None:
         steps = _with_new_steps(estimate, steps, former, task)
-    estimate = _match_neighbours(estimate, steps, task.following(estimate))
+        track = _followed(estimate, steps, task)
+    estimate = _match_neighbours(estimate, track, task.following(estimate))
     for _ in range(_RETIMINGS):
         late = _late(estimate)
         if late == 0.0:
@@ -57,7 +59,8 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         if abs(late) < _SAME_STEPS:
             estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
         else:
-            estimate = _match_neighbours(*_descended(estimate, now), now)
+            estimate, steps = _descended(estimate, now)
+            estimate = _match_neighbours(estimate, _followed(estimate, steps, now), now)
     return estimate
 
 
@@ -98,23 +101,35 @@ def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
-def _with_keyframes_where_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Ints | None]:
-    """Cut the steps of the odometry that the clouds contradict at the scans within them.
+def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
+    scans, config = estimate.lidar, task.config
+    return scan_to_scan.follow(
+        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
+        rough(config.solver),
+    )  # fmt: skip
 
-    Where the robot moves little between two scans, any odometry is good enough as a start of matching.
+
+def _with_keyframes_where_slipped(estimate: Estimate, slips: Floats, task: Task) -> tuple[Estimate, Ints | None]:
+    """Cut the steps of the odometry in which it slipped, with a probability (e,), at the scans within them.
+
+    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud.
 
     Returns
     -------
     The estimate, and (k,) the number that each keyframe had before, see scan_clouds.remake; None where nothing changes.
     """
     before = task.recordings
-    doubtful = steps.contradicted(task.config.scan_to_scan)
-    after = denser(before, doubtful, _CUTS)
+    slipped = estimate.odometry.i[slips > _LIKELY]
+    after = denser(before, slipped, _CUTS)
     if len(after.stamps) == len(before.stamps):
         return estimate, None
     scans, former = scan_clouds.remake(estimate.lidar, before, after, task.config)
-    task.stages.end("keyframes added", steps=len(doubtful), keyframes=len(after.stamps))
+    task.stages.end("keyframes added", steps=len(slipped), keyframes=len(after.stamps))
     return replace(with_keyframes(estimate, before, after), scans=scans), former
+
+
+_LIKELY = 0.5
 
 
 def _with_new_steps(estimate: Estimate, steps: Steps, former: Ints, task: Task) -> Steps:
@@ -137,19 +152,18 @@ _RETIMINGS = 4
 """Most times that clouds are made again; a quarter of the error remains each time."""
 
 
-def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
-    """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    config, scans, graph = task.config, estimate.lidar, estimate.graph
-    rules = config.refinement
-    found = scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, graph, steps, rules.first_gate, config.scan_to_scan
-    )
-    estimate = replace(estimate, odometry=found.wheels)
+def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Match each cloud with those just before and after it, so that sub-maps are stiff; objects that move are left out."""
+    config, rules, graph = task.config, task.config.refinement, estimate.graph
+    estimate = replace(estimate, odometry=track.wheels, scans=scan_clouds.only(estimate.lidar, ~track.moving, config))
     weak = _with_inflated_ranges(estimate)
-    problem = graph.with_edges(*weak.odometry_and_ranges, found.steps)
+    problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
-    gate = float(np.clip(found.miss, rules.later_gate, rules.first_gate))
-    return _refined_neighbours(estimate, graph, gate, task, searched=found.searched)
+    gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
+    return _refined_neighbours(
+        estimate, graph, gate, task, searched=track.searched, slipped=int(np.sum(track.slips > _LIKELY)),
+        moving=round(float(track.moving.mean()), 4),
+    )  # fmt: skip
 
 
 def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, **figures: object) -> Estimate:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Ints
+from ..arrays import Bools, Ints
 from ..lidar import cloud_rasters, clouds
 from ..lidar.clouds import Clouds
 from ..odometry.attached import choose_scans, scan_points
@@ -37,6 +37,11 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
     both = clouds.joined([old.clouds, new.clouds]).chosen(place)
     return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay), former
+
+
+def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
+    """Return the clouds with some of their points (p,) alone."""
+    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay)
 
 
 def _with_raster(built: Clouds, config: MappingConfig, delay: float) -> ScanClouds:

@@ -1,0 +1,248 @@
+"""Registration: where a cloud lies in another one, given a prior that may be wrong altogether.
+
+The prior of a relative pose is a mixture: a Gaussian about what the odometry counts, and with the probability of a slip a wide
+one about the same place (see ``Slip``). Matching descends from places throughout the prior, and each part of the mixture is
+compared by its evidence, the marginal likelihood of the source's surfaces in the target by Laplace:
+
+    log E = log N(T; mean, C) + sum over objects log((1 - m) exp(-chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|.
+
+The surfaces of a cloud are cut into objects, runs of neighbouring points. An object moves by itself with probability m, which
+falls with its length: people, trolleys and animals are short, walls are not. It counts as one thing however many rays meet
+it, and a cow that fills the view cannot outvote the walls behind it. A point agrees with the target on a surface, disagrees
+beside one or in its free space, and says nothing where the target did not look.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, Table, concatenated
+from .cloud_rasters import CloudRasters
+from .clouds import Clouds
+from .free_space import free_space
+from .scan_matching import Correspondences, PairFactors, PairPoints, condensed, correspondences, nondegenerate_step
+from .visibility import in_free_space
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationConfig:
+    """Likelihood of surfaces."""
+
+    gate: ClassVar[float] = 0.15
+    """Farthest match at the end, m."""
+    first_gate: ClassVar[float] = 0.5
+    """Farthest match at the beginning of the descent, m; the reach of the rasters."""
+    correlation: ClassVar[float] = 8.0
+    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
+    outlier: ClassVar[float] = 9.0
+    """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
+    gap: ClassVar[float] = 0.4
+    """Distance between neighbouring points that ends an object, m."""
+    moves: ClassVar[float] = 0.03
+    """Probability that an object moves by itself."""
+    long: ClassVar[float] = 2.0
+    """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
+    iterations: ClassVar[int] = 20
+    shrink: ClassVar[float] = 0.8
+    """Gate of an iteration as a share of the one before."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed(Table):
+    """Where descent ended, of e pairs."""
+
+    pose: Floats
+    """(e, 3) T_i_j."""
+    factors: PairFactors
+    """Of the matches there, objects that move left out."""
+    evidence: Floats
+    """(e,) log marginal likelihood."""
+    evidence_lost: Floats
+    """(e,) by how much the log likelihood is below that of surfaces that all agree at the prior's mean."""
+    share: Floats
+    """(e,) share of the points in view that match, 0..1."""
+
+    def measured(self, variance: float) -> tuple[Floats, Floats]:
+        """Return what the matches measure by themselves, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
+
+        A direction whose own optimum lies beyond what holds for linear surfaces was not measured: the prior placed it.
+
+        Parameters
+        ----------
+        variance : of a match, m^2.
+        """
+        step, root = nondegenerate_step(self.factors)
+        along = np.einsum("eij,ej->ei", root, step)
+        root = np.where((np.abs(along) <= _LINEAR * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
+        z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=1e-9), root, step)
+        z[:, 2] = se2.wrap_angle(z[:, 2])
+        return z, np.asarray(root @ se2.rotation(z[:, 2]) / np.sqrt(variance))
+
+    def replaced(self, rows: Ints, others: "Placed", better: Bools) -> "Placed":
+        """Return these pairs, some rows (r,) of them replaced by others where these are better (r,)."""
+        which = np.arange(len(self.pose))
+        which[rows[better]] = len(self.pose) + np.flatnonzero(better)
+        return concatenated([self, others]).rows(which)
+
+
+def best_of(placed: Sequence[Placed]) -> Placed:
+    """Return of several placements of the same pairs those with the largest evidence."""
+    best = np.argmax([p.evidence for p in placed], axis=0)
+    count = len(best)
+    return concatenated(list(placed)).rows(best * count + np.arange(count))
+
+
+class Registration:
+    """Clouds ready for registration with each other."""
+
+    def __init__(self, clouds: Clouds, raster: CloudRasters, nearest: Floats, sigma: float) -> None:
+        """Take clouds, their rasters, the nearest surface by bearing (see visibility), and the deviation of a match, m."""
+        self._clouds, self._raster, self.sigma = clouds, raster, sigma
+        self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
+        self._reach = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 1.0
+        self._object, length = objects(clouds, RegistrationConfig.gap)
+        self._most = -np.log(RegistrationConfig.moves) * np.maximum(length / RegistrationConfig.long, 1.0)
+
+    def descend(self, i: Ints, points: PairPoints, start: Floats, mean: Floats, covariance: Floats) -> Placed:
+        """Place sources in targets i (e,) under Gaussian priors, each from its start (e, 3).
+
+        Parameters
+        ----------
+        mean, covariance : (e, 3) and (e, 3, 3) of x, y, heading of T_i_j. points : of the sources, see pair_points.
+        """
+        c = RegistrationConfig
+        information = np.linalg.inv(covariance)
+        pose, variance = start.copy(), self.sigma**2
+        gate, temper = c.first_gate, 1.0
+        for _ in range(c.iterations):
+            factors, _ = self._match(i, points, pose, gate, covariance * temper)
+            step = self._step(factors, information, pose, mean)
+            pose += step
+            pose[:, 2] = se2.wrap_angle(pose[:, 2])
+            if gate <= c.gate and temper < 0.01 and np.abs(step).max(initial=0.0) < _CONVERGED:
+                break
+            gate, temper = max(gate * c.shrink, c.gate), temper * _COOLING
+        factors, judged = self._match(i, points, pose, c.gate, np.zeros_like(covariance))
+        likelihood, top, share = (np.concatenate([getattr(part, n) for part in judged]) for n in ("likelihood", "most", "share"))
+        hessian = factors.hessian / (variance * c.correlation)
+        off = _difference(pose, mean)
+        distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
+        prior = -distance - 0.5 * np.linalg.slogdet(covariance)[1]
+        volume = -0.5 * np.linalg.slogdet(hessian + information)[1]
+        return Placed(pose, factors, likelihood + prior + volume, distance + top - likelihood, share)
+
+    def most_odds(self, placed: Placed, one: Floats, other: Floats) -> Floats:
+        """Return by how much the evidence of pairs (e,) would rise at most under another covariance (e, 3, 3) of their priors.
+
+        It does where everything agrees there, with the information that it has here.
+        """
+        hessian = placed.factors.hessian / (self.sigma**2 * RegistrationConfig.correlation)
+        here, there = (np.linalg.slogdet(np.eye(3) + covariance @ hessian)[1] for covariance in (one, other))
+        return np.asarray(placed.evidence_lost + 0.5 * (here - there))
+
+    def _step(self, factors: PairFactors, information: Floats, pose: Floats, mean: Floats) -> Floats:
+        """Return a damped Gauss-Newton step (e, 3) of matches and prior."""
+        scale = self.sigma**2 * RegistrationConfig.correlation
+        hessian = factors.hessian / scale + information
+        gradient = factors.gradient / scale + np.einsum("eij,ej->ei", information, _difference(pose, mean))
+        step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
+        return np.asarray(step / np.maximum(reach, 1.0)[:, None])
+
+    def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats) -> Bools:
+        """Return which points (p,) of all clouds belong to objects of sources j (e,) that moved by themselves.
+
+        Parameters
+        ----------
+        pose : (e, 3) T_i_j. For the others see descend.
+        """
+        moves = np.zeros(len(self._clouds.points), dtype=bool)
+        for found in correspondences(self._clouds, self._raster, i, pose, points, RegistrationConfig.gate):
+            some = found.pairs
+            judged = self._judge(found, i[some], pose[some], np.zeros((len(pose[some]), 3, 3)))
+            for source, static in zip(j[some].tolist(), judged.static, strict=True):
+                rows = slice(int(self._clouds.offsets[source]), int(self._clouds.offsets[source + 1]))
+                number = np.minimum(self._object[rows], len(static) - 1)
+                moves[rows] = (static[number] < _UNLIKELY) & (self._object[rows] < len(static))
+        return moves
+
+    def _match(self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats) -> tuple[PairFactors, list["_Judged"]]:
+        """Return factors of the objects that do not move, and how each pair agrees, at poses (e, 3)."""
+        parts, judged = [], []
+        for found in correspondences(self._clouds, self._raster, i, pose, points, gate):
+            some = found.pairs
+            own = self._judge(found, i[some], pose[some], covariance[some])
+            weight = np.take_along_axis(own.static, self._object[found.row], axis=1) * found.good
+            parts.append(condensed(self._clouds, found, max(gate / 2.0, 3.0 * self.sigma), np.sqrt(weight)))
+            judged.append(own)
+        return concatenated(parts), judged
+
+    def _judge(self, found: Correspondences, i: Ints, pose: Floats, covariance: Floats) -> "_Judged":
+        """Judge the objects of some pairs (e,) at poses (e, 3), whose covariance (e, 3, 3) is left out of the residuals."""
+        c, usable = RegistrationConfig, found.row >= 0
+        (nx, ny), (rx, ry) = found.normal, found.arm
+        jacobian = np.stack([nx, ny, ny * rx - nx * ry])
+        # What the prior leaves open shifts a surface without making it a thing that moves.
+        variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
+        squared = np.square(found.distance) / variance
+        cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
+        through = usable & ~found.good & in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        cost[through] = c.outlier
+        group = self._object[found.row]
+        many = int(group.max(initial=0)) + 1
+        key = (np.arange(len(i))[:, None] * many + group)[usable]
+        chi2, matched, asked = (
+            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / c.correlation
+            for v in (cost, found.good.astype(np.float64), usable.astype(np.float64))
+        )
+        most = np.full((len(i), many), -np.log(c.moves))
+        most.reshape(-1)[key] = self._most[found.row[usable]]
+        gain = np.log(self._reach / (np.sqrt(2.0 * np.pi) * self.sigma))
+        stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
+        return _Judged(
+            1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
+            np.logaddexp(fixed + stays, -most).sum(axis=1),
+            np.logaddexp(fixed + np.minimum(gain * asked, most), -most).sum(axis=1),
+            found.good.sum(axis=1) / np.maximum((found.good | through).sum(axis=1), 1),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """How the objects of some pairs (e,) agree with their targets."""
+
+    static: Floats
+    """(e, o) probability that each object does not move."""
+    likelihood: Floats
+    """(e,) log likelihood of the source, by that in unknown space."""
+    most: Floats
+    """(e,) the same where every point agreed."""
+    share: Floats
+    """(e,) share of the points in view that match, 0..1."""
+
+
+_FARTHEST, _WIDEST = 0.3, 0.15
+_LINEAR = 0.1
+_UNLIKELY, _HUGE = 0.5, 50.0
+_CONVERGED = 1e-4
+_COOLING = 0.6
+
+
+def _difference(pose: Floats, mean: Floats) -> Floats:
+    off = pose - mean
+    off[:, 2] = se2.wrap_angle(off[:, 2])
+    return off
+
+
+def objects(clouds: Clouds, gap: float) -> tuple[Ints, Floats]:
+    """Return the number (p,) of the object of each point within its cloud, from 0 on, and the length (p,) of it, m."""
+    points, owner = clouds.points.astype(np.float64), clouds.owner
+    away = np.hypot(*np.diff(points, axis=0).T) if len(points) else np.zeros(0)
+    new = np.concatenate([[True], (away > gap) | (np.diff(owner) != 0)])[: len(points)]
+    number = np.cumsum(new) - 1
+    length = np.bincount(number, np.concatenate([[0.0], away])[: len(points)] * ~new)
+    first = number[np.minimum(clouds.offsets[:-1], max(len(points) - 1, 0))] if len(points) else number
+    return number - first[owner], length[number]
