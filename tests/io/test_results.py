@@ -60,7 +60,7 @@ def test_timings_are_the_only_difference_of_two_runs(tmp_path):
 def test_report_json_holds_every_stage(tmp_path):
     write_result(tmp_path / "map", [small_log()], small_result(), RECORD)
     report = json.loads((tmp_path / "map" / "report.json").read_text())
-    assert report["schema"] == 2
+    assert report["schema"] == 3
     assert report["inputs"][0]["sha256"] == "ab" * 32
     assert report["trusted"] is True
     assert [c["accepted"] for c in report["closures"]] == [True, False, False]
