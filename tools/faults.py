@@ -225,7 +225,7 @@ def write_page(page: Path, done: Sequence[Outcome], minutes: float) -> None:
         f"## Faults\n\nFaults of sensors and of users, put into {minutes:g} min of a simulated recording or into a real one.\n"
         f"{meaning}\n\n{words}\n\n{summary(done)}.\n\n{table(*counted(done))}\n"
         "### Every kind of fault\n\nThe number is the error of the trajectory (ATE), m. The last column has the kinds of all "
-        "doubts of the row, the most\nfrequent first; [formats.md](formats.md#warnings-and-doubts) explains them.\n\n"
+        "doubts of the row, the most\nfrequent first; [findings.md](findings.md) explains them.\n\n"
         f"{table(*by_kind(done))}"
     )
     write_section(page, "faults", text)

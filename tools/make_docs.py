@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/tuning.md from the docstrings of the settings; ``--check`` only says whether it is up to date."""
+"""Write docs/tuning.md and docs/findings.md from the source; ``--check`` only says whether they are up to date."""
 
 import dataclasses
 import sys
@@ -8,6 +8,8 @@ from typing import Any, get_type_hints
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+
+import finding_page
 
 from uwblite.io.settings_toml import field_docs, permitted, shown_fields, toml_value
 from uwblite.mapping import MappingConfig
@@ -86,15 +88,17 @@ def page() -> str:
 
 
 def main() -> int:
-    """Write the page, or check it."""
-    text = page()
-    if "--check" in sys.argv[1:]:
-        current = TARGET.exists() and TARGET.read_text() == text
-        print("docs/tuning.md is up to date" if current else "docs/tuning.md is out of date: python tools/make_docs.py")
-        return 0 if current else 1
-    TARGET.write_text(text)
-    print(TARGET)
-    return 0
+    """Write the pages, or check them."""
+    late = []
+    for target, text in ((TARGET, page()), (ROOT / "docs" / "findings.md", finding_page.page())):
+        if "--check" not in sys.argv[1:]:
+            target.write_text(text)
+            print(target)
+        elif not target.exists() or target.read_text() != text:
+            late.append(target.name)
+    if late:
+        print(f"out of date: {', '.join(late)}: python tools/make_docs.py")
+    return 1 if late else 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,38 @@
+"""The page of findings holds what the rules say, and every kind that the code makes."""
+
+import ast
+
+import finding_page
+
+
+def test_a_planted_rule_is_read():
+    code = '''
+def check(estimate):
+    """Doubt a map that is wet.
+
+    Parameters
+    ----------
+    estimate : of the map.
+    """
+    text = f"the map has {estimate} drops"
+    yield doubt("wet-map", text, drops=1)
+    text = "it is dry" + "; drive on"
+    yield warning("dry-map", text)
+    yield Finding("damp-map", DOUBT, f"{estimate}: dry it")
+    stages.warn(estimate, "no kind")
+'''
+    (function,) = finding_page._functions(ast.parse(code))
+    found = {rule.kind: (rule.severity, rule.text) for rule in finding_page._rules_of(function, "room.py")}
+    assert found == {
+        "wet-map": ("doubt", "the map has ... drops"),
+        "dry-map": ("warning", "it is dry; drive on"),
+        "damp-map": ("doubt", "...: dry it"),
+    }
+
+
+def test_kinds_of_all_rooms_are_on_the_page():
+    kinds = {rule.kind for rule in finding_page.rules()}
+    assert {"odometry-steps", "wheels-against-lidar", "clock-set-back", "free-space-violation", "not-localized"} <= kinds
+    page = finding_page.page()
+    assert all(f"\n## {kind}\n" in page for kind in kinds)
+    assert "Planted faults that only this kind names" in page

@@ -1,0 +1,133 @@
+"""The page docs/findings.md: every kind of finding, from the rules' own code and texts and from the table of faults.
+
+A rule is a function of the package that makes a finding of a kind; its docstring says what it looks at and why, its text is the
+example, and the table of faults in docs/accuracy.md shows which planted faults only this kind names.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "uwblite"
+FACTORIES = {"doubt": "doubt", "warning": "warning", "warn": "warning", "Finding": "", "say": "", "add": ""}
+"""Functions that make a finding of the kind that is their first argument, and its severity where they say it."""
+KIND = re.compile(r"[a-z]+(-[a-z]+)+|gyro|drift|scales|carried|uncertain|mirrored")
+
+HEAD = """\
+# Findings
+
+Written by `tools/make_docs.py` from the rules themselves; do not edit.
+
+A finding says what is wrong in a recording, in a map or in a live pose. Its kind is a fixed name, for searching here and for
+scripts (`kind` in `report.json` and in `--json`). A **doubt** is a reason not to trust the result: the files are written and
+the exit code is 3. A **warning** was repaired or costs accuracy. No rule takes back what another one found. Where a doubt is
+about stretches of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states.
+
+*Planted faults* are those of `tools/faults.py` in a simulated laboratory and in a real recording: the faults after which this
+kind was the only doubt. A kind without such a fault is named by other rules at the same time, or needs a recording of another
+sort (several recordings, a lost anchor, a wide place).
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A function that makes a finding of a kind."""
+
+    kind: str
+    severity: str
+    """'doubt', 'warning' or 'warning or doubt'."""
+    room: str
+    says: str
+    """Docstring of the function."""
+    text: str
+    """The finding's text, an ellipsis in place of each value; empty where it is made elsewhere."""
+
+
+def rules() -> list[Rule]:
+    """Return the rules of the package, in the order of kinds."""
+    found: dict[tuple[str, str], Rule] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for function in _functions(ast.parse(path.read_text(encoding="utf-8"))):
+            for rule in _rules_of(function, path.relative_to(PACKAGE).as_posix()):
+                known = found.get((rule.kind, rule.room + rule.says))
+                if known is not None and known.severity != rule.severity:
+                    rule = Rule(rule.kind, "warning or doubt", rule.room, rule.says, known.text or rule.text)
+                found[rule.kind, rule.room + rule.says] = rule
+    return sorted(found.values(), key=lambda rule: (rule.kind, rule.room))
+
+
+def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def _rules_of(function: ast.FunctionDef, room: str) -> Iterator[Rule]:
+    assigned = [node for node in ast.walk(function) if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)]
+    assigned.sort(key=lambda node: node.lineno)
+    texts = [(node.lineno, getattr(node.targets[0], "id", ""), node.value) for node in assigned]
+    for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
+        name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+        if not call.args or (name not in FACTORIES and not isinstance(call.func, ast.IfExp)):
+            continue
+        kind = _kind(call.args[0])
+        if not kind or not KIND.fullmatch(kind):
+            continue
+        severity = FACTORIES.get(name, "")
+        if name == "Finding" and len(call.args) > 1:
+            severity = getattr(call.args[1], "id", "").lower()
+        text = call.args[2 if name == "Finding" else 1] if len(call.args) > (2 if name == "Finding" else 1) else None
+        if isinstance(text, ast.Name):
+            before = [value for line, target, value in texts if target == text.id and line <= call.lineno]
+            text = before[-1] if before else None
+        yield Rule(kind, severity or "warning or doubt", room, ast.get_docstring(function) or "", plain(text))
+
+
+def _kind(node: ast.expr) -> str:
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "x" for part in node.values)
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+
+
+def plain(node: ast.expr | None) -> str:
+    """Return an expression for a text with an ellipsis in place of each value."""
+    match node:
+        case ast.Constant(value=str(text)):
+            return text
+        case ast.JoinedStr(values=values):
+            return "".join(part.value if isinstance(part, ast.Constant) else "..." for part in values)
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return plain(left) + plain(right)
+        case ast.IfExp(body=body):
+            return plain(body)
+        case _:
+            return ""
+
+
+def only_named_by() -> dict[str, list[str]]:
+    """Return, by kind, the faults after which it was the only doubt, from the table in docs/accuracy.md."""
+    page = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.+?) \|.*\| ([a-z, -]*) \|$", page.partition("### Every kind of fault")[2], re.M)
+    alone: dict[str, list[str]] = {}
+    for fault, kinds in rows:
+        if kinds and "," not in kinds:
+            alone.setdefault(kinds, []).append(fault)
+    return alone
+
+
+def page() -> str:
+    """Return the text of docs/findings.md."""
+    parts, alone, every = [HEAD], only_named_by(), rules()
+    for kind in sorted({rule.kind for rule in every}):
+        own = [rule for rule in every if rule.kind == kind]
+        severities = {rule.severity for rule in own}
+        parts.append(f"\n## {kind}\n\nA {severities.pop() if len(severities) == 1 else 'warning or doubt'}.\n")
+        for rule in own:
+            says = " ".join(rule.says.partition("\n\nParameters")[0].partition("\n\nReturns")[0].split())
+            parts.append(f"\n{says} (`{rule.room}`)\n")
+            if rule.text:
+                parts.append(f"\n> {rule.text}\n")
+        if kind in alone:
+            parts.append(f"\nPlanted faults that only this kind names: {'; '.join(alone[kind])}.\n")
+    return "".join(parts)
