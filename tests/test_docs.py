@@ -21,7 +21,7 @@ from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.map_result import OUTCOMES
 from uwblite.pipeline.mapping_config import MappingConfig
 
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(document, language):
@@ -212,6 +212,6 @@ def test_every_kind_of_warning_and_doubt_is_listed():
     assert set(OUTCOMES) <= listed
 
 
-@pytest.mark.parametrize("page", sorted(p.name for p in (ROOT / "docs").glob("*.md")))
+@pytest.mark.parametrize("page", sorted(p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")))
 def test_every_page_is_linked_from_the_readme(page):
     assert f"docs/{page}" in (ROOT / "README.md").read_text()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How accurate the defaults are, what each ingredient buys, and what false measurements cost; writes docs/accuracy.md.
+"""How accurate the defaults are, what each ingredient buys, and what false measurements cost; writes docs/lab/accuracy.md.
 
     python tools/accuracy.py                                     everything, about an hour on two cores
     python tools/accuracy.py simulated --seeds 1 --only hall,lab a part of it
@@ -588,7 +588,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("parts", nargs="*", choices=[*PARTS, []], metavar="PART", help=f"some of {', '.join(PARTS)} (all)")
-    p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
+    p.add_argument("--out", type=Path, default=ROOT / "docs" / "lab" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings per row (3)")
     p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation, first of fusion (1)")

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Are the stated uncertainties true? Maps simulated recordings and compares errors with the covariances that uwblite states.
 
-    python tools/consistency.py                              20 recordings of 7 min of each world; writes into docs/accuracy.md
+    python tools/consistency.py                              20 recordings of 7 min of each world; writes docs/lab/accuracy.md
     python tools/consistency.py --runs 4 --minutes 4 --only hall --print     a quick look
     python tools/consistency.py --of "corridor, no lidar" --of "lab, one anchor" --minutes 4 --print
     python tools/consistency.py --easy --print               rooms without errors that stay with places
@@ -211,7 +211,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--easy", action="store_true", help="rooms without errors that stay with places, walls and floors")
     p.add_argument("--first", type=int, default=FIRST_SEED, metavar="SEED", help=f"seed of the first recordings ({FIRST_SEED})")
     p.add_argument("--minutes", type=float, default=7.0, metavar="N", help="length of each (7)")
-    p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
+    p.add_argument("--out", type=Path, default=ROOT / "docs" / "lab" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")
     p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
     p.add_argument("--keep", type=Path, metavar="FILE", help="add to the recordings kept in FILE, which must be of one state")

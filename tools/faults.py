@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Does a wrong result say that it is wrong? Puts faults of sensors and users into recordings and maps them.
 
-    python tools/faults.py                               3 min of a lab; writes into docs/accuracy.md
+    python tools/faults.py                               3 min of a lab; writes into docs/lab/accuracy.md
     python tools/faults.py --only frozen                 cases whose names contain a word; the page stays
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
 
@@ -225,7 +225,7 @@ def write_page(page: Path, done: Sequence[Outcome], minutes: float) -> None:
         f"## Faults\n\nFaults of sensors and of users, put into {minutes:g} min of a simulated recording or into a real one.\n"
         f"{meaning}\n\n{words}\n\n{summary(done)}.\n\n{table(*counted(done))}\n"
         "### Every kind of fault\n\nThe number is the error of the trajectory (ATE), m. The last column has the kinds of all "
-        "doubts of the row, the most\nfrequent first; [findings.md](findings.md) explains them.\n\n"
+        "doubts of the row, the most\nfrequent first; [findings.md](../findings.md) explains them.\n\n"
         f"{table(*by_kind(done))}"
     )
     write_section(page, "faults", text)
@@ -242,7 +242,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--only", action="append", default=[], metavar="WORD", help=only)
     p.add_argument("--sensors", default="all,no-lidar,no-uwb")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
-    p.add_argument("--print", action="store_true", help="do not write docs/accuracy.md")
+    p.add_argument("--print", action="store_true", help="do not write docs/lab/accuracy.md")
     p.add_argument("--verbose", action="store_true", help="show warnings too")
     args = p.parse_args(argv)
     worlds, tasks = args.worlds.split(","), []
@@ -264,7 +264,7 @@ def main(argv: list[str] | None = None) -> int:
             print(*(f"      warning: {w}" for w in outcome.warnings), sep="\n", flush=True)
     print(summary(done))
     if not args.print and not args.only:
-        write_page(ROOT / "docs" / "accuracy.md", done, args.minutes)
+        write_page(ROOT / "docs" / "lab" / "accuracy.md", done, args.minutes)
     return 1 if any(o.verdict.isupper() for o in done) else 0
 
 

@@ -1,7 +1,7 @@
 """The page docs/findings.md: every kind of finding, from the rules' own code and texts and from the table of faults.
 
 A rule is a function of the package that makes a finding of a kind; its docstring says what it looks at and why, its text is the
-example, and the table of faults in docs/accuracy.md shows which planted faults only this kind names.
+example, and the table of faults in docs/lab/accuracy.md shows which planted faults only this kind names.
 """
 
 import ast
@@ -106,8 +106,8 @@ def plain(node: ast.expr | None) -> str:
 
 
 def only_named_by() -> dict[str, list[str]]:
-    """Return, by kind, the faults after which it was the only doubt, from the table in docs/accuracy.md."""
-    page = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    """Return, by kind, the faults after which it was the only doubt, from the table in docs/lab/accuracy.md."""
+    page = (ROOT / "docs" / "lab" / "accuracy.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (.+?) \|.*\| ([a-z, -]*) \|$", page.partition("### Every kind of fault")[2], re.M)
     alone: dict[str, list[str]] = {}
     for fault, kinds in rows:

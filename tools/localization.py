@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How a live localisation starts, tracks and recovers in maps of other recordings; writes docs/localization.md.
+"""How a live localisation starts, tracks and recovers in maps of other recordings; writes docs/lab/localization.md.
 
     python tools/localization.py                          hall, lab and warehouse: half an hour
     python tools/localization.py --only lab --starts 10   a part of it
@@ -383,7 +383,7 @@ def main(argv: list[str] | None = None) -> int:
             text += "\n" + table((f"{world}, wrong map: certain in", "all sensors", "without lidar"), rows)
         print(text, flush=True)
         if not args.print:
-            write_section(ROOT / "docs" / "localization.md", f"localization {world}", text)
+            write_section(ROOT / "docs" / "lab" / "localization.md", f"localization {world}", text)
     return 0
 
 

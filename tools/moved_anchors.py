@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Are moved anchors found, and only these? Moves anchors of simulated recordings, and leaves all where they are in others.
 
-    python tools/moved_anchors.py                       writes into docs/accuracy.md
+    python tools/moved_anchors.py                       writes into docs/lab/accuracy.md
     python tools/moved_anchors.py --worlds hall,lab --runs 2 --first 500 --print     a quick look
 
 The ranges keep their errors: each is longer or shorter by what the true distance changes. Rooms are those of
@@ -123,7 +123,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--runs", type=int, default=3, metavar="N", help="recordings of each world (3)")
     p.add_argument("--minutes", type=float, default=4.0, metavar="N", help="length of each (4)")
     p.add_argument("--first", type=int, default=91000, metavar="SEED", help="seed of the first recordings (91000)")
-    p.add_argument("--print", action="store_true", help="print instead of writing docs/accuracy.md")
+    p.add_argument("--print", action="store_true", help="print instead of writing docs/lab/accuracy.md")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
     args = p.parse_args(argv)
     tasks: list[Settings] = []
@@ -141,7 +141,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.print:
         print(text)
     else:
-        write_section(ROOT / "docs" / "accuracy.md", "moved anchors", text)
+        write_section(ROOT / "docs" / "lab" / "accuracy.md", "moved anchors", text)
     return 0
 
 

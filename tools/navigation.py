@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A robot drives to goals by the live pose alone, in the simulator; writes docs/localization.md.
+"""A robot drives to goals by the live pose alone, in the simulator; writes docs/lab/localization.md.
 
     python tools/navigation.py                      lab, hall, warehouse and arena, 20 goals each
     python tools/navigation.py --only lab --goals 5 --print
@@ -316,7 +316,7 @@ def main(argv: list[str] | None = None) -> int:
     text = table(head, rows)
     print(text)
     if not args.print:
-        write_section(ROOT / "docs" / "localization.md", "closed loop", text)
+        write_section(ROOT / "docs" / "lab" / "localization.md", "closed loop", text)
     return 0
 
 

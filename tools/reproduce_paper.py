@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Repeat the experiments of the paper on simulated buildings, with its plain settings and with the defaults.
 
-    python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png; ten minutes on two cores
+    python tools/reproduce_paper.py            docs/lab/paper.md and its pictures; ten minutes on two cores
     python tools/reproduce_paper.py --quick --out paper-out    recordings of 6 min, one seed, a few minutes
 
 Liu et al., Cost-effective Mapping of Mobile Robot Based on the Fusion of UWB and Short-range 2D LiDAR (CITATION.cff):
@@ -390,7 +390,7 @@ def gallery() -> str:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of paper.md (docs)")
+    p.add_argument("--out", type=Path, default=ROOT / "docs" / "lab", metavar="DIR", help="folder of paper.md (docs/lab)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min, one seed, few values")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings of the hall (3)")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")

@@ -1,6 +1,6 @@
 """A site mapped from several recordings against what their measurements allow together.
 
-    python tools/site_oracle.py                        writes the part "site" of docs/accuracy.md
+    python tools/site_oracle.py                        writes the part "site" of docs/lab/accuracy.md
     python tools/site_oracle.py --seeds 1 --print      the first three recordings only
 
 The oracle of tools/oracle.py for several recordings at once: anchors, their biases and patterns, walls and columns are the same
@@ -139,7 +139,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.print:
         print(text)
     else:
-        write_section(ROOT / "docs" / "accuracy.md", "site", text)
+        write_section(ROOT / "docs" / "lab" / "accuracy.md", "site", text)
     return 0
 
 

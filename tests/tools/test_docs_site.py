@@ -21,7 +21,7 @@ from docs_site import as_in_site
         ("docs/api.md", "../README.md", "index.md"),
         ("firmware_notes/README.md", "../docs/formats.md", "../formats.md"),
         ("firmware_notes/README.md", "anchors.md", "../firmware_notes/anchors.md"),
-        ("docs/paper.md", "https://arxiv.org/abs/2106.03648", "https://arxiv.org/abs/2106.03648"),
+        ("docs/lab/paper.md", "https://arxiv.org/abs/2106.03648", "https://arxiv.org/abs/2106.03648"),
         ("docs/api.md", "#progress", "#progress"),
     ],
 )

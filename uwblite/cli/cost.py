@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from ..sensor_log import SensorLog
 
 SECONDS_AT_LEAST = 0.5
-"""Starting, reading settings, writing files; on the computer of docs/performance.md, as the figures below."""
+"""Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
 _SECONDS_PER_METRE = 0.06
 """Of driving, with lidar: matching of clouds, graph."""
 _SECONDS_PER_METRE_WITHOUT_LIDAR = 0.0005
@@ -28,7 +28,7 @@ _TRIAL_SECONDS = 3.0
 
 
 def work_seconds(log: "SensorLog") -> float:
-    """Return the time that the map of a recording takes on the computer of docs/performance.md, s."""
+    """Return the time that the map of a recording takes on the computer of docs/lab/performance.md, s."""
     import numpy as np
 
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
@@ -40,7 +40,7 @@ def work_seconds(log: "SensorLog") -> float:
 
 
 def model_seconds(log: "SensorLog") -> float:
-    """Return the wall time of a map on the computer of docs/performance.md, s."""
+    """Return the wall time of a map on the computer of docs/lab/performance.md, s."""
     return SECONDS_AT_LEAST + work_seconds(log)
 
 

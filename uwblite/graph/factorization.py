@@ -22,7 +22,7 @@ from .elimination import elimination_tree, is_full, minimum_degree, narrow_order
 from .schwarz_cg import expected_work
 
 _WIDEST_BAND = 16
-"""Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
+"""Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""
 _WIDEST_BORDER = 48
 """Most scalars in a border; more of them stay in the sparse matrix."""
 _LONGEST_LINK = 16

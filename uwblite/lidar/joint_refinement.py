@@ -263,7 +263,7 @@ def measured_again(
 _BETTER = 0.002
 """Share by which the mean squared distance of matches has to fall from round to round at the last gate. Where it does not,
 clouds creep in unobserved directions: for many rounds where recordings overlap in corridors, and away from the truth
-(docs/performance.md)."""
+(docs/lab/performance.md)."""
 _GATE_PER_SHIFT = 3.0
 """Ratio of the gate of a round to the largest motion of a cloud in the frame of its partner in the round before."""
 

@@ -40,7 +40,7 @@ _SPACING, _SCANS = 0.3, 2
 _LONG, _WIDER, _FINE = 800.0, 1.5, 500
 """Path from which on keyframes are farther apart, m, in proportion to it; how many times as far at most; and beams with which
 one scan is a cloud there. Whoever drives far in a building sees its walls again and again, and noise averages out over the
-visits: what is left of the error hardly depends on how many clouds there are (docs/performance.md)."""
+visits: what is left of the error hardly depends on how many clouds there are (docs/lab/performance.md)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
