@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from uwblite.cli import check, cost
-from uwblite.cli.stage_shares import Overall
 from uwblite.config import override
-from uwblite.errors import Cancelled, DataError
-from uwblite.mapping import MappingConfig, Stage
+from uwblite.mapping import MappingConfig
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
 
@@ -36,58 +34,7 @@ def test_memory_grows_with_path_scans_beams_and_cells(place):
 
 
 def test_without_lidar_it_takes_less_memory():
-    assert cost.expected_megabytes(300.0, 0, 0, 0) < 0.5 * cost.expected_megabytes(300.0, 9000, 682, 300_000)
-
-
-def begun(monkeypatch, stages, refused=None):
-    """Replace the map by stages (name, s) that report ten steps each, on a clock of their own."""
-    clock = [0.0]
-
-    def build_map(part, config=None, *, progress):
-        for name, seconds in stages:
-            for step in range(1, 11):
-                clock[0] += seconds / 10
-                if progress(Stage(name), step, 10) is False:
-                    raise Cancelled("stopped")
-        if refused:
-            raise DataError(refused)
-
-    monkeypatch.setattr("uwblite.mapping.build_map", build_map)
-    monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
-    return clock
-
-
-def usual(seconds, lidar=True):
-    """Return the stages of a map of so many seconds that takes what maps usually take in each."""
-    shares = Overall(lidar=lidar)._shares
-    return [(name, seconds * share / sum(s for _, s in shares)) for name, share in shares]
-
-
-@pytest.mark.parametrize("lidar", [True, False])
-@pytest.mark.parametrize("seconds", [0.5, 30.0, 300.0])
-def test_the_time_of_a_usual_map_is_known_after_a_part_of_it(log, monkeypatch, seconds, lidar):
-    clock = begun(monkeypatch, usual(seconds, lidar))
-    assert cost.expected_seconds(log.without(lidar=not lidar)) == pytest.approx(cost.SECONDS_AT_LEAST + seconds, rel=1e-6)
-    longest_step = max(s for _, s in usual(seconds, lidar)) / 10
-    assert clock[0] <= min(seconds, cost._TRIAL_SECONDS + longest_step) + 1e-9
-
-
-def test_a_stage_that_takes_longer_than_usual_makes_the_estimate_longer(log, monkeypatch):
-    """Wherever along the recording the difficult part lies: the stages go over all of it."""
-    stages = [(name, 4.0 * s if name == "scan-to-scan matching" else s) for name, s in usual(8.0)]
-    begun(monkeypatch, stages)
-    assert cost.expected_seconds(log) == pytest.approx(sum(s for _, s in stages), rel=0.5)
-
-
-def test_without_the_lidar_by_the_settings_the_stages_are_those_of_the_radio(log, monkeypatch):
-    begun(monkeypatch, usual(30.0, lidar=False))
-    config = override(MappingConfig(), ["use_lidar=false"])
-    assert cost.expected_seconds(log, config) == pytest.approx(cost.SECONDS_AT_LEAST + 30.0, rel=1e-6)
-
-
-def test_what_a_map_refuses_costs_what_the_model_expects(log, monkeypatch):
-    begun(monkeypatch, [("keyframes", 0.1)], refused="nothing")
-    assert cost.expected_seconds(log) == cost.model_seconds(log)
+    assert cost.expected_megabytes(300.0, 0, 0, 0) < cost.expected_megabytes(300.0, 9000, 682, 300_000) - 40
 
 
 @pytest.mark.parametrize("slow", [0.2, 30.0])
@@ -114,3 +61,12 @@ def test_the_map_is_as_large_as_what_was_seen(log):
     scans = LaserScans(np.array([0.0, 1.0]), ranges, -np.pi / 2, np.pi / 2, 0.0, 0.1, 5.0)
     assert cost.seen_size(SensorLog(odometry, scans=scans)) == pytest.approx([3.0, 3.0])
     assert np.array_equal(cost.seen_size(log.without(lidar=True)), np.ptp(log.odometry.poses[:, :2], axis=0))
+
+
+def test_a_larger_grid_than_is_allowed_costs_what_is_allowed(log):
+    few = cost.expected_cost(log, override(MappingConfig(), ["grid.resolution=0.001", "grid.max_cells=10000"]))
+    assert few["map cells"] == 10_000
+    many = cost.expected_cost(log, override(MappingConfig(), ["grid.resolution=0.001"]))
+    assert many["megabytes"] > few["megabytes"] + 100
+    assert few["map width m"] == cost.expected_cost(log)["map width m"] > 5.0
+    assert cost.expected_cost(log.without(lidar=True))["map cells"] == 0

@@ -161,10 +161,16 @@ def test_mounting_and_settings_of_the_command_line_count(minute_log, tmp_path, c
     assert (tmp_path / "map" / "map_scale.png").exists()
 
 
-def test_a_dry_run_writes_nothing(short_log, tmp_path, capsys):
-    assert main(["map", str(short_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
-    assert "expected cost" in capsys.readouterr().out
-    assert not (tmp_path / "map").exists()
+def test_a_dry_run_maps_and_writes_nothing(short_log, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("uwblite.mapping.build_map", None)
+    assert main(["map", str(short_log), "--dry-run"]) == 0
+    line = r".*short.log.gz: about \d+ s of a desktop computer, \d+ MB, a map of \d+ x \d+ m\n"
+    assert re.fullmatch(line, capsys.readouterr().out)
+    assert main(["map", str(short_log), "--dry-run", "--json", "--out", "map", "--set", "use_lidar=true"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert row["expected cost of map"]["megabytes"] > 50
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -24,6 +24,8 @@ VERBS = (
     "optimize", "config",
 )  # fmt: skip
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
+_WITHOUT_MATRICES = ("view", "record", "watch", "devices", "config")
+"""Verbs that leave maps to other processes, or make none."""
 
 _DESCRIPTION = """\
 Maps from wheel odometry, ultra-wideband ranges to unknown anchors and a short-range 2D lidar.
@@ -183,13 +185,15 @@ def _flushed(code: int) -> int:
 
 def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) -> int:
     """Run a verb and turn its errors into exit codes."""
-    from . import console
+    from . import console, memory
 
     try:
         with warnings.catch_warnings():
             if not args.debug:
                 # numpy's remarks on overflows say nothing to a user; what comes of them is in a message of ours.
                 warnings.simplefilter("ignore", RuntimeWarning)
+            if module.__name__.rpartition(".")[2] not in _WITHOUT_MATRICES:
+                memory.load_libraries()
             return int(module.run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
@@ -202,16 +206,19 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
 
 def failure(error: BaseException) -> tuple[int, str]:
     """Return the exit code that an error means, and what is said of it."""
-    from . import console
+    from . import console, memory
 
     if isinstance(error, UwbliteError):
         return 2 if isinstance(error, UsageError) else 1, str(error)
-    if isinstance(error, MemoryError):
-        return 1, _OUT_OF_MEMORY
+    # A library that does not fit is an ImportError; one that is absent is a ModuleNotFoundError.
+    unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
+    if isinstance(error, MemoryError) or unfit:
+        limited = f"; the shell allows {size / 1e6:.0f} MB (ulimit -v)" if (size := memory.address_space()) else ""
+        return 1, _OUT_OF_MEMORY + limited
     if isinstance(error, OSError):
         return 1, console.os_error_text(error)
     if isinstance(error, ImportError):
-        return 1, f"a library could not be loaded: {error}; is there memory enough, and is the installation whole?"
+        return 1, f"a library could not be loaded: {error}; is the installation whole?"
     return 1, f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
 
 

@@ -9,7 +9,6 @@ from .wording import calibration_text, signed
 
 if TYPE_CHECKING:
     from ..checks.recording import Diagnosis
-    from ..mapping import MappingConfig
     from ..sensor_log import SensorLog
 
 HELP = "say what is wrong with a recording and what to do about it, before mapping it"
@@ -67,37 +66,16 @@ def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
     return diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts), seconds
 
 
-def expected_cost(log: "SensorLog", seconds: float | None = None, config: "MappingConfig | None" = None) -> dict[str, float]:
-    """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
-
-    They are those of the recording as a map repairs it; empty where it refuses the recording. Where no time is given, the map
-    is begun to find it.
-    """
-    import numpy as np
-
+def expected_cost(log: "SensorLog", seconds: float) -> dict[str, float]:
+    """Return what `uwblite map` is expected to need of the recording as it repairs it; empty where it refuses the recording."""
     from ..errors import DataError
-    from ..mapping import MappingConfig
     from ..screening.screen import screen
-    from .cost import expected_megabytes, expected_seconds, seen_size
+    from . import cost
 
     try:
-        log = screen(log)
+        return {**cost.expected_cost(screen(log)), "seconds": round(seconds, 1)}
     except DataError:
         return {}
-
-    resolution = (config or MappingConfig()).grid.resolution
-    size = seen_size(log)
-    cells = 0 if log.scans is None else int(np.prod(size / resolution))
-    scans = 0 if log.scans is None else len(log.scans.stamps)
-    beams = 0 if log.scans is None else log.scans.ranges.shape[1]
-    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
-    return {
-        "seconds": round(expected_seconds(log, config) if seconds is None else seconds, 1),
-        "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
-        "map width m": round(float(size[0]), 1) if cells else 0.0,
-        "map height m": round(float(size[1]), 1) if cells else 0.0,
-        "map cells": cells,
-    }
 
 
 def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> dict[str, Any]:
@@ -124,7 +102,7 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> l
     lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
     if cost:
         grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
-        lines.append(f"expected cost here: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
+        lines.append(f"expected cost: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
     serious = len(diagnosis.serious)
     lines.append(
         f"fix the {serious} serious finding{'s' if serious > 1 else ''} first"

@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,13 +45,19 @@ def make(
     reading: float,
     progress: "Progress | None" = None,
     executor: "Executor | None" = None,
+    note: Callable[[str], None] | None = None,
 ) -> Made:
-    """Map recordings and write the result; say nothing.
+    """Map recordings and write the result; say nothing but notes.
 
     Parameters
     ----------
     logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
     reading : time that it took to read them, s.
+    note : is told beforehand where memory will be short.
+
+    Raises
+    ------
+    ConfigError : the map needs more than twice the memory there is, and args.ignore_memory is not set.
     """
     from ..io.result_text import RunRecord
     from ..io.results import write_result
@@ -66,6 +73,7 @@ def make(
 
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
+    _check_memory(kept, config, args.ignore_memory, note)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
     record = RunRecord(
@@ -83,6 +91,23 @@ def make(
     )
     names = write_result(args.out, kept, result, record)
     return Made(kept, result, names, reading + time.perf_counter() - began)
+
+
+def _check_memory(
+    logs: "list[SensorLog]", config: "MappingConfig", ignore: bool, note: Callable[[str], None] | None
+) -> None:
+    """Refuse a map that will not fit in memory, or note that it may not."""
+    from ..errors import ConfigError
+    from .cost import expected_cost, together
+    from .memory import shortage
+
+    found = shortage(together([expected_cost(log, config) for log in logs])["megabytes"])
+    if found is None:
+        return
+    if found.hopeless and not ignore:
+        raise ConfigError(f"{found.text}; --ignore-memory tries all the same")
+    if note is not None:
+        note(f"uwblite: {found.text}")
 
 
 def config_text(config: "MappingConfig") -> str:

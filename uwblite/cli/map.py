@@ -27,7 +27,7 @@ examples:
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
   uwblite map run.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
   uwblite map run.log --out map/ --scheduler tcp://head:8786    the heavy stages on a cluster of dask.distributed
-  uwblite map run.log --out map/ --dry-run             read, check and estimate only
+  uwblite map run.log --dry-run                        read, and estimate time and memory
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
   trajectory_covariance.csv, anchors.csv, range_errors.csv, graph.g2o, graph.pyfg, graph_stamps.csv, config.toml,
@@ -40,14 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     several = "CARMEN log, plain or .gz, ROS bag or CSV folder; several are mapped together; - reads a log from standard input"
     parser.add_argument("logs", metavar="LOG", nargs="+", help=several)
-    parser.add_argument("--out", type=place, metavar="DIR", required=True, help="folder for the result")
+    out = parser.add_argument("--out", type=place, metavar="DIR", required=True, help="folder for the result")
     parser.add_argument("--force", action="store_true", help="replace a result that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
-    parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
+    text = "read, estimate time and memory, and map nothing; needs no --out"
+    parser.add_argument("--dry-run", action=_Instead, nargs=0, default=False, const=out, help=text)
     text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
     parser.add_argument("--corrected-log", type=place, metavar="FILE", help=text)
     add_worker_arguments(parser, "processes for the heavy stages (1)")
     add_map_arguments(parser)
+
+
+class _Instead(argparse.Action):
+    """A switch with which another option, its `const`, is not required."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: Any) -> None:
+        setattr(namespace, self.dest, True)
+        self.const.required = False
 
 
 def add_map_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +81,8 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     beforehand.add_argument("--constraints", type=place, metavar="FILE.toml", help=text)
     text = "go on in the frame of an earlier map: its anchors.csv; anchors that were moved since are named"
     beforehand.add_argument("--anchors-from", type=place, metavar="FILE.csv", help=text)
+    text = "map although it is expected to need more than twice the memory that this computer, control group or shell gives"
+    parser.add_argument("--ignore-memory", action="store_true", help=text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
@@ -86,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     name_recordings_once(args)
     _check_corrected_log(args)
     if args.dry_run:
-        return _map(args)
+        return _dry_run(args)
     with sole_writer(args.out):
         check_target(args.out, force=args.force)
         return _map(args)
@@ -94,20 +105,24 @@ def run(args: argparse.Namespace) -> int:
 
 def _map(args: argparse.Namespace) -> int:
     from . import console
-    from .making import read_logs
 
     began = time.perf_counter()
-    with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
-        logs = read_logs(args, executor)
-    reading = time.perf_counter() - began
-    _report_reader_warnings(logs)
-    if args.dry_run:
-        return max(_dry_run(args, log) for log in logs)
-    made = _make_shown(args, logs, reading)
+    logs = _read(args)
+    made = _make_shown(args, logs, time.perf_counter() - began)
     if args.corrected_log:
         _write_corrected_log(args, made)
     console.report(args.json, summary_json(args, made), summary_lines(args, made))
     return 3 if made.result.doubts else 0
+
+
+def _read(args: argparse.Namespace) -> "list[SensorLog]":
+    """Return the recordings of the command line; what is wrong with their files is said."""
+    from .making import read_logs
+
+    with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
+        logs = read_logs(args, executor)
+    _report_reader_warnings(logs)
+    return logs
 
 
 def _check_corrected_log(args: argparse.Namespace) -> None:
@@ -156,7 +171,7 @@ def _make_shown(args: argparse.Namespace, logs: "list[SensorLog]", reading: floa
 
     try:
         with workers(args.jobs, args.scheduler) as executor:
-            return make(args, logs, reading, report, executor)
+            return make(args, logs, reading, report, executor, console.note)
     finally:
         progress.close()
 
@@ -172,16 +187,28 @@ def _report_reader_warnings(logs: list["SensorLog"]) -> None:
             console.note(f"uwblite: {notes.source}: {warning}")
 
 
-def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
-    from ..checks.recording import diagnose
-    from . import check, console
+def _dry_run(args: argparse.Namespace) -> int:
+    from ..screening.screen import screen
+    from . import console
+    from .cost import expected_cost, together
     from .making import settings
+    from .memory import shortage
 
-    diagnosis = diagnose(log)
-    cost = check.expected_cost(log, config=settings(args))
-    about = log.notes.source, diagnosis, cost
-    console.report(args.json, check.summary_json(*about), check.report_lines(*about))
-    return 3 if diagnosis.serious else 0
+    config = settings(args)
+    costs = [expected_cost(screen(log, config.detect_laser_flip), config) for log in _read(args)]
+    rows = [{"log": name, "expected cost of map": each} for name, each in zip(args.logs, costs, strict=True)]
+    whole = together(costs)
+    summary = {"recordings": rows, "expected cost of map": whole, "exit_code": 0}
+    lines = [_cost_line(log, cost) for log, cost in zip(args.logs, costs, strict=True)]
+    console.report(args.json, summary, [*lines, _cost_line("all together", whole)] if len(lines) > 1 else lines)
+    if found := shortage(whole["megabytes"]):
+        console.note(f"uwblite: {found.text}")
+    return 0
+
+
+def _cost_line(name: str, cost: dict[str, float]) -> str:
+    grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost.get("map cells") else ""
+    return f"{name}: about {cost['seconds']:.0f} s of a desktop computer, {cost['megabytes']:.0f} MB{grid}"
 
 
 def summary_json(args: argparse.Namespace, made: "Made") -> dict[str, Any]:

@@ -1,0 +1,135 @@
+"""Memory: limits that are read, what is said beforehand, and one line where there is too little."""
+
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+from uwblite.cli import cost, main, memory
+
+resource = pytest.importorskip("resource")
+
+
+@pytest.fixture
+def system(tmp_path, monkeypatch):
+    """Folders that stand for /proc and /sys/fs/cgroup, with nothing in them; the address space has no limit."""
+    (tmp_path / "proc" / "self").mkdir(parents=True)
+    monkeypatch.setattr(memory, "_PROC", str(tmp_path / "proc"))
+    monkeypatch.setattr(memory, "_CGROUPS", str(tmp_path / "cgroup"))
+    monkeypatch.setattr(memory, "address_space", lambda: 0)
+
+    def write(name, text):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    return write
+
+
+def sizes():
+    return [limit.bytes for limit in memory.limits()]
+
+
+def test_what_cannot_be_read_sets_no_limit(system):
+    assert memory.limits() == []
+    assert memory.shortage(1e9) is None
+    system("proc/meminfo", "no such rows\n")
+    system("proc/self/cgroup", "neither\n")
+    system("proc/self/statm", "nor this")
+    assert memory.limits() == []
+
+
+def test_the_limit_of_every_group_around_the_process_counts(system):
+    system("proc/self/cgroup", "0::/user/shell\n")
+    system("cgroup/memory.max", "max\n")
+    system("cgroup/user/memory.max", "500000000\n")
+    system("cgroup/user/shell/memory.max", "max\n")
+    assert sizes() == [500_000_000]
+
+
+def test_groups_of_the_first_version_have_a_folder_for_memory(system):
+    system("proc/self/cgroup", "5:cpu,cpuacct:/a\n4:memory:/a\n0::/b\n")
+    system("cgroup/memory/a/memory.limit_in_bytes", "400000000\n")
+    system("cgroup/memory/memory.limit_in_bytes", "9223372036854771712\n")
+    assert sizes() == [400_000_000]
+
+
+def test_the_computer_has_its_memory_and_what_it_swaps(system):
+    system("proc/meminfo", "MemTotal:        1000 kB\nMemFree:  5 kB\nSwapTotal:  24 kB\n")
+    assert sizes() == [1024 * 1024]
+
+
+def test_the_tightest_limit_is_named_and_twice_as_much_is_hopeless(system):
+    system("proc/meminfo", "MemTotal: 1000000 kB\nSwapTotal: 0 kB\n")
+    system("proc/self/cgroup", "0::/\n")
+    system("cgroup/memory.max", "500000000\n")
+    assert memory.shortage(499.0) is None
+    few, many = memory.shortage(600.0), memory.shortage(1001.0)
+    assert not few.hopeless
+    assert many.hopeless
+    assert "about 600 MB" in few.text
+    assert "control group is 500 MB" in few.text
+
+
+def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeypatch):
+    monkeypatch.setattr(memory, "address_space", lambda: 300_000_000)
+    system("proc/self/statm", "61000 1000 3 4\n")
+    page = memory._pages()[0] // 61_000
+    assert memory.shortage(299.0 - 60_000 * page / 1e6) is None
+    assert "ulimit -v" in memory.shortage(301.0 - 60_000 * page / 1e6).text
+
+
+def limited(monkeypatch, size):
+    monkeypatch.setattr(memory, "limits", lambda: [memory.Limit("the limit of this test", size)])
+
+
+def test_a_map_that_will_not_fit_is_refused_before_it_begins(short_log, tmp_path, monkeypatch, capsys):
+    limited(monkeypatch, 10_000_000)
+    words = ["map", str(short_log), "--out", str(tmp_path / "map")]
+    monkeypatch.setattr("uwblite.mapping.build_map", lambda *_, **__: pytest.fail("nothing is to be mapped"))
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert "the limit of this test is 10 MB" in said
+    assert "--ignore-memory" in said
+    assert not (tmp_path / "map").exists()
+
+
+def test_it_is_tried_where_that_is_wanted_and_where_it_may_fit(short_log, tmp_path, monkeypatch, capsys):
+    words = ["map", str(short_log), "--out", str(tmp_path / "map"), "--without", "lidar"]
+    limited(monkeypatch, 10_000_000)
+    assert main([*words, "--ignore-memory"]) in (0, 3)
+    assert "the limit of this test" in capsys.readouterr().err
+    limited(monkeypatch, 70_000_000)
+    assert main([*words, "--force"]) in (0, 3)
+    assert "70 MB" in capsys.readouterr().err
+    assert main(["map", str(short_log), "--dry-run"]) == 0
+    assert "70 MB" in capsys.readouterr().err
+
+
+def test_of_several_recordings_the_program_counts_once(log):
+    one = cost.expected_cost(log)
+    two = cost.together([one, one])
+    assert one["megabytes"] < two["megabytes"] < 2 * one["megabytes"] - 50
+    assert one["seconds"] < two["seconds"] < 2 * one["seconds"]
+
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]) * 1_000_000,) * 2)
+sys.argv = ["uwblite", *sys.argv[2:]]
+from uwblite.__main__ import start
+sys.exit(start())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the address space is limited on Linux")
+@pytest.mark.parametrize("megabytes", [60, 150, 260])
+def test_with_too_little_address_space_the_end_comes_soon_and_in_one_line(megabytes, short_log, tmp_path):
+    words = [str(megabytes), "map", str(short_log), "--out", str(tmp_path / "map"), "-q"]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *words], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert done.stderr.startswith("uwblite: error: out of memory")
+    assert f"{megabytes} MB (ulimit -v)" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,127 @@
+"""How much memory this process may have, compared beforehand with what a map needs."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import NamedTuple
+
+_PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
+_LIBRARIES = 300_000_000
+"""Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
+matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own."""
+_NO_LIMIT = 1 << 60
+"""Bytes from which a cgroup of version 1 has no limit: it says the largest multiple of a page in 63 bits."""
+
+
+class Limit(NamedTuple):
+    """The most memory that this process may have."""
+
+    name: str
+    bytes: int
+    of_addresses: bool = False
+    """It counts what is mapped, used or not, libraries too."""
+
+
+class Shortage(NamedTuple):
+    """A map that needs more memory than there is."""
+
+    text: str
+    hopeless: bool
+    """It needs more than twice as much: the estimate is not as wrong as that."""
+
+
+def shortage(megabytes: float) -> Shortage | None:
+    """Compare the memory that a map is expected to need with the limits of this process; None where it suffices."""
+    worst = max(((_needed(megabytes, limit) / limit.bytes, limit) for limit in limits()), default=None)
+    if worst is None or worst[0] <= 1.0:
+        return None
+    share, limit = worst
+    text = f"this map needs about {share * limit.bytes / 1e6:.0f} MB of memory; {limit.name} is {limit.bytes / 1e6:.0f} MB"
+    return Shortage(f"{text}: a larger --resolution, --every-nth-scan or a part of the recording needs less", share > 2.0)
+
+
+def _needed(megabytes: float, limit: Limit) -> float:
+    """Return bytes as this limit counts them."""
+    if not limit.of_addresses:
+        return 1e6 * megabytes
+    mapped, resident = _pages()
+    return 1e6 * megabytes + max(mapped - resident, 0)
+
+
+def limits() -> list[Limit]:
+    """Return the limits that this system sets; what cannot be read sets none."""
+    found = [Limit("this computer's memory", total)] if (total := _total()) else []
+    if addresses := address_space():
+        found.append(Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True))
+    return found + [Limit("the limit of this control group", size) for size in _group_limits() if size < _NO_LIMIT]
+
+
+def address_space() -> int:
+    """Return the limit of the address space, bytes; 0 = none."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return 0 if soft == resource.RLIM_INFINITY else soft
+
+
+def load_libraries() -> None:
+    """Where the address space is limited, load numpy and scipy, and let OpenBLAS map its buffers while there is room.
+
+    OpenBLAS tries for ever where it cannot map them.
+
+    Raises
+    ------
+    MemoryError : there is no room.
+    """
+    if not address_space():
+        return
+    import mmap
+
+    try:
+        mmap.mmap(-1, _LIBRARIES).close()
+    except OSError as error:
+        raise MemoryError(str(error)) from error
+    import numpy as np
+    from scipy.linalg import blas
+
+    square = np.ones((128, 128))  # products of smaller matrices do without the buffer
+    np.dot(square, square.T)
+    blas.dsyrk(1.0, square)
+
+
+def _pages() -> tuple[int, int]:
+    """Return what this process has mapped and what of it is in memory, bytes; zeros where that is not known."""
+    import os
+
+    words = _text(f"{_PROC}/self/statm").split()
+    with suppress(ValueError, IndexError):
+        return int(words[0]) * os.sysconf("SC_PAGE_SIZE"), int(words[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0, 0
+
+
+def _total() -> int:
+    """Return the memory of this computer with what it can swap, bytes; 0 where it is not known."""
+    rows = dict(line.split(":", 1) for line in _text(f"{_PROC}/meminfo").splitlines() if ":" in line)
+    return sum(1024 * int(rows[name].split()[0]) for name in ("MemTotal", "SwapTotal") if rows.get(name, "").split())
+
+
+def _group_limits() -> Iterator[int]:
+    """Yield the limits of this process's control group, of either version, and of those around it, bytes."""
+    for line in _text(f"{_PROC}/self/cgroup").splitlines():
+        _, controllers, path = (*line.split(":", 2), "", "")[:3]
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root, name = (f"{_CGROUPS}/memory", "memory.limit_in_bytes") if controllers else (_CGROUPS, "memory.max")
+        parts = [part for part in path.split("/") if part]
+        for depth in range(len(parts), -1, -1):
+            with suppress(ValueError):
+                yield int(_text("/".join([root, *parts[:depth], name])))
+
+
+def _text(path: str) -> str:
+    try:
+        with open(path, encoding="ascii", errors="replace") as file:
+            return file.read()
+    except OSError:
+        return ""
