@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 
+from ..errors import DataError
 from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan, Measured
 from ..sensor_log import SensorMounting
 from .known_map import KnownMap
@@ -38,6 +39,7 @@ class LiveFeed:
         self._early: list[Measured] = []
         self._seen: dict[str, float] = {}
         self._silent: set[str] = set()
+        self._wrong: set[str] = set()
         self._sees = False
 
     def take(self, data: bytes) -> Iterator[LocalizerState]:
@@ -71,6 +73,15 @@ class LiveFeed:
             yield from self._use(self._localizer, measured)
 
     def _use(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
+        """Use a measurement; one that does not fit the robot is left out, and the reason reported once."""
+        try:
+            yield from self._used(localizer, measured)
+        except DataError as error:
+            if str(error) not in self._wrong:
+                self._wrong.add(str(error))
+                self._note(f"left out: {error}")
+
+    def _used(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
         if isinstance(measured, LiveOdometry):
             yield localizer.add_odometry(measured.stamp, *measured.pose.tolist())
         elif isinstance(measured, LiveGyro):
