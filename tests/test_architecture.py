@@ -18,6 +18,7 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 
 FLOORS = (
     ("errors", "arrays", "findings"),
+    ("validation",),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
     ("constraints", "odometry", "grid"),

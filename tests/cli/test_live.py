@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import socket
 
 import numpy as np
@@ -18,6 +19,7 @@ from uwblite import se2
 from uwblite.cli import main
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
+from uwblite.localization.live_feed import LiveFeed
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,16 @@ def room(tmp_path_factory):
     log = folder / "run.log"
     log.write_text("\n".join(lines) + "\n")
     return folder, log, poses
+
+
+def test_ranges_of_a_tag_that_the_log_named_too_late_are_left_out_and_reported_once(room):
+    text, said = room[1].read_text(), []
+    feed = LiveFeed(known(), lambda mounting: mounting, said.append)
+    states = list(feed.take(text.encode()))
+    late = [re.sub("^UWB ", "UWB2 ", line) for line in text.splitlines(keepends=True) if line.startswith("UWB A ")]
+    list(feed.take("".join(late[-3:]).encode()))
+    assert said == ["left out: tag 1 is none of the robot's 1 tags; they count from 0"]
+    assert not states[-1].lost
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ def test_scan_jacobians_equal_differences_whatever_of_mounting_and_delay_is_free
 @pytest.mark.parametrize(("scale", "turn"), [(-0.95, 0.2), (-1.5, 0.2), (0.3, -0.97), (-0.99, -2.0), (-0.85, -0.85)])
 def test_wheels_that_count_more_than_ten_times_what_they_do_divide_by_a_tenth(scale, turn):
     graph, kinds = every_kind(10)
-    edges = replace(kinds["odometry"], calibration=np.tile([0, 1, 2, 3, -1, -1, -1], (8, 1)))
+    edges = replace(kinds["odometry"], calibration=np.tile([0, 1, 2, 3, -1, -1, -1, -1], (8, 1)))
     values = np.concatenate([[scale, turn], graph.calibration.values[2:]])
     graph = graph.updated(graph.poses, graph.anchors, values)
     assert_jacobians_equal_differences(graph, edges)

@@ -6,11 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from uwblite.errors import DataError
 from uwblite.lidar.point_cloud import (
     estimate_normals,
     make_tree,
     radius_outlier_filter,
     statistical_outlier_filter,
+    voxel_filter,
 )
 
 clouds = hnp.arrays(
@@ -43,6 +45,34 @@ def test_radius_filter_equals_brute_force(points, radius, least):
     others = (distances <= radius).sum(axis=1) - 1
     clear = (np.abs(distances - radius) > 1e-9).all(axis=1)
     np.testing.assert_array_equal(radius_outlier_filter(points, radius, least)[clear], (others >= least)[clear])
+
+
+@settings(max_examples=60, deadline=None)
+@given(clouds, st.floats(0.05, 3.0))
+def test_voxel_filter_equals_brute_force(points, size):
+    squares = {}
+    for point, square in zip(points, np.floor(points / size).tolist(), strict=True):
+        squares.setdefault(tuple(square), []).append(point)
+    expected = np.array([np.mean(squares[key], axis=0) for key in sorted(squares)]).reshape(-1, 2)
+    np.testing.assert_allclose(voxel_filter(points, size), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("points", "words"), [
+    (np.zeros((3, 3)), r"points has shape \(3, 3\), expected \(n, 2\)"), ([[0.0, np.nan]], r"points\[0\] is not finite"),
+    ("wall", "points must hold numbers, not str"),
+])  # fmt: skip
+def test_filters_say_what_is_wrong_with_points(points, words):
+    for call in (lambda p: voxel_filter(p, 0.1), lambda p: statistical_outlier_filter(p, 3, 1.0),
+                 lambda p: radius_outlier_filter(p, 0.1, 1)):  # fmt: skip
+        with pytest.raises(DataError, match=words):
+            call(points)
+
+
+def test_filters_take_lists():
+    points = [[0, 0], [0, 1], [5, 5]]
+    np.testing.assert_array_equal(voxel_filter(points, 2.0), [[0.0, 0.5], [5.0, 5.0]])
+    assert radius_outlier_filter(points, 1.0, 1).tolist() == [True, True, False]
+    assert statistical_outlier_filter(points, 1, 0.5).tolist() == [True, True, False]
 
 
 def test_radius_filter_counts_a_neighbour_at_exactly_the_radius():

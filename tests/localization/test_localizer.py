@@ -271,6 +271,31 @@ def test_as_many_ids_as_ranges_are_wanted():
         robot(known()).localizer.add_ranges(100.0, ["A", "B"], [1.0, 2.0, 3.0])
 
 
+@pytest.mark.parametrize(("call", "words"), [
+    (lambda r: r.add_odometry("now", 0.0, 0.0, 0.0), "stamp must be a number, not str 'now'"),
+    (lambda r: r.add_odometry(1.0, 0.0, [0.0], 0.0), "y must be a number, not list"),
+    (lambda r: r.add_gyro(1.0, None), "heading must be a number, not NoneType"),
+    (lambda r: r.add_ranges(1.0, "AB", [1.0, 2.0]), "anchor_ids must be a list of names, not 'AB'"),
+    (lambda r: r.add_ranges(1.0, [1], [1.0]), "anchor_ids must be a list of names"),
+    (lambda r: r.add_ranges(1.0, ["A"], ["far"]), "metres must hold numbers, not str"),
+    (lambda r: r.add_ranges(1.0, ["A"], [1.0], tag=1), "tag 1 is none of the robot's 1 tags"),
+    (lambda r: r.add_scan(1.0, np.ones((1, 181)), SCANNER), r"ranges has shape \(1, 181\), expected \(181,\)"),
+    (lambda r: r.add_scan(1.0, np.ones(10)), r"ranges has shape \(10,\), expected \(181,\)"),
+])  # fmt: skip
+def test_measurements_of_another_form_are_refused_by_the_name_of_the_argument(call, words):
+    localizer = robot(known()).localizer
+    localizer.add_scan(0.0, [2] * 181, SCANNER)
+    with pytest.raises(DataError, match=words):
+        call(localizer)
+
+
+def test_another_scanner_may_have_another_number_of_rays():
+    localizer = robot(known()).localizer
+    localizer.add_scan(0.0, np.full(181, 2.0), SCANNER)
+    localizer.add_scan(0.1, np.full(91, 2.0), dataclasses.replace(SCANNER, angle_increment=2 * SCANNER.angle_increment))
+    localizer.add_scan(0.2, np.full(91, 2.0))
+
+
 def test_values_that_no_device_measures_change_nothing(drive):
     """Poses and headings whose steps have no digits left, readings beyond any lidar, a header that is broken."""
     poses, states = drive

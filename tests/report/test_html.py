@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from helpers.results import EVIL, small_result
 
-from uwblite.map_result import OUTCOMES
+from uwblite.graph.graph import UnknownKey
+from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
 from uwblite.report.html import render
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -66,12 +67,42 @@ def test_everything_that_belongs_in_it_is_there():
     for wanted in (
         "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small",
         "1 of 3 candidates accepted",
-        "odometry_scale", "\u22121.20", "the robot hardly turns", "0.800", "anchor 91A3 may be mirrored",
+        "odometry_scale", "\u22121.20 \u00b10.20 %", "the robot hardly turns", "40 / 50 = 0.80", "anchor 91A3 may be mirrored",
     ):  # fmt: skip
         assert wanted in words, wanted
     assert {"map-view", "anchors", "calibration", "loop-closures", "range-residuals", "stages", "warnings"} <= Page(text).ids
     assert text.count("<ellipse") == 2
     assert 'class="mirror"' in text
+
+
+def test_verdict_and_map_come_first_and_how_it_was_made_last():
+    text = render(small_result(), title="run.log", command="uwblite map", lead="4 min 00 s", facts=(("sha256", "ab" * 32),))
+    parts = ("<h1>", 'id="warnings"', "4 min 00 s", "<svg", 'id="anchors"', "abababab", "uwblite map<")
+    places = [text.index(part) for part in parts]
+    assert places == sorted(places)
+
+
+def test_every_cell_of_a_wide_table_names_its_column():
+    """On a phone a row is a block, and the head of the table is gone."""
+    wide = re.findall(r'<table class="cards">(.*?)</table>', page(), re.S)
+    assert len(wide) >= 4
+    for table in wide:
+        head, cells = re.findall(r"<th>([^<]*)</th>", table), re.findall(r'<td[^>]*data-name="([^"]*)"', table)
+        assert cells == head * (len(cells) // len(head))
+        assert len(cells) == table.count("<td")
+
+
+def test_a_squared_height_is_shown_as_a_height():
+    squared = CalibrationEstimate(UnknownKey("height2", "5C0B"), 0.09, 0.08, "m2", "squared height", "estimated")
+    text = render(replace(small_result(), calibration=(squared,)), title="a", command="b")
+    assert "height of anchor 5C0B above or below the tag</td>" in text
+    assert ">0.30 m, below 0.50 m</td>" in text
+
+
+def test_figures_of_stages_have_words():
+    figures = {"keyframes": 186, "searched": 0, "used": 0, "alike": [1.0, 1.5], "shift": [1, 2], "converged": True}
+    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), title="a", command="b")
+    assert ">186 keyframes</td>" in text
 
 
 def test_marked_ranges_are_those_that_disagree():
@@ -93,7 +124,7 @@ def test_rejected_closures_are_counted_by_outcome():
     result = small_result()
     more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
     text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
-    assert f"{OUTCOMES['few-matches']}</td><td>5</td>" in text
+    assert re.search(f">{OUTCOMES['few-matches']}</td><td[^>]*>5</td>", text)
     assert "only 12% of its points" in text
 
 

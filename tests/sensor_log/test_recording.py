@@ -60,7 +60,7 @@ ONE = Odometry(np.zeros(1), np.zeros((1, 3)))
         (lambda: SensorLog(Odometry(np.zeros(2), np.zeros((3, 3)))), "odometry.poses"),
         (lambda: SensorLog(Odometry(np.array([1.0, 0.0]), np.zeros((2, 3)))), "backwards at index 1"),
         (lambda: SensorLog(Odometry(np.zeros(2), np.array([[0.0, 0, 0], [np.nan, 0, 0]]))), r"poses\[1\] is not finite"),
-        (lambda: SensorLog(ONE, UwbRanges(np.zeros(1), np.array([1]), np.ones(1), np.ones(1), ("A",))), "outside anchor_ids"),
+        (lambda: SensorLog(ONE, UwbRanges([0], [1], [1], [1], ("A",))), "1 is no index of 1 anchor_ids"),
         (lambda: SensorLog(ONE, UwbRanges(np.zeros(2), np.zeros(1, int), np.ones(2), np.ones(2), ("A",))), "ranges.anchor"),
         (lambda: SensorLog(ONE, UwbRanges(np.zeros(1), np.zeros(1, int), np.ones(2), np.ones(1), ("A",))), "ranges.ranges"),
         (lambda: SensorLog(ONE, None, LaserScans(np.zeros(2), np.ones((1, 4), np.float32), 0, 1, 0, 0, 9)), "scans.ranges"),

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-from ..report.printable import encodable, printable
+from ..report.printable import duration, encodable, printable
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -222,16 +222,6 @@ def overall_line(stage: str, share: float, elapsed: float) -> str:
     known = 0.05 < share < 1.0 and elapsed > 2.0
     left = f"  about {duration(elapsed * (1.0 - share) / share)} left" if known else ""
     return f"[{'#' * int(20 * share):<20}] {100 * share:3.0f} %  {stage}{left}"
-
-
-def duration(seconds: float) -> str:
-    """Return a time span in words, such as 3.2 s, 4 min 05 s or 1 h 02 min."""
-    if seconds < 59.95:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def say_json(value: Any) -> None:

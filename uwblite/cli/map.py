@@ -241,7 +241,7 @@ def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     """Return the summary for people."""
     import os
 
-    from .console import duration
+    from ..report.printable import duration
     from .wording import anchor_line, calibration_line
 
     result, seconds = made.result, made.seconds

@@ -1,11 +1,14 @@
 """Given distances between anchors, and between points seen from poses."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..validation import Shape
 from .graph import EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
@@ -13,6 +16,8 @@ from .robust import SQUARED, Kernel
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorDistanceEdges(EdgeTable):
     """Distance between two anchors: e = |a_i - a_j| - d."""
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "anchors", "j": "anchors"}
 
     i: Ints
     """(e,) index of one anchor."""
@@ -47,6 +52,9 @@ class PointDistanceEdges(EdgeTable):
 
     The points are landmarks as seen from the two poses: their distance in the map has to be the measured one.
     """
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"point_i": (2,), "point_j": (2,)}
 
     i: Ints
     """(e,) index of one pose."""

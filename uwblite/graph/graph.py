@@ -13,7 +13,7 @@ estimate as seen from the measurement, expected minus measured. What a MapResult
 measurement, measured minus expected.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
@@ -22,6 +22,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
+from ..validation import Shape, array_fields, require_index, require_type, settle
 from .robust import SQUARED, Kernel
 
 Block = tuple[str, Ints, Floats]
@@ -42,15 +43,27 @@ class EdgeTable:
     """A kind of edges: a dataclass of arrays with a row per edge."""
 
     __slots__ = ()
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {}
+    """Block of the unknowns whose indices an array holds, by the array's name; the first one has an index per edge."""
+    ROWS: ClassVar[Mapping[str, Shape]] = {}
+    """Shape of a row of each array whose rows are no single numbers."""
     SHARED: ClassVar[tuple[str, ...]] = ()
-    """Names of the arrays that all edges share."""
-    FIRST: ClassVar[str] = "i"
-    """Name of an array with a row per edge."""
+    """Names of the arrays that all edges share; they are one row."""
 
     weights: Floats | None
 
+    def __post_init__(self) -> None:
+        rows = {name: self.ROWS.get(name, ()) for name in array_fields(type(self))}
+        settle(self, type(self).__name__, {n: row if n in self.SHARED else ("e", *row) for n, row in rows.items()})
+
     def __len__(self) -> int:
-        return len(getattr(self, self.FIRST))
+        return len(getattr(self, next(iter(self.UNKNOWNS))))
+
+    def require_unknowns(self, counts: Mapping[str, int]) -> None:
+        """Raise DataError where an edge refers to an unknown that is not among so many of each block; -1 may stand for none."""
+        for name, block in self.UNKNOWNS.items():
+            least = -1 if name == "calibration" else 0
+            require_index(getattr(self, name), f"{type(self).__name__}.{name}", counts[block], block, least)
 
     @property
     def own_weights(self) -> Floats:
@@ -64,18 +77,18 @@ class EdgeTable:
 
     def rows(self, which: Ints | Bools) -> Self:
         """Return some of the edges."""
-        arrays = {name: values[which] for name, values in self._by_edge().items() if len(values)}
+        arrays = {name: values[which] for name, values in self.by_edge().items() if len(values)}
         return replace(self, **arrays)  # type: ignore[type-var]
 
     def followed_by(self, *others: Self) -> Self:
         """Return these edges followed by others of their kind; the values that all edges share are taken from these."""
         tables = (self, *others)
-        arrays = {name: np.concatenate([getattr(t, name) for t in tables]) for name in self._by_edge() if name != "weights"}
+        arrays = {name: np.concatenate([getattr(t, name) for t in tables]) for name in self.by_edge() if name != "weights"}
         if any(t.weights is not None for t in tables):
             arrays["weights"] = np.concatenate([t.own_weights for t in tables])
         return replace(self, **arrays)  # type: ignore[type-var]
 
-    def _by_edge(self) -> dict[str, Any]:
+    def by_edge(self) -> dict[str, Any]:
         """Return the arrays with a row per edge by their names; those that are left out are empty."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
         return {name: v for name, v in own.items() if isinstance(v, np.ndarray) and name not in self.SHARED}
@@ -136,6 +149,9 @@ class Calibration:
     values: Floats = field(default_factory=lambda: np.zeros(0))
     """(c,), unit by kind: see calibration.py."""
 
+    def __post_init__(self) -> None:
+        settle(self, "Calibration", {"values": ("c",)})
+
     def index(self, kind: str, anchor: str | None = None, recording: int | None = None, tag: int = 0) -> int:
         """Return the position of an unknown, -1 where the graph has none such; recording None = the first that has one."""
         for number, key in enumerate(self.keys):
@@ -171,14 +187,25 @@ class Graph:
     """(c,) True = fixed; made without any, all are free."""
 
     def __post_init__(self) -> None:
-        estimates = {"poses": self.poses, "anchors": self.anchors, "calibration": self.calibration.values}
-        for name, values in estimates.items():
-            fixed = getattr(self, f"fixed_{name}")
-            if not len(fixed):
-                gauge = (np.arange(len(values)) == 0) & (name == "poses")
+        settle(self, "Graph", {"poses": ("n", 3), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)})
+        require_type(self.calibration, "Graph.calibration", Calibration)
+        values = self.calibration.values
+        if len(values) != len(self.calibration.keys):
+            raise DataError(f"Calibration has {len(values)} values for {len(self.calibration.keys)} keys")
+        settle(self, "Graph", {"fixed_calibration": (len(values),)})
+        counts = {"poses": len(self.poses), "anchors": len(self.anchors), "calibration": len(values)}
+        for name, count in counts.items():
+            if not len(getattr(self, f"fixed_{name}")):
+                gauge = (np.arange(count) == 0) & (name == "poses")
                 object.__setattr__(self, f"fixed_{name}", gauge)
-            elif len(fixed) != len(values):
-                raise DataError(f"fixed_{name} has {len(fixed)} entries for {len(values)} {name}")
+        if not isinstance(self.edges, Sequence):
+            raise DataError(f"Graph.edges must be a tuple of tables of edges, not {type(self.edges).__name__}")
+        object.__setattr__(self, "edges", tuple(self.edges))
+        for k, edges in enumerate(self.edges):
+            if isinstance(edges, EdgeTable):
+                edges.require_unknowns(counts)
+            elif not hasattr(edges, "linearize"):
+                raise DataError(f"Graph.edges[{k}] is a {type(edges).__name__}, which is no table of edges")
 
     @property
     def calibration_priors(self) -> "tuple[PriorEdges, ...]":
@@ -251,11 +278,18 @@ class PriorEdges(EdgeTable):
     """(e, k, k) L with information = L^T L."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-    FIRST: ClassVar[str] = "index"
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"index": ""}
 
     def __post_init__(self) -> None:
-        if self.block not in ("poses", "anchors", "calibration"):
+        width = {"poses": 3, "anchors": 2, "calibration": 1}.get(self.block)
+        if width is None:
             raise DataError(f"a prior on {self.block!r}: it must be on poses, anchors or calibration")
+        shapes: dict[str, Shape] = {"value": ("e", width), "sqrt_information": ("e", width, width)}
+        settle(self, f"PriorEdges on {self.block}", {"index": ("e",), **shapes, "weights": ("e",)})
+
+    def require_unknowns(self, counts: Mapping[str, int]) -> None:
+        """Raise DataError where a prior refers to an unknown that is not among so many of its block."""
+        require_index(self.index, f"PriorEdges on {self.block}: index", counts[self.block], self.block)
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, k)."""

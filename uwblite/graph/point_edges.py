@@ -1,5 +1,6 @@
 """Landmarks seen from poses as points: a kind of edge in imported graphs (g2o EDGE_SE2_XY)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..validation import Shape
 from .graph import EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
 
@@ -14,6 +16,9 @@ from .robust import SQUARED, Kernel
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkEdges(EdgeTable):
     """Position of a landmark, which is stored as an anchor, in the frame of a pose: e = X^-1 a - z."""
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"pose": "poses", "anchor": "anchors"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"position": (2,), "sqrt_information": (2, 2)}
 
     pose: Ints
     """(e,) index of the pose that saw it."""
@@ -25,7 +30,6 @@ class LandmarkEdges(EdgeTable):
     """(e, 2, 2) L with information = L^T L."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-    FIRST: ClassVar[str] = "pose"
 
     def _seen(self, graph: Graph) -> Floats:
         poses = graph.poses[self.pose]

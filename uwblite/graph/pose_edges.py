@@ -3,6 +3,7 @@
 Residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import compress
 from typing import ClassVar
@@ -11,6 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..validation import Shape
 from .graph import Block, EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
 
@@ -50,6 +52,9 @@ def _by_pose(*columns: Floats) -> Floats:
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePoseEdges(EdgeTable):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"T_i_j": (3,), "sqrt_information": (3, 3)}
 
     i: Ints
     """(e,) index of the pose measured from."""
@@ -91,6 +96,9 @@ class OdometryEdges(EdgeTable):
     The error is that in the middle of the step: a heading error anywhere along the step displaces the end, on average, by half
     the distance times the error, and the remaining error across is independent of it.
     """
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"motion": (3,), "sqrt_information": (3, 3), "calibration": (8,)}
 
     i: Ints
     j: Ints
@@ -204,6 +212,12 @@ class ScanEdges(EdgeTable):
     measures S_i^-1 S_j.
     """
 
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {
+        "T_i_j": (3,), "sqrt_information": (3, 3), "twist_i": (3,), "twist_j": (3,), "calibration": (4,), "by_surface": (4, 3),
+    }  # fmt: skip
+    SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
+
     i: Ints
     j: Ints
     T_i_j: Floats
@@ -223,8 +237,6 @@ class ScanEdges(EdgeTable):
     by_surface: Floats | None = None
     """(e, 4, 3) change of e by an error of the ranges to surfaces that face each quarter of the map, m/m and rad/m; None = not
     known. Counts where common errors are estimated, not in the residuals (lidar/surface_errors.py)."""
-
-    SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import SolverError
-from .graph import Graph, Linearization
+from .graph import Edges, EdgeTable, Graph, Linearization
 from .unknowns import free_unknowns
 
 
@@ -29,9 +29,17 @@ def what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
     for edges, lin in zip(graph.edges, linearized, strict=True):
         bad = np.nonzero(~np.isfinite(lin.residuals).all(axis=1))[0]
         if len(bad):
-            kind = type(edges).__name__
-            return f"residuals are not finite: edge {bad[0]} of {kind} ({len(bad)} in all); remove such measurements"
+            kind, why = type(edges).__name__, _why_not_finite(edges, int(bad[0]))
+            return f"residuals are not finite: edge {bad[0]} of {kind} ({len(bad)} in all){why}; remove such measurements"
     return "the cost is not finite although every residual is: weights or residuals are too large"
+
+
+def _why_not_finite(edges: Edges, number: int) -> str:
+    """Return which value of an edge is not finite, or is a sigma of 0; empty where all are sound."""
+    for name, values in edges.by_edge().items() if isinstance(edges, EdgeTable) else ():
+        if len(values) and not (np.isfinite(values[number]).all() and (name != "sigma" or values[number] > 0.0)):
+            return f", its {name} is {values[number].tolist()}"
+    return ""
 
 
 def independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:

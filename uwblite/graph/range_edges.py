@@ -1,5 +1,6 @@
 """Edges between a pose and an anchor: UWB ranges."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import compress
 from typing import ClassVar
@@ -8,6 +9,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..validation import Shape
 from .graph import Block, EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
@@ -26,6 +28,10 @@ class RangeEdges(EdgeTable):
     negative number is no distance, so the term that q adds for q > 0 is then subtracted: with P^2 = D^2 + height^2, the
     expected distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; it is negative at the anchor itself.
     """
+
+    UNKNOWNS: ClassVar[Mapping[str, str]] = {"pose": "poses", "anchor": "anchors", "calibration": "calibration"}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"lever_arm": (2,), "velocity": (2,), "tag": (2,), "calibration": (6,)}
+    SHARED: ClassVar[tuple[str, ...]] = ("tag",)
 
     pose: Ints
     """(e,) keyframe before the range."""
@@ -50,13 +56,10 @@ class RangeEdges(EdgeTable):
     -1 = not an unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-    FIRST: ClassVar[str] = "pose"
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
     late: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) m, known delay of each range; empty = none is known."""
-
-    SHARED: ClassVar[tuple[str, ...]] = ("tag",)
 
     def tag_positions(self, poses: Floats) -> Floats:
         """Return where the tag was at each range (e, 2), map frame, by its nominal position on the base."""

@@ -32,6 +32,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import MapResult
 from ..report.html import render
 from ..report.picture import PictureAnchor, draw_map
+from ..report.printable import duration
 from ..sensor_log import SensorLog
 from .files import write_text
 from .folders import check_free, mend, replacing_folder
@@ -127,6 +128,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
             result,
             title=_title(logs),
             command=record.command,
+            lead=_lead(logs, result),
             facts=_facts(logs, result, record),
             grid_png=grid_png,
             timings=record.timings_in_report,
@@ -150,7 +152,8 @@ def _title(logs: Sequence[SensorLog]) -> str:
 def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
     """Return what the picture shows in a line: a name alone, mostly run.log, means nothing."""
     sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
-    counts = f"{sums['travelled']:.0f} m in {sums['duration'] / 60:.0f} min, {len(result.anchors)} anchors, {kept} closures"
+    driven = f"{sums['travelled']:.0f} m in {duration(sums['duration'])}"
+    counts = f"{driven}, {len(result.anchors)} anchors, {kept} closures"
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
 
 
@@ -181,13 +184,16 @@ def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     )
 
 
+def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:
+    """Return recording and map in a line."""
+    sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
+    driven = f"{duration(sums['duration'])}, {sums['travelled']:.1f} m, {sums['ranges']} ranges, {sums['scans']} scans"
+    closures = f"{kept} of {len(result.closures)} loop closures" if result.closures else ""
+    return "; ".join(filter(None, (driven, "" if result.grid is None else _size(result.grid), closures)))
+
+
 def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
-    sums = recording_figures(logs, result)
-    grid, kept = result.grid, sum(c.accepted for c in result.closures)
     facts = [
-        ("recording", "{duration:.0f} s, {travelled:.1f} m, {ranges} ranges, {scans} scans".format(**sums)),
-        ("map", "" if grid is None else _size(grid)),
-        ("graph", f"{len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures accepted"),
         *(("sha256", log.notes.sha256) for log in logs),
         ("settings", settings_line(record.preset, record.changed)),
         ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
@@ -198,4 +204,4 @@ def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> t
 def _size(grid: OccupancyGrid) -> str:
     g = grid.geometry
     width, depth = g.cols * g.resolution, g.rows * g.resolution
-    return f"{width:.1f} x {depth:.1f} m, cells of {g.resolution:g} m, {grid.scans_used} scans drawn"
+    return f"{width:.1f} x {depth:.1f} m at {g.resolution:g} m"

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Wides, concatenated
+from ..arrays import Bools, Floats, Ints, concatenated
 from ..config import setting
 from ..odometry.attached import ScanPoints
 from . import beam_gaps
-from .point_cloud import Lines, estimate_normals, make_tree
+from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_by_key
 
 _TURN = 8.0
 """rad; more than all bearings differ by."""
@@ -164,29 +164,6 @@ def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]
     key = cell_number(rays.keyframe, rays.points, size)
     one, mean = mean_by_key(key, np.concatenate([rays.points, rays.origins], axis=1))
     return rays.keyframe[one], mean[:, :2], mean[:, 2:]
-
-
-def cell_number(owner: Ints, points: Floats, size: float) -> Wides:
-    """Return a number (p,) that points (p, 2) have in common which have one owner (p,) and lie in one square."""
-    x, y = np.floor(np.ascontiguousarray(points.T) / size).astype(WIDE)
-    x -= x.min(initial=0)
-    y -= y.min(initial=0)
-    return np.asarray((owner * (x.max(initial=0) + 1) + x) * (y.max(initial=0) + 1) + y)
-
-
-def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
-    """Average the rows of values (p, v) that share a key (p,).
-
-    Returns
-    -------
-    One row of each key (m,), by key, and the means (m, v).
-    """
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    if not len(first):
-        return first, values
-    count = np.diff(np.append(first, len(key)))[:, None]
-    return order[first], np.add.reduceat(values.take(order, axis=0), first, axis=0) / count
 
 
 def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:

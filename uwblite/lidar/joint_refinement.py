@@ -206,8 +206,8 @@ def refine(
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
     gate, sigma, rounds, fit = config.first_gate, config.sigma, 0, np.inf
-    none = np.zeros((0, 3)), np.zeros((0, 3, 3))
-    probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
+    none = np.broadcast_to(0.0, (len(i), 3, 3))
+    probe = ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     optimizer = Optimizer()
     # The next round looks all matches up again: one successful step is enough.
     brief = replace(solver, max_iterations=12, relative_decrease=0.5)

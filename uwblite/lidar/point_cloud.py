@@ -6,9 +6,11 @@ Points are finite, in metres, in any one frame, and keep their order.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, Wides
+from ..validation import as_array, require_finite, require_shape
 
 
 def make_tree(points: Floats) -> cKDTree:
@@ -16,12 +18,33 @@ def make_tree(points: Floats) -> cKDTree:
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
-def statistical_outlier_filter(points: Floats, neighbours: int, std_ratio: float) -> Bools:
+def as_points(points: ArrayLike, name: str = "points") -> Floats:
+    """Return points (n, 2), m, as an array.
+
+    Raises
+    ------
+    DataError : they have another shape, are no numbers, or one is not finite.
+    """
+    array = as_array(points, name)
+    array = array.reshape(-1, 2) if not array.size else array
+    require_shape(array, name, ("n", 2))
+    require_finite(array, name)
+    return array
+
+
+def voxel_filter(points: ArrayLike, size: float) -> Floats:
+    """Return the mean (m, 2) of the points (n, 2) in each occupied square of an edge, m, by x and y of the squares."""
+    points = as_points(points)
+    return mean_by_key(cell_number(np.zeros(len(points), dtype=np.int64), points, size), points)[1]
+
+
+def statistical_outlier_filter(points: ArrayLike, neighbours: int, std_ratio: float) -> Bools:
     """Return which points (n, 2), m, are not unusually far from their nearest neighbours; a small cloud uses all its points.
 
     A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
     that distance over the whole cloud.
     """
+    points = as_points(points)
     k = min(neighbours, len(points) - 1)
     if k < 1:
         return np.ones(len(points), bool)
@@ -29,13 +52,37 @@ def statistical_outlier_filter(points: Floats, neighbours: int, std_ratio: float
     return np.asarray(mean <= mean.mean() + std_ratio * mean.std())
 
 
-def radius_outlier_filter(points: Floats, radius: float, min_neighbours: int) -> Bools:
+def radius_outlier_filter(points: ArrayLike, radius: float, min_neighbours: int) -> Bools:
     """Return which points (n, 2), m, have at least min_neighbours others within the radius, m, inclusive."""
+    points = as_points(points)
     if min_neighbours < 1 or len(points) == 0:
         return np.ones(len(points), bool)
     bound = np.nextafter(radius, np.inf)
     farthest = make_tree(points).query(points, k=[min_neighbours + 1], distance_upper_bound=bound)[0]
     return np.asarray(farthest[:, 0] <= radius)
+
+
+def cell_number(owner: Ints, points: Floats, size: float) -> Wides:
+    """Return a number (p,) that points (p, 2) have in common which have one owner (p,) and lie in one square."""
+    x, y = np.floor(np.ascontiguousarray(points.T) / size).astype(WIDE)
+    x -= x.min(initial=0)
+    y -= y.min(initial=0)
+    return np.asarray((owner * (x.max(initial=0) + 1) + x) * (y.max(initial=0) + 1) + y)
+
+
+def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
+    """Average the rows of values (p, v) that share a key (p,).
+
+    Returns
+    -------
+    One row of each key (m,), by key, and the means (m, v).
+    """
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    if not len(first):
+        return first, values
+    count = np.diff(np.append(first, len(key)))[:, None]
+    return order[first], np.add.reduceat(values.take(order, axis=0), first, axis=0) / count
 
 
 @dataclass(frozen=True, slots=True, eq=False)

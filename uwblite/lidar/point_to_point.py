@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import Floats
 from ..config import setting
+from ..validation import as_array, require_finite, require_shape
+from .point_cloud import as_points, make_tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,12 @@ class Registration:
     frame."""
 
 
-def align(target: cKDTree, source: Floats, T_target_source: Floats, config: IcpConfig | None = None) -> Registration:
+def align(
+    target: cKDTree | ArrayLike,
+    source: ArrayLike,
+    T_target_source: ArrayLike = (0.0, 0.0, 0.0),
+    config: IcpConfig | None = None,
+) -> Registration:
     """Find the pose of the source in the target's frame from an initial guess.
 
     The motion that minimises the squared distances of matched points is known in closed form: with a, b these points
@@ -63,11 +71,18 @@ def align(target: cKDTree, source: Floats, T_target_source: Floats, config: IcpC
 
     Parameters
     ----------
-    target : of the target's points, m; see make_tree. source : (n, 2) points in their own frame, m.
-    T_target_source : (3,) initial guess; m, m, rad.
+    target : (m, 2) points, m, or their tree where there are many sources, see make_tree. source : (n, 2) points in their own
+        frame, m. T_target_source : (3,) initial guess; m, m, rad.
+
+    Raises
+    ------
+    DataError : points or guess have another shape, or are not finite.
     """
     config = config or IcpConfig()
-    pose = np.array(T_target_source, dtype=np.float64)
+    target = target if isinstance(target, cKDTree) else make_tree(as_points(target, "target"))
+    source, pose = as_points(source, "source"), as_array(T_target_source, "T_target_source").copy()
+    require_shape(pose, "T_target_source", (3,))
+    require_finite(pose, "T_target_source")
     for name, size in (("target", target.n), ("source", len(source))):
         if size < config.min_matches:
             return _failure(pose, f"the {name} has {size} points, fewer than {config.min_matches}", source)

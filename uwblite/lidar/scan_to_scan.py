@@ -13,8 +13,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
-from ..graph.solver import SolverConfig, optimize
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
+from ..graph.solver import SolverConfig, optimize
 from ..odometry.slips import EVERY, LASTS, covariance_of, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters

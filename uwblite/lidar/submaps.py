@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints, rms_length
 from ..config import setting
-from .clouds import Clouds, cell_number, joined, mean_by_key
-from .point_cloud import radius_outlier_filter, statistical_outlier_filter
+from .clouds import Clouds, joined
+from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statistical_outlier_filter
 
 _AT_ONCE = 32
 """Sub-maps merged at once; a bound on the memory."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import DataError
 from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan, Measured
 from ..sensor_log import SensorMounting
 from .known_map import KnownMap
@@ -52,6 +53,7 @@ class LiveFeed:
         self.silence = Silence(self._patience.late, tuple(name for name in CONSEQUENCES if name != "gyro"))
         self._reported: set[str] = set()
         self._stopped = False
+        self._wrong: set[str] = set()
         self._sees = False
 
     def take(self, data: bytes) -> Iterator[LocalizerState]:
@@ -96,6 +98,15 @@ class LiveFeed:
             yield from self._use(self._localizer, measured)
 
     def _use(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
+        """Use a measurement; one that does not fit the robot is left out, and the reason reported once."""
+        try:
+            yield from self._used(localizer, measured)
+        except DataError as error:
+            if str(error) not in self._wrong:
+                self._wrong.add(str(error))
+                self._note(f"left out: {error}")
+
+    def _used(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
         if isinstance(measured, LiveOdometry):
             yield self._aged(localizer.add_odometry(measured.stamp, *measured.pose.tolist()))
         elif isinstance(measured, LiveGyro):

@@ -4,6 +4,7 @@ Measurements wait here until the odometry has reached them, then they are correc
 the robot's base; the pose is estimated from them in pose_estimator.
 """
 
+import numbers
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from .. import se2
 from ..arrays import Floats
 from ..errors import DataError
 from ..sensor_log import SensorMounting, plausible
+from ..validation import as_array, require_shape, require_type
 from .gyro_turns import GyroTurns
 from .known_map import KnownMap
 from .odometer import Odometer
@@ -67,6 +69,8 @@ class Localizer:
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
         self._square = np.square(heights) + known.anchors.rise
+        self._rays = 0
+        """Of a scan; 0 = none has come."""
         self.strangers: dict[str, int] = {}
         """Ranges to anchors that are not in the map, by id."""
 
@@ -82,7 +86,8 @@ class Localizer:
 
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
-        wheels = np.array([x, y, theta], dtype=np.float64)
+        stamp, *pose = _numbers(stamp=stamp, x=x, y=y, theta=theta)
+        wheels = np.array(pose)
         wheels[~(np.abs(wheels) < _BEYOND)] = np.nan
         stamp += self._clock_shift
         if stamp < self._measured - _SET_BACK:
@@ -110,6 +115,7 @@ class Localizer:
 
     def add_gyro(self, stamp: float, heading: float) -> LocalizerState:
         """Take the heading of a gyro, s and rad from any zero; once its bias is known, the wheels turn as it does."""
+        stamp, heading = _numbers(stamp=stamp, heading=heading)
         if abs(heading) < _BEYOND:
             self._turns.add(self.on_time(stamp), heading)
         return self.state()
@@ -123,9 +129,14 @@ class Localizer:
 
         Raises
         ------
-        DataError : there are more ids than ranges, or fewer.
+        DataError : there are more ids than ranges, or fewer; or the robot has no such tag.
         """
-        values = np.asarray(metres, dtype=np.float64).reshape(-1)
+        (stamp,) = _numbers(stamp=stamp)
+        values = as_array(metres, "metres").reshape(-1)
+        if isinstance(anchor_ids, str) or not all(isinstance(name, str) for name in anchor_ids):
+            raise DataError(f"anchor_ids must be a list of names, not {anchor_ids!r:.60}")
+        if not 0 <= tag < len(self.mounting.tags):
+            raise DataError(f"tag {tag} is none of the robot's {len(self.mounting.tags)} tags; they count from 0")
         if len(anchor_ids) != len(values):
             raise DataError(f"{len(anchor_ids)} anchor ids for {len(values)} ranges; one id belongs to each range")
         good = plausible(values)
@@ -145,10 +156,17 @@ class Localizer:
         ----------
         stamp : s, of the first ray, on the lidar's clock. ranges : (b,) m; inf = nothing seen, nan = invalid.
         scanner : geometry, where it is not the one of before.
+
+        Raises
+        ------
+        DataError : the scan has another number of rays than those before it by the same scanner.
         """
-        self.scanner = scanner or self.scanner
+        (stamp,), readings = _numbers(stamp=stamp), as_array(ranges, "ranges")
+        if scanner is not None and scanner != self.scanner:
+            self.scanner, self._rays = scanner, len(readings)
+        self._rays = self._rays or len(readings)
+        require_shape(readings, "ranges", (self._rays,))
         if self.scanner is not None and self.scanner.usable and self.known.walls is not None:
-            readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
             for at, entry in self._scan_clock.take(stamp, self._measured, self._silences, (readings, self.scanner)):
                 scan = Scan(at + self.known.laser_delay, *entry)
                 self._waiting.add(scan.end, scan)
@@ -219,3 +237,10 @@ class Localizer:
             float(anchors.sigma[anchor]), anchors.scale, anchors.errors[anchor] if anchors.errors else None,
         )  # fmt: skip
         self._estimator.use_range(fact, tags[min(max(entry.tag, 0), len(tags) - 1), :2], stamp, then)
+
+
+def _numbers(**values: float) -> list[float]:
+    """Return numbers as they are; of what is none the name is said."""
+    for name, value in values.items():
+        require_type(value, name, numbers.Real, "number")
+    return [float(value) for value in values.values()]

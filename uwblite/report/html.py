@@ -8,15 +8,15 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from html import escape as escape_markup
-from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints
 from ..findings import Finding
+from ..graph.calibration import HEIGHT
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .page import PAGE, SCRIPT, STYLE
-from .printable import printable, sigma_text
+from .printable import duration, printable, sigma_text
 from .svg_map import draw, number, shown_closures, sigma, thin
 
 MOST_RESIDUALS = 1500
@@ -33,6 +33,7 @@ def render(
     *,
     title: str,
     command: str,
+    lead: str = "",
     facts: tuple[tuple[str, str], ...] = (),
     grid_png: bytes | None = None,
     timings: bool = False,
@@ -42,22 +43,24 @@ def render(
     Parameters
     ----------
     command : command line that makes the same map again.
-    facts : (name, value) pairs for the head of the page: input hash, version, settings.
+    lead : the result in a line, under the verdict.
+    facts : (name, value) pairs about how it was made: input hash, version, settings.
     grid_png : picture of the bare grid, one pixel a cell, highest y first.
     timings : whether to show the seconds of each stage; the page then differs from run to run.
     """
+    again = f"<p>{escape(_WHERE.format(title))}</p><pre>{escape(command)}</pre>"
+    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
     sections = (
-        _banner(result),
+        _banner(result, lead),
         _section("Map", draw(result, grid_png)),
         _section("Anchors", _anchor_table(result.anchors)),
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
         _section("Loop closures", _closure_table(result)),
         _section("Stages", _stage_table(result, timings)),
-        _section("Again", f"<p>{escape(_WHERE.format(title))}</p><pre>{escape(command)}</pre>"),
+        _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
-    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
-    body = f"<h1>{escape(title)}</h1><div class=scroll><table class=facts>{table}</table></div>" + "".join(sections)
+    body = f"<h1>{escape(title)}</h1>" + "".join(sections)
     return PAGE.format(title=escape(title), style=STYLE, script=SCRIPT, body=body)
 
 
@@ -68,7 +71,7 @@ def _section(title: str, content: str) -> str:
     return f'<section id="{title.lower().replace(" ", "-")}"><h2>{title}</h2>{content}</section>'
 
 
-def _banner(result: MapResult) -> str:
+def _banner(result: MapResult, lead: str) -> str:
     boxes = (
         ('"box bad" role=alert', "Do not trust this map before these are resolved:", result.doubts),
         ('"box warn"', "Worth knowing:", result.warnings),
@@ -76,7 +79,7 @@ def _banner(result: MapResult) -> str:
     items = ((kind, head, "".join(_item(finding) for finding in found)) for kind, head, found in boxes)
     text = "".join(f"<div class={kind}><b>{head}</b><ul>{listed}</ul></div>" for kind, head, listed in items if listed)
     text = text or '<div class="box good">No warnings.</div>'
-    return f'<section id="warnings">{text}</section>'
+    return f'<section id="warnings">{text}<p class=lead>{escape(lead)}</p></section>'
 
 
 def _item(finding: Finding) -> str:
@@ -86,34 +89,38 @@ def _item(finding: Finding) -> str:
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:
+    """Return a table; on a phone a row of more than two columns is a block with a line for each."""
     if not rows:
         return f"<p>{escape(empty)}</p>"
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in rows)
-    return f"<div class=scroll><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+    kind, names = ("cards", head) if len(head) > 2 else ("", ("",) * len(head))
+    body = "".join("<tr>" + "".join(map(_cell, row, names)) + "</tr>" for row in rows)
+    return f'<div class=scroll><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _cell(text: str) -> str:
+def _cell(text: str, name: str) -> str:
     """Return a cell of a table; one that holds a sentence may be wrapped, but not to a word a line."""
-    return f"<td class=words>{escape(text)}</td>" if len(text) > 20 and " " in text else f"<td>{escape(text)}</td>"
+    words = " class=words" if len(text) > 20 and " " in text else ""
+    named = f' data-name="{escape(name)}"' if name else ""
+    return f"<td{words}{named}>{escape(text)}</td>"
+
+
+def _with_sigma(value: float, sigma: float, digits: int = 3, sign: bool = False) -> str:
+    return f"{number(value, digits, sign)} \u00b1{sigma_text(sigma, digits)}" if np.isfinite(value) else number(value)
 
 
 def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
-    spread, rest = "\u00b1", ("ranges", "down-weighted", "residual rms, m", "status")
-    head = ("anchor", "x, m", spread, "y, m", spread, "bias, m", spread, *rest)
+    head = ("anchor", "status", "x, m", "y, m", "bias, m", "ranges", "disagree", "residual rms, m")
     rows = [
         (
             a.id,
-            number(a.position[0]),
-            sigma_text(sigma(a, 0), 3),
-            number(a.position[1]),
-            sigma_text(sigma(a, 1), 3),
-            number(a.bias, sign=True),
-            sigma_text(a.bias_sigma, 3),
+            f"{a.status}: {a.reason}" if a.reason else a.status,
+            _with_sigma(a.position[0], sigma(a, 0)),
+            _with_sigma(a.position[1], sigma(a, 1)),
+            _with_sigma(a.bias, a.bias_sigma, sign=True),
             str(a.ranges),
             f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
             number(a.residual_rms),
-            f"{a.status}: {a.reason}" if a.reason else a.status,
         )
         for a in anchors
     ]
@@ -122,7 +129,7 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
 
 def _calibration_table(result: MapResult) -> str:
     """Return what was calibrated, and, folded away, what the recording does not show."""
-    head = ("name", "value", "\u00b1", "unit", "meaning")
+    head = ("meaning", "value", "name")
     found = [_calibration_row(c) for c in result.calibration if c.state == "estimated"]
     text = _table(head, found, "Nothing was calibrated.")
     if silent := [(*_calibration_row(c), c.reason) for c in result.calibration if c.state != "estimated"]:
@@ -132,9 +139,12 @@ def _calibration_table(result: MapResult) -> str:
 
 
 def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
-    """Return name, value, sigma, unit and meaning; ratios in per cent."""
+    """Return meaning, value with sigma and unit, and name; ratios in per cent, heights in metres."""
+    if value.key.kind == HEIGHT:
+        height, most = np.sqrt(np.maximum([value.value, value.value + 2.0 * value.sigma], 0.0)).tolist()
+        return f"height of anchor {value.key.anchor} above or below the tag", f"{height:.2f} m, below {most:.2f} m", value.name
     scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
-    return (value.name, number(scale * value.value, digits, True), sigma_text(scale * value.sigma, digits), unit, value.meaning)
+    return value.meaning, f"{_with_sigma(scale * value.value, scale * value.sigma, digits, True)} {unit}", value.name
 
 
 def _closure_table(result: MapResult) -> str:
@@ -149,38 +159,38 @@ def _closure_table(result: MapResult) -> str:
         (f"{c.i}\u2013{c.j}", state[bool(c.accepted)], f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
         for c in [*kept, *rejected]
     ]
-    listing = _table(("keyframes", "", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")
+    listing = _table(("keyframes", "outcome", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")
     return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
 
 
 def _stage_table(result: MapResult, timings: bool) -> str:
-    head = ("stage", "\u03c7\u00b2", "degrees of freedom", "\u03c7\u00b2 / dof", *(("seconds",) if timings else ()), "figures")
+    head = ("stage", *(("seconds",) if timings else ()), "\u03c7\u00b2 / degrees of freedom", "figures")
     rows = []
     for stage in result.stages:
         chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
-        ratio = number(chi2 / dof) if chi2 is not None and dof else ""
-        others = ", ".join(f"{_words(k)} {_figure(v)}" for k, v in stage.figures.items() if k not in ("chi2", "dof"))
-        time = (f"{stage.seconds:.2f}",) if timings else ()
-        rows.append((stage.name, "" if chi2 is None else f"{chi2:.1f}", "" if dof is None else str(dof), ratio, *time, others))
-    hint = "" if timings else "<p class=hint>The timings of each stage stand in report.json, beside this page.</p>"
-    return _table(head, rows, "") + hint
+        ratio = f"{chi2:.0f} / {dof} = {number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
+        values = {name: value for name, value in stage.figures.items() if isinstance(value, int | float) and value}
+        shown = ", ".join(text.format(values[name]) for name, text in _FIGURES.items() if name in values)
+        if ratio or shown or timings:
+            rows.append((stage.name, *((f"{stage.seconds:.2f}",) if timings else ()), ratio, shown))
+    return f"<details><summary>{len(rows)} stages</summary>{_table(head, rows, '')}<p class=hint>{_ABOUT_STAGES}</p></details>"
 
 
-def _words(name: str) -> str:
-    """Return the name of a figure as words."""
-    return name.replace("_", " ")
+_FIGURES = {
+    "keyframes": "{} keyframes", "travelled": "{:.1f} m", "odometry": "{} steps of odometry", "ranges": "{} ranges",
+    "placed": "{} anchors placed", "points": "{} points", "pairs": "{} pairs of scans", "used": "{} of them used",
+    "submaps": "{} sub-maps", "candidates": "{} candidates", "accepted": "{} accepted", "walls": "{} walls",
+    "columns": "{} columns", "rays": "{} rays", "sigma": "scatter {:.4f} m", "range_sigma": "scatter of ranges {:.3f} m",
+    "shift": "poses moved by {:.4f} m", "visits": "{} visits of places seen before", "scans": "{} scans drawn",
+    "free_space_violation": "{:.2%} of the rays end in free space", "iterations": "{} iterations",
+}  # fmt: skip
+"""Figures of stages that are shown, and how."""
 
-
-def _figure(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict):
-        return "(" + ", ".join(f"{_words(k)} {_figure(v)}" for k, v in value.items()) + ")"
-    if isinstance(value, list | tuple):
-        return f"{len(value)} values" if len(value) > 6 else ", ".join(map(_figure, value))
-    return str(value)
+_ABOUT_STAGES = (
+    "Each line is what its stage did; later ones add keyframes and weigh anew. \u03c7\u00b2 below the degrees of freedom is"
+    " intended: ranges, and scans that are matched several times, have errors in common and are given less weight for it."
+    " report.json has all figures, and the time of each stage."
+)
 
 
 def _residuals(result: MapResult) -> str:
@@ -189,7 +199,7 @@ def _residuals(result: MapResult) -> str:
     # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
     time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
     span = max(float(time.max()), 1e-9)
-    ends = ("first recording", "last recording") if several else ("0 s", f"{span:.0f} s")
+    ends = ("first recording", "last recording") if several else ("0 s", duration(span))
     parts = [
         "<p class=hint>Measured minus expected range over time: above zero the range is too long;"
         " <span class=nlos-text>marked</span>: does not agree with the map, as where something blocks the line of sight (NLOS)."

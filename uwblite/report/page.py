@@ -40,7 +40,7 @@ summary{cursor:pointer;padding:.4rem 0}
 .good{background:var(--good)}.warn{background:var(--warn)}.bad{background:var(--bad)}
 .hint{color:var(--dim);font-size:.85rem}.nlos-text{color:var(--nlos)}
 pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wrap;overflow-wrap:anywhere}
-.controls{display:flex;flex-wrap:wrap;gap:.3rem .9rem;align-items:center;margin-bottom:.4rem}
+.controls{display:flex;flex-wrap:wrap;gap:.3rem .9rem;align-items:center;margin:.4rem 0}
 .controls label{white-space:nowrap;padding:.2rem 0}button{font:inherit;min-width:2.2rem;min-height:2.2rem}
 .buttons{white-space:nowrap}
 .mapbox{border:1px solid var(--line);border-radius:.4rem;overflow:hidden}
@@ -72,7 +72,13 @@ figure{margin:.6rem 0}figcaption{font-weight:600}
 .residuals{display:block;flex:1;min-width:0;height:7rem;border:1px solid var(--line);border-radius:.3rem}
 .residuals path{fill:none;stroke-width:3;stroke-linecap:round;vector-effect:non-scaling-stroke}
 .residuals .axis{stroke:var(--line);stroke-width:1}.residuals .los{stroke:var(--path)}.residuals .nlos{stroke:var(--nlos)}
-@media (max-width:40rem){main{padding:.6rem}body{font-size:15px}}
+.lead{margin:.4rem 0;color:var(--dim)}
+@media (max-width:40rem){main{padding:.6rem}body{font-size:15px}h1{margin:.3rem 0}h2{margin:1rem 0 .3rem}
+.cards thead{display:none}.cards,.cards tbody,.cards tr,.cards td{display:block}
+.cards tr{padding:.4rem 0;border-bottom:1px solid var(--line)}
+.cards td,.cards td.words{display:flex;gap:.6rem;border:0;padding:.1rem 0;white-space:normal;min-width:0;overflow-wrap:anywhere}
+.cards td::before{content:attr(data-name);color:var(--dim);flex:0 0 8rem}.cards td:empty{display:none}
+.cards td:first-child{font-weight:600}.cards td:first-child::before{content:none}}
 """
 
 

@@ -30,6 +30,16 @@ def _escape(character: str) -> str:
     return character.encode("unicode_escape", "surrogatepass").decode()
 
 
+def duration(seconds: float) -> str:
+    """Return a time span in words, such as 3.2 s, 4 min 05 s or 1 h 02 min."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
 def sigma_text(sigma: float, digits: int) -> str:
     """Return a standard deviation with so many decimals, or more where it would show less than two digits of itself.
 

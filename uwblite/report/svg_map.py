@@ -98,7 +98,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     words = f"Green: start; ring: end; {unclear}wheel or pinch zooms, dragging moves; point at things for details."
     paths = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
     hint = f'<p class=hint><output id="place"></output>{paths}{words}</p>'
-    return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"
+    return f"<div class=mapbox>{svg}</div><div class=controls>{boxes}<span class=buttons>{buttons}</span></div>{hint}"
 
 
 def _end_marks(result: MapResult, recording: int, size: float) -> str:

@@ -1,14 +1,16 @@
 """One recording as arrays, checked once when it enters, and the checks."""
 
+import numbers
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ..arrays import Floats
 from ..errors import DataError
+from ..validation import require_finite, require_index, require_type
 from .notes import LogNotes, Screening
 from .sensors import Gyro, LaserScans, Odometry, SensorMounting, UwbRanges
 
@@ -57,40 +59,31 @@ class SensorLog:
     gyro: Gyro | None = None
 
     def __post_init__(self) -> None:
-        sensors = {"odometry": self.odometry, "gyro": self.gyro, "ranges": self.ranges, "scans": self.scans}
-        for name, sensor in sensors.items():
-            if sensor is not None:
-                _check(sensor.stamps, f"{name}.stamps", (None,), ordered=True)
-        _check(self.odometry.poses, "odometry.poses", (len(self.odometry.stamps), 3), most=MOST_METRES)
+        kinds = {"odometry": Odometry, "gyro": Gyro, "ranges": UwbRanges, "scans": LaserScans}
+        for name, kind in kinds.items():
+            sensor = getattr(self, name)
+            if sensor is not None or name == "odometry":
+                require_type(sensor, name, kind)
+                _check_stamps(sensor, name)
+        require_type(self.mounting, "mounting", SensorMounting)
+        require_finite(self.odometry.poses, "odometry.poses", MOST_METRES)
         if len(self.odometry.stamps) == 0:
             raise DataError("the log has no odometry; uwblite needs ODOM messages (or ROBOTLASER1 with robot poses)")
         if self.gyro is not None:
-            _check(self.gyro.heading, "gyro.heading", (len(self.gyro.stamps),))
+            require_finite(self.gyro.heading, "gyro.heading", MOST_SECONDS)
         if self.ranges is not None:
-            m = len(self.ranges.stamps)
-            if len(self.ranges.anchor_ids) > MOST_ANCHORS:
-                raise DataError(
-                    f"the ranges name {len(self.ranges.anchor_ids)} anchors, more than {MOST_ANCHORS}: is the anchor's id what "
-                    "stands in its field?"
-                )
-            _check(self.ranges.ranges, "ranges.ranges", (m,), most=MOST_METRES)
-            _check(self.ranges.quality, "ranges.quality", (m,))
-            tag, tags = self.ranges.tag, len(self.mounting.tags)
-            if tag is not None and (tag.shape != (m,) or not np.all((tag >= 0) & (tag < tags))):
-                raise DataError(f"ranges.tag does not say one of {tags} tags for each of {m} ranges")
-            if self.ranges.anchor.shape != (m,):
-                raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
-            if m and not 0 <= self.ranges.anchor.min() <= self.ranges.anchor.max() < len(self.ranges.anchor_ids):
-                raise DataError("ranges.anchor holds an index outside anchor_ids")
+            _check_ranges(self.ranges, len(self.mounting.tags))
+        if self.scans is not None:
+            _check_geometry(self.scans)
         for name, places in (("laser", self.mounting.T_base_laser[:2]), ("tag", self.mounting.tags)):
             if not np.all(np.abs(places) <= _FARTHEST_ON_ROBOT):
                 away = f"{np.abs(places).max():.3g} m from the base, on which it is mounted"
                 raise DataError(f"the {name} stands {away}; lengths are in m, not mm")
+        require_finite(self.mounting.T_base_laser, "mounting.T_base_laser")
+        require_finite(self.mounting.tags, "mounting.tag_position and more_tags")
         for name in (*(() if self.ranges is None else self.ranges.anchor_ids), *self.mounting.anchor_heights):
             if fault := fault_of_id(name):
                 raise DataError(f"the anchor's id {fault}")
-        if self.scans is not None and (self.scans.ranges.ndim != 2 or len(self.scans.ranges) != len(self.scans.stamps)):
-            raise DataError(f"scans.ranges has shape {self.scans.ranges.shape}, expected ({len(self.scans.stamps)}, beams)")
 
     def without(self, *, uwb: bool = False, lidar: bool = False) -> "SensorLog":
         """Return the same recording with a sensor left out."""
@@ -130,14 +123,32 @@ class SensorLog:
         return replace(self, **{name: change(sensor) for name, sensor in sensors.items() if sensor is not None})
 
 
-def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False, most: float = MOST_SECONDS) -> None:
-    if values.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, values.shape, strict=True)):
-        raise DataError(f"{name} has shape {values.shape}, expected {shape}")
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
-    if len(bad):
-        raise DataError(f"{name}[{bad[0]}] is not finite ({len(bad)} such rows)")
-    far = np.flatnonzero((np.abs(values) > most).any(axis=tuple(range(1, values.ndim))))
-    if len(far):
-        raise DataError(f"{name}[{far[0]}] is beyond {most:g} ({len(far)} such rows); are the units right?")
-    if ordered and np.any(np.diff(values) < 0):
-        raise DataError(f"{name} runs backwards at index {int(np.argmax(np.diff(values) < 0)) + 1}; sort by time first")
+def _check_stamps(sensor: Any, name: str) -> None:
+    require_finite(sensor.stamps, f"{name}.stamps", MOST_SECONDS)
+    if np.any(back := np.diff(sensor.stamps) < 0):
+        raise DataError(f"{name}.stamps runs backwards at index {int(np.argmax(back)) + 1}; sort by time first")
+
+
+def _check_ranges(ranges: UwbRanges, tags: int) -> None:
+    names = ranges.anchor_ids
+    if len(names) > MOST_ANCHORS:
+        raise DataError(
+            f"the ranges name {len(names)} anchors, more than {MOST_ANCHORS}: is the anchor's id what stands in its field?"
+        )
+    for k, name in enumerate(names):
+        require_type(name, f"ranges.anchor_ids[{k}]", str)
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise DataError(f"ranges.anchor_ids has {twice[0]!r} twice; each anchor has one entry, and ranges.anchor refers to it")
+    require_finite(ranges.ranges, "ranges.ranges", MOST_METRES)
+    require_finite(ranges.quality, "ranges.quality", MOST_SECONDS)
+    require_index(ranges.anchor, "ranges.anchor", len(names), "anchor_ids")
+    if ranges.tag is not None:
+        require_index(ranges.tag, "ranges.tag", tags, "tags of the mounting")
+
+
+def _check_geometry(scans: LaserScans) -> None:
+    for name in ("angle_min", "angle_increment", "time_increment", "range_min", "range_max"):
+        value = getattr(scans, name)
+        require_type(value, f"scans.{name}", numbers.Real, "number")
+        if not np.isfinite(value) and name != "range_max":
+            raise DataError(f"scans.{name} is {value}; it must be a finite number")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..errors import DataError
+from ..validation import settle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,6 +19,9 @@ class Odometry(Table):
     """(n,) s, non-decreasing."""
     poses: Floats
     """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
+
+    def __post_init__(self) -> None:
+        settle(self, "odometry", {"stamps": ("n",), "poses": ("n", 3)})
 
     @property
     def travelled(self) -> Floats:
@@ -68,6 +72,10 @@ class UwbRanges:
     tag: Ints | None = None
     """(m,) which of the robot's tags measured, an index into SensorMounting.tags; None = all the first."""
 
+    def __post_init__(self) -> None:
+        settle(self, "ranges", dict.fromkeys(("stamps", "anchor", "ranges", "quality", "tag"), ("m",)))
+        object.__setattr__(self, "anchor_ids", tuple(self.anchor_ids))
+
     def require_one_tag(self, place: str) -> None:
         """Raise DataError where the ranges of several tags would lose whose they are."""
         if self.tag is not None:
@@ -100,6 +108,9 @@ class Gyro(Table):
     heading: Floats
     """(g,) rad, counter-clockwise, unwrapped."""
 
+    def __post_init__(self) -> None:
+        settle(self, "gyro", {"stamps": ("g",), "heading": ("g",)})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserScans(Table):
@@ -118,6 +129,9 @@ class LaserScans(Table):
     range_min: float
     range_max: float
     """m; a reading outside [range_min, range_max] is not an obstacle."""
+
+    def __post_init__(self) -> None:
+        settle(self, "scans", {"stamps": ("k",), "ranges": ("k", "b")})
 
     @property
     def angles(self) -> Floats:
@@ -151,6 +165,9 @@ class SensorMounting:
     """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
     more_tags: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(t, 3) x, y, z of further tags on the base."""
+
+    def __post_init__(self) -> None:
+        settle(self, "mounting", {"T_base_laser": (3,), "tag_position": (3,), "more_tags": ("t", 3)})
 
     @property
     def tags(self) -> Floats:
