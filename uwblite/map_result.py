@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from .arrays import Floats, Ints
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
@@ -162,3 +164,7 @@ class MapResult:
     """Warnings for the user."""
     doubts: tuple[Notice, ...]
     """Reasons not to trust the result; non-empty means exit code 3."""
+    shape_poses: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(p, 3) poses all over the map."""
+    shape_covariances: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    """(p, 3, 3) their covariances in the frame that fits all of them best: how far the map is bent there; m, m, rad."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import Unknown, unknowns
-from ..graph.covariances import Covariances, shape_error
+from ..graph.covariances import Covariances, about_best_fit, shape_error
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
@@ -79,6 +79,8 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
         stages=tuple(stages.done),
         warnings=tuple(stages.warnings),
         doubts=tuple(stages.doubts),
+        shape_poses=graph.poses[covariance.chosen],
+        shape_covariances=about_best_fit(graph.poses[covariance.chosen], covariance.among),
     )
 
 
