@@ -24,8 +24,6 @@ _NORMAL_RADIUS = 0.2
 _BEHIND = 0.013
 """m; the surface behind the first occupied cells' centres. A cell before it is occupied where more than a third of the rays
 that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
-_SIDE = (0.1, 0.15, 0.2, 0.25)
-"""m; distance at which the free side of a wall is searched."""
 _MOST_CELLS = 4_000_000
 """Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
 
@@ -210,13 +208,14 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     if not len(occupied):
         empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
         return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
-    lines = _lines(occupied, _free_side(grid.geometry, states, occupied), max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
-    cell = max(grid.geometry.resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
-    bare = Walls(
-        grid.geometry, states, lines.centers, lines.normals, np.zeros(len(occupied), bool), lines.normal_variance,
-        cell, *_nearest(lines.centers, cell),
-    )  # fmt: skip
-    return _facing_free_space(bare)
+    resolution = grid.geometry.resolution
+    sides = _free_side(grid.geometry, states, occupied)
+    lines = _lines(occupied, sides, max(_NORMAL_RADIUS, 3.0 * resolution))
+    normals = lines.normals * np.where((lines.normals * sides).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    one_sided = np.hypot(*sides.T) > 0.5
+    points = lines.centers - _BEHIND * normals * one_sided[:, None]
+    cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
+    return Walls(grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, *_nearest(points, cell))
 
 
 def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats) -> Floats:
@@ -266,18 +265,6 @@ def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
     near[:, :-1] |= free[:, 1:]
     row, col = np.nonzero((states == OCCUPIED) & near)
     return geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
-
-
-def _facing_free_space(walls: Walls) -> Walls:
-    """Return the walls with normals that point to the side on which the map has free space."""
-    free = []
-    for sign in (1.0, -1.0):
-        places = [walls.points + sign * offset * walls.normals for offset in _SIDE]
-        free.append(sum((walls.state_at(p[:, 0], p[:, 1]) == FREE).astype(np.int64) for p in places))
-    turned = np.where((free[1] > free[0])[:, None], -walls.normals, walls.normals)
-    one_sided = np.minimum(free[0], free[1]) == 0
-    points = walls.points - _BEHIND * turned * one_sided[:, None]
-    return replace(walls, points=points, normals=turned, one_sided=one_sided)
 
 
 def _cells(values: Floats, origin: float, size: float) -> Ints:
