@@ -153,6 +153,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
             "rows": grid.geometry.rows,
             "cols": grid.geometry.cols,
             "scans_used": grid.scans_used,
+            "missing_share": grid.missing_share,
         },
         "files": hashes,
     }

@@ -100,7 +100,7 @@ def from_result(result: StoredResult) -> KnownMap:
     if not anchors.ids and result.grid is None:
         raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: no robot can be localized in it")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
-    walls = None if result.grid is None else walls_of(result.grid)
+    walls = None if result.grid is None else walls_of(replace(result.grid, missing_share=_missing_share(result.report)))
     return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0), _shape(result.report))
 
 
@@ -144,6 +144,13 @@ def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
     away = anchors.positions[anchor] - tags
     bearings = np.arctan2(away[:, 1], away[:, 0]) - stored.headings[own]
     return replace(anchors, errors=range_errors(anchor, tags, bearings, stored.errors[own], len(anchors.ids)))
+
+
+def _missing_share(report: dict[str, Any]) -> float:
+    """Return the share of beams towards walls without a reading that a report states; nan = it does not."""
+    stated = report.get("map")
+    share = stated.get("missing_share") if isinstance(stated, dict) else None
+    return float(share) if isinstance(share, int | float) else float("nan")
 
 
 def _shape(report: dict[str, Any]) -> tuple[Floats, Floats]:

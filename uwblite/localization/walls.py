@@ -83,6 +83,8 @@ class Walls:
     """m; of the table of nearest walls."""
     origin: Floats
     """(2,) m, its lower left corner."""
+    missing: float
+    """Likelihood that a ray towards a wall comes back without a reading."""
     nearest: NDArray[np.signedinteger]
     """(x, y) nearest wall point of each of its cells, with a line or without one; -1 = none within reach."""
 
@@ -163,7 +165,8 @@ class Walls:
         """Return how rays agree with the map at poses (h, 3).
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
-        a ray that passes a wall counts as if it ended in free space, or half of that where it has no reading.
+        a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
+        return there, to the power of a half: what is dark to one ray is dark to its neighbours.
         """
         c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
 
@@ -182,7 +185,7 @@ class Walls:
         # Up to 0.3 m before the end: beyond that it may be the wall on which the ray ends.
         t = _LOOKS[:, None, None] * np.maximum(1.0 - 0.3 / np.maximum(np.hypot(along, across), 0.3), 0.0)
         passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
-        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(_STRANGE)), value)
+        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(self.missing)), value)
         ends = rays.hit & ~unknown
         known = ends.sum(axis=1).astype(np.float64)
         share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
@@ -207,7 +210,7 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     occupied = _surface(grid.geometry, states)
     if not len(occupied):
         empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
-        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
+        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), 1.0, none)
     resolution = grid.geometry.resolution
     sides = _free_side(grid.geometry, states, occupied)
     lines = _lines(occupied, sides, max(_NORMAL_RADIUS, 3.0 * resolution))
@@ -215,7 +218,11 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     one_sided = np.hypot(*sides.T) > 0.5
     points = lines.centers - _BEHIND * normals * one_sided[:, None]
     cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
-    return Walls(grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, *_nearest(points, cell))
+    origin, nearest = _nearest(points, cell)
+    missing = float(np.clip(grid.missing_share, _STRANGE, 1.0)) if np.isfinite(grid.missing_share) else _STRANGE
+    return Walls(
+        grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest
+    )
 
 
 def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats) -> Floats:
