@@ -29,5 +29,6 @@ def test_of_beams_that_return_nothing_at_random_their_share_is_found(lost):
 
 
 def test_beams_that_end_at_a_person_before_the_wall_do_not_count():
-    assert missing_share([sweeps(0.0, person=0.4)], grid_of(ODD), 3.0) == 0.0
+    assert missing_share([sweeps(0.0, person=2.0)], grid_of(ODD), 3.0) == 0.0
+    assert np.isnan(missing_share([sweeps(0.0, person=0.1)], grid_of(ODD), 3.0))
     assert np.isnan(missing_share([], grid_of(ODD), 3.0))
