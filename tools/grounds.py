@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from simulation import logfile
+from simulation.laser import LaserModel
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings, simulate
 from trials import Trial, loaded
@@ -21,10 +22,12 @@ from uwblite.localization.known_map import KnownMap, from_result
 from uwblite.mapping import build_map
 from uwblite.pipeline.mapping_config import preset
 
-MINUTES = {"hall": 15.0, "lab": 10.0, "warehouse": 40.0, "arena": 15.0, "room": 3.0}
+MINUTES = {"hall": 15.0, "lab": 10.0, "warehouse": 40.0, "arena": 15.0, "room": 3.0, "corridor": 15.0}
 """Of the recording that a map is made of."""
 SPEED = {"warehouse": 0.5}
 """m/s of the robots in a world, where it is not 0.2: half an hour of that passes a tenth of the warehouse."""
+WEAK_GRAZING = np.deg2rad(70.0)
+"""Angle at which a weak lidar loses half of the rays at 3 m."""
 PLAYED = 10.0
 """Minutes of another recording in the same building."""
 
@@ -38,6 +41,8 @@ class Place:
     seed: int
     easy: bool = False
     """Rooms without errors that stay with places, and without people."""
+    weak: bool = False
+    """The lidar loses a sixth of its returns by distance, angle and paint, and another robot carries it a little turned."""
 
     @property
     def settings(self) -> Settings:
@@ -45,12 +50,15 @@ class Place:
         rooms = None if self.easy else RealRooms()
         minutes = MINUTES[self.world]
         speed = SPEED.get(self.world, 0.2)
-        return Settings(self.world, self.seed, minutes, speed, scan_rate=5.0, building=self.building, rooms=rooms)
+        laser = LaserModel(grazing=WEAK_GRAZING, weak=0.2, dark=0.2) if self.weak else LaserModel()
+        if rooms is not None and self.weak:
+            rooms = replace(rooms, grazing=WEAK_GRAZING)
+        return Settings(self.world, self.seed, minutes, speed, scan_rate=5.0, building=self.building, rooms=rooms, laser=laser)
 
     @property
     def name(self) -> str:
         """Of its folder."""
-        return f"{self.world}-{self.building}-{self.seed}" + ("-easy" if self.easy else "")
+        return f"{self.world}-{self.building}-{self.seed}" + "-easy" * self.easy + "-weak" * self.weak
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,8 @@ def played(place: Place, keep: Path | None = None) -> Trial:
     """Return another path of another robot, from another day, in the same building."""
     with _folder(keep) as folder:
         settings = replace(place.settings, seed=place.seed + 1, minutes=PLAYED, scan_rate=10.0)
+        if place.weak:
+            settings = replace(settings, laser_error=(0.005, -0.005, -0.012))
         return _recorded(settings, Path(folder) / place.name / "played")
 
 

@@ -267,7 +267,7 @@ def scaled(on: Bench, grid: OccupancyGrid, factor: float) -> Bench:
 def abroad(on: Bench, other: KnownMap) -> Bench:
     """Return the bench with the map of another building, whose anchors bear the same ids."""
     count = min(len(on.known.anchors.ids), len(other.anchors.ids))
-    fields = ("positions", "bias", "rise", "sigma")
+    fields = ("positions", "bias", "rise", "sigma", "bias_sigma")
     parts = {name: getattr(other.anchors, name)[:count] for name in fields}
     return replace(on, known=replace(other, anchors=replace(other.anchors, ids=on.known.anchors.ids[:count], **parts)))
 
@@ -368,22 +368,23 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=480.0, help="of tracking")
     parser.add_argument("--seed", type=int, default=301)
     parser.add_argument("--building", type=int, default=31, help="range offsets of walls, glass, multipath, biases of anchors")
+    parser.add_argument("--weak", action="store_true", help="returns are lost by range, angle and paint")
     parser.add_argument("--easy", action="store_true", help="rooms without the errors of real ones")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep maps and recordings, and use those that are there")
     parser.add_argument("--print", action="store_true", help="write nothing")
     args = parser.parse_args(argv)
     for world in args.only.split(","):
-        on = bench(Place(world, args.building, args.seed, args.easy), args.keep)
+        on = bench(Place(world, args.building, args.seed, args.easy, args.weak), args.keep)
         text = report(on, args.starts, args.carried, args.seconds)
         if args.wrong:
-            place, other = (Place(w, args.building, args.seed, args.easy) for w in (world, ELSEWHERE[world]))
+            place, other = (Place(w, args.building, args.seed, args.easy, args.weak) for w in (world, ELSEWHERE[world]))
             grid = mapped(place, keep=args.keep).result.grid
             assert grid is not None
             rows = wrong_rows(on, grid, mapped(other, keep=args.keep).known, args.wrong)
             text += "\n" + table((f"{world}, wrong map: certain in", "all sensors", "without lidar"), rows)
         print(text, flush=True)
         if not args.print:
-            write_section(ROOT / "docs" / "lab" / "localization.md", f"localization {world}", text)
+            write_section(ROOT / "docs" / "lab" / "localization.md", f"localization {world}{' weak' * args.weak}", text)
     return 0
 
 

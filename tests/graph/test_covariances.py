@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from uwblite.graph.covariances import shape_error
+from uwblite import se2
+from uwblite.graph.covariances import about_best_fit, shape_error
 
 
 def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
@@ -29,3 +30,26 @@ def test_moves_turns_and_growth_of_the_whole_are_no_error_of_its_shape():
     modes = modes.reshape(4, -1).T
     assert shape_error(poses, modes @ modes.T) == pytest.approx(0.0, abs=1e-6)
     assert shape_error(poses, np.eye(27)) == pytest.approx(np.sqrt((18 - 4) / 9))
+
+
+def test_covariances_about_the_best_fit_are_those_of_many_draws_that_were_fitted():
+    rng = np.random.default_rng(5)
+    poses = rng.normal(loc=[40.0, -20.0, 0.0], scale=10.0, size=(6, 3))
+    root = 1e-3 * rng.normal(size=(18, 18))
+    errors = (root @ rng.normal(size=(18, 4000))).T.reshape(-1, 6, 3)
+    fits = np.array([se2.align(poses[:, :2] + e[:, :2], poses[:, :2]) for e in errors])
+    left = np.array([se2.compose(fit, poses + e) - poses for fit, e in zip(fits, errors, strict=True)])
+    left[..., 2] = se2.wrap_angle(left[..., 2])
+    drawn = np.einsum("nki,nkj->kij", left, left) / len(left)
+    stated = about_best_fit(poses, root @ root.T)
+    scale = np.sqrt(np.einsum("kii->ki", stated))
+    both = scale[:, :, None] * scale[:, None, :]
+    np.testing.assert_allclose(drawn / both, stated / both, atol=0.1)
+
+
+def test_a_move_of_the_whole_bends_it_nowhere():
+    poses = np.random.default_rng(3).normal(scale=5.0, size=(9, 3))
+    modes = np.tile(np.eye(3), (9, 1, 1))
+    modes[:, 0, 2], modes[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    modes = modes.reshape(27, 3)
+    np.testing.assert_allclose(about_best_fit(poses, modes @ modes.T), 0.0, atol=1e-9)

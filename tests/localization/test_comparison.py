@@ -22,7 +22,8 @@ def test_a_place_near_an_earlier_one_stays_only_if_it_is_far_better():
 def test_a_search_that_was_driven_through_compares_in_the_present_frame():
     """Ranges to four anchors tell place and heading: what is found hangs on the robot, however far it drove meanwhile."""
     anchors = np.array([[0.0, 0.0], [9.0, 1.0], [8.0, 8.0], [-1.0, 7.0]])
-    known = KnownMap(KnownAnchors(tuple("abcd"), anchors, *np.zeros((2, 4)), np.full(4, 0.05)), None, np.zeros(3))
+    stated = KnownAnchors(tuple("abcd"), anchors, *np.zeros((2, 4)), np.full(4, 0.05), np.full(4, 0.1))
+    known = KnownMap(stated, None, np.zeros(3))
     path = np.column_stack([np.linspace(2.0, 6.0, 21), 3.0 + np.sin(np.linspace(0.0, 3.0, 21)), np.linspace(0.0, 0.8, 21)])
     window = Window()
     for k, pose in enumerate(path):

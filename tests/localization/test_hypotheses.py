@@ -6,7 +6,7 @@ from helpers.localization_room import cast, grid_of
 
 from uwblite import se2
 from uwblite.localization import hypotheses
-from uwblite.localization.hypotheses import SLOW_LENGTH
+from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH
 from uwblite.localization.walls import Rays, walls_of
 
 
@@ -22,7 +22,9 @@ def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
         still = hypotheses.Hypotheses(bank.mean, 0.0 * bank.covariance, bank.log_weight)
         noise = hypotheses.moved(still, step).covariance[0]
         np.testing.assert_allclose(hypotheses.moved(bank, step).covariance[0] - noise, F @ bank.covariance[0] @ F.T, atol=1e-9)
-        assert np.isclose(F[-1, -1], np.exp(-np.hypot(*step[:2]) / SLOW_LENGTH))
+        fading = FIRST_ANCHOR + np.arange(2)
+        np.testing.assert_allclose(F[fading, fading], np.exp(-np.hypot(*step[:2]) / SLOW_LENGTH), rtol=1e-6)
+        np.testing.assert_allclose(F[-2:, -2:], np.eye(2), atol=1e-9)
 
 
 def test_scans_between_two_oblique_walls_say_nothing_along_them_and_a_third_wall_does():
@@ -38,7 +40,7 @@ def test_scans_between_two_oblique_walls_say_nothing_along_them_and_a_third_wall
         readings, angles = cast(pose, turned), np.linspace(-np.pi / 2, np.pi / 2, 181)
         seen = np.isfinite(readings)
         ends = readings[seen, None] * np.stack([np.cos(angles[seen]), np.sin(angles[seen])], axis=1)
-        bank = hypotheses.started(pose[None], np.diag(sigma**2)[None], 1)
+        bank = hypotheses.started(pose[None], np.diag(sigma**2)[None], np.full(1, 0.1))
         for _ in range(40):
             bank = hypotheses.matched(bank, walls, Rays(ends, np.zeros_like(ends), np.ones(len(ends), bool)), 1.0, found=True)
         along = se2.rotate(turn, np.eye(2))

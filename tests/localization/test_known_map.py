@@ -1,5 +1,6 @@
 """What a localisation takes from a map's folder."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,26 @@ def test_ranges_are_corrected_by_what_the_maps_own_left_over(tmp_path):
         from_result(read_result(tmp_path / "map"))
     (tmp_path / "map" / "range_errors.csv").unlink()
     assert from_result(read_result(tmp_path / "map")).anchors.errors == ()
+
+
+def test_the_bend_of_the_map_is_in_the_pose_where_it_is(tmp_path):
+    result = small_result()
+    bent = np.stack([np.diag([4e-4, 1e-4, 1e-6]), np.diag([0.04, 0.01, 1e-4])])
+    poses = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0]])
+    stated = replace(result, shape_poses=poses, shape_covariances=bent)
+    write_result(tmp_path / "map", [small_log()], stated, RunRecord("", ""))
+    known = from_result(read_result(tmp_path / "map"))
+    near, far = known.covariance_at(np.array([[1.0, 1.0], [9.0, 0.0]]))
+    np.testing.assert_allclose(far - near, bent[1] - bent[0])
+    report = tmp_path / "map" / "report.json"
+    for broken in ('"shape": 3', '"shape": {"poses": [[0, 0, 0]], "covariances": [[[1]]]}'):
+        text = re.sub(r'"shape": \{[^}]*\}', broken, report.read_text())
+        assert broken in text
+        report.write_text(text)
+        plain = from_result(read_result(tmp_path / "map"))
+        assert np.isfinite(plain.covariance_at(np.zeros(2))).all()
+        assert not len(plain.shape[0])
+        report.write_text(text.replace(broken, '"shape": {}'))
 
 
 def anchors_of(*rows):

@@ -25,7 +25,8 @@ def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
         def expected(x, waves=waves, known=known):
             place = x[:2] + se2.rotate(x[2], tag)
             distance = np.sqrt(np.sum((place - fact.place) ** 2) + fact.square)
-            return np.array([(1.0 + fact.scale) * distance + x[FIRST_ANCHOR + fact.anchor] + waves @ x[PATTERN] + known])
+            own = x[FIRST_ANCHOR + fact.anchor] + x[FIRST_ANCHOR + 2 + fact.anchor]
+            return np.array([(1.0 + fact.scale) * distance + own + waves @ x[PATTERN] + known])
 
         H, P = numeric(expected, bank.mean[0]), bank.covariance[0]
         measured = float(expected(bank.mean[0])[0]) + 0.05

@@ -57,7 +57,7 @@ def test_ranges_to_one_anchor_confirm_nothing_in_any_map():
 
 
 def test_a_rival_a_hundred_times_less_likely_is_none_in_a_map_in_which_the_robot_was_tracked():
-    bank = hypotheses.started(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), np.tile(0.01 * np.eye(3), (2, 1, 1)), 0)
+    bank = hypotheses.started(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), np.tile(0.01 * np.eye(3), (2, 1, 1)), np.zeros(0))
     bank = hypotheses.reweighted(bank, np.array([0.0, -5.0]))
     for fitting, proven, certain in ((CLEAR, True, True), (CLEAR, False, False), (ONE_ANCHOR, True, False)):
         assert (doubt(bank, 0, True, -0.1, ENOUGH_ENDS, fitting, proven) == "") is certain

@@ -31,6 +31,10 @@ class LaserModel:
     """Share of rays that see nothing for no reason."""
     grazing: float = np.deg2rad(80.0)
     """Angle of incidence at which half of the rays at 3 m are lost."""
+    weak: float = 0.0
+    """Share of rays lost at full reach; in proportion to the square of the distance, and to paint."""
+    dark: float = 0.0
+    """Share of the surfaces that are painted dark: the angle and the distance at which they answer halve."""
     mixed: float = 0.35
     """Share of the rays at an edge that return a distance between the two surfaces."""
     error_codes: float = 0.1
@@ -90,11 +94,12 @@ def near(walls: Floats, columns: Floats, centre: Floats, reach: float) -> tuple[
 
 
 def disturb(
-    true: Floats, cosine: Floats, surface: NDArray[np.intp], model: LaserModel, colour: Floats, rng: np.random.Generator
+    true: Floats, cosine: Floats, surface: NDArray[np.intp], model: LaserModel, colour: Floats, rng: np.random.Generator,
+    dark: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the reported distances, mm, of whole scans (k, beams), and which are of two surfaces at once.
 
-    There are noise, mixed pixels, lost rays and error codes.
+    There are noise, mixed pixels, lost rays and error codes. dark (s,): which surfaces are painted dark, the last one is none.
     """
     seen = np.isfinite(true)
     range_ = np.where(seen, true, model.max_range)
@@ -110,9 +115,10 @@ def disturb(
     sd = np.maximum(model.near_sd, model.far_sd * stated)
     stated = stated + sd * rng.standard_normal(true.shape) + np.where(surface >= 0, colour[surface], 0.0)
     # Little light comes back from oblique and far surfaces: the angle that still answers shrinks with distance.
-    limit = np.cos(model.grazing) * range_ / 3.0
+    painted = np.ones(true.shape) if dark is None else np.where((surface >= 0) & dark[surface], 2.0, 1.0)
+    limit = np.cos(model.grazing) * painted * range_ / 3.0
     lost = rng.random(true.shape) > 1.0 / (1.0 + np.exp(np.clip((limit - cosine) / (0.15 * limit + 1e-3), -50, 50)))
-    lost |= rng.random(true.shape) < model.blind
+    lost |= rng.random(true.shape) < model.blind + model.weak * np.square(painted * range_ / model.max_range)
     lost |= mix & ~both
     lost |= ~seen | (stated >= model.max_range) | (stated < model.min_range)
     code = rng.random(true.shape) < model.error_codes

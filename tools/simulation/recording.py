@@ -275,6 +275,8 @@ class Scene:
     """(s,) m, constant error of each surface: walls, columns, people."""
     glass: NDArray[np.bool_]
     """(w,) which walls are of glass."""
+    dark: NDArray[np.bool_]
+    """(s,) which surfaces are painted dark."""
 
 
 def scene_of(settings: Settings, plan: FloorPlan, crowd: list[drive.Motion], rng: np.random.Generator) -> Scene:
@@ -289,7 +291,8 @@ def scene_of(settings: Settings, plan: FloorPlan, crowd: list[drive.Motion], rng
         # The outer walls stay: a place without any has no map.
         glass = _lasting(settings.building, 13, _rng(settings, 13)).random(len(plan.walls)) < rooms.glass
         glass[:4] = False
-    return Scene(settings, plan, crowd, model, colour, glass)
+    paint = _lasting(settings.building, 14, _rng(settings, 14)).random(len(colour)) < model.dark
+    return Scene(settings, plan, crowd, model, colour, glass, paint)
 
 
 def swept(
@@ -319,7 +322,7 @@ def swept(
         true = np.where(real_rooms.unseen_glass(rooms, scene.glass, surface, cosine), np.inf, true)
         surface = np.where(np.isfinite(true), surface, -1)
         true = true + rooms.warm_up[0] * np.exp(-stamps[:, None] / rooms.warm_up[1])
-    stated, mixed = laser.disturb(true, cosine, surface, model, scene.colour, rng)
+    stated, mixed = laser.disturb(true, cosine, surface, model, scene.colour, rng, scene.dark)
     far = model.far_sd * np.where(np.isfinite(true), true, 0.0)
     most = 5.0 * np.maximum(model.near_sd, far) + 3.0 * model.surface_sd
     own = (np.abs(0.001 * stated - true) < most) & ~mixed & (surface < len(plan.walls) + len(plan.columns))

@@ -10,7 +10,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
-from ..graph.covariances import Covariances, shape_error
+from ..graph.covariances import Covariances, about_best_fit, shape_error
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
@@ -79,6 +79,8 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
         grid=grid,
         stages=tuple(stages.done),
         findings=tuple(stages.findings),
+        shape_poses=graph.poses[covariance.chosen],
+        shape_covariances=about_best_fit(graph.poses[covariance.chosen], covariance.among),
     )
 
 

@@ -26,6 +26,27 @@ class Covariances:
     """(3 k, 3 k) of the k chosen poses with each other, x, y, theta of each in turn."""
 
 
+def about_best_fit(poses: Floats, covariance: Floats) -> Floats:
+    """Return the covariances (k, 3, 3) of poses in the frame that fits all of them best, not that of the first pose.
+
+    The fit is the rigid motion ``xi = A^+ e`` of least squares that the errors e of the places have in common; what is left at
+    each pose is ``e_i - G_i xi``.
+
+    Parameters
+    ----------
+    poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
+    """
+    count = len(poses)
+    x, y = (poses[:, :2] - poses[:, :2].mean(axis=0)).T
+    moves = np.tile(np.eye(3), (count, 1, 1))
+    moves[:, 0, 2], moves[:, 1, 2] = -y, x
+    fit = np.zeros((3, count, 3))
+    fit[:, :, :2] = np.linalg.pinv(moves[:, :2].reshape(-1, 3)).reshape(3, count, 2)
+    left = np.eye(3 * count) - moves.reshape(-1, 3) @ fit.reshape(3, -1)
+    whole = (left @ covariance @ left.T).reshape(count, 3, count, 3)
+    return np.asarray(whole[np.arange(count), :, np.arange(count), :])
+
+
 def shape_error(poses: Floats, covariance: Floats) -> float:
     """Return the rms error of places (m) that is expected after alignment by a similarity.
 

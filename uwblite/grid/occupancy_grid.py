@@ -87,6 +87,8 @@ class OccupancyGrid:
     """Scans traced into it."""
     scans_astray: int = 0
     """Scans not traced, because they lie so far from all others that the grid would have been too large."""
+    missing_share: float = math.nan
+    """Share, 0..1, of the beams towards a wall nearby that came back without a reading; nan = not known."""
 
     def probability(self, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the probability of being occupied (rows, cols), of some rows; 0.5 = unknown."""

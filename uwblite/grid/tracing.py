@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
-from .occupancy_grid import GridConfig, OccupancyGrid, from_counts, walls_of
+from .occupancy_grid import OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid, from_counts, walls_of
 from .ray_counter import Counts, RayCounter
 from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 
@@ -98,7 +98,40 @@ def from_sweeps(
     if clears:
         trace(walls_of(from_counts(counter, config)), count)
     drawn = from_counts(counter if geometry else counter.cropped(), config)
-    return replace(drawn, scans_used=count, scans_astray=chosen - count)
+    missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
+    return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)
+
+
+def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: float) -> float:
+    """Return the share, 0..1, of the beams towards a wall of the map within reach, m, that came back without a reading.
+
+    Beams that ended before the wall, at what is not in the map, do not count. nan where no beam meets a wall.
+    """
+    met = lost = 0
+    states, g = np.pad(grid.states(), 1, constant_values=UNKNOWN), grid.geometry
+    for sweeps in recordings:
+        chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.int64))
+        last = None if sweeps.last is None else sweeps.last[chosen]
+        far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
+        far[:, ::_EVERY] = reach
+        readings = sweeps.scans.ranges[chosen][:, ::_EVERY].reshape(-1)
+        rays = scan_rays(sweeps.scans, far, sweeps.first[chosen], last, flipped=sweeps.flipped)
+        along = np.linspace(0.0, 1.0, int(np.ceil(reach / g.resolution)) + 1)[1:]
+        for part in np.array_split(np.arange(len(rays.origins)), max(len(chosen) // 16, 1)):
+            origins, way = rays.origins[part], rays.endpoints[part] - rays.origins[part]
+            row, col = g.cell_of(origins + along[:, None, None] * way)
+            inside = g.inside(row, col)
+            wall = states[np.where(inside, row + 1, 0), np.where(inside, col + 1, 0)] == OCCUPIED
+            distance = np.where(wall.any(axis=0), reach * along[wall.argmax(axis=0)], np.inf)
+            reading = readings[part]
+            nothing = np.isposinf(reading)
+            lost += int((nothing & np.isfinite(distance)).sum())
+            met += int(((nothing | (reading >= distance - _BEFORE)) & np.isfinite(distance)).sum())
+    return lost / met if met else math.nan
+
+
+_SAMPLED, _EVERY, _BEFORE = 200, 8, 0.3
+"""Scans of a recording, and which of their beams, that are compared with the map; and how far before a wall, m, one may end."""
 
 
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":

@@ -150,6 +150,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "warnings": notices(result.warnings),
         "anchors": [{name: getattr(a, name) for name in _ANCHOR_FIELDS} for a in result.anchors],
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
+        "shape": {"poses": result.shape_poses, "covariances": result.shape_covariances},
         "closures": [_closure_entry(c, result.keyframe_stamps) for c in result.closures],
         "stages": [{"name": s.name, **s.figures} for s in result.stages],
         "map": None
@@ -160,6 +161,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
             "rows": grid.geometry.rows,
             "cols": grid.geometry.cols,
             "scans_used": grid.scans_used,
+            "missing_share": grid.missing_share,
         },
         "files": hashes,
     }

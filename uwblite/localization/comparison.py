@@ -70,7 +70,7 @@ class PlaceSearch:
     """
 
     def __init__(self, known: KnownMap) -> None:
-        self.walls, self.anchors = known.walls, len(known.anchors.ids)
+        self.walls, self._biases = known.walls, known.anchors.bias_sigma
         self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
         self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
         self._odom = np.zeros(3)
@@ -158,10 +158,12 @@ class PlaceSearch:
         """Return hypotheses at poses (c, 3) that a search found."""
         scans = self.walls is not None and rays.hit.sum() >= verdict.FEW_ENDS
         covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
+        fresh = hypotheses.started(poses, covariances, self._biases, self._slow)
         if not scans:
             hessian, _ = range_likelihood.range_factors(poses, ranges)
-            covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
-        fresh = hypotheses.started(poses, covariances, self.anchors, self._slow)
+            covariances = np.linalg.inv(hessian + range_likelihood.POOR) + np.diag(np.square(_SIGMA_FLOOR))
+            effect = range_likelihood.bias_effect(poses, ranges, len(self._biases))
+            fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
         if self.walls is not None and rays.hit.sum() >= verdict.FEW_BESIDE:
             fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0, found=False)
         return fresh

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Table
+from ..arrays import Bools, Floats, Ints, Table
 from ..lidar.degeneracy import measured_part
 from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
@@ -25,6 +25,7 @@ tag's radiation pattern and the shadow of the robot's own body, the same for all
 LASER = PATTERN.stop
 """Of the state: rad, heading of the laser on the base against the mounting that the map's robot showed."""
 FIRST_ANCHOR = LASER + 1
+"""Of the state: m, of each anchor the range error that fades, and behind all of these, the one that stays."""
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 LASER_SIGMA = 0.02
@@ -34,6 +35,8 @@ SLOW_SIGMA = 0.12
 SLOW_LEFT = 0.08
 """m; the same where the map contains the range error at a place: the error that remains after correction by a few ranges
 nearby."""
+BIAS_SIGMA = 0.1
+"""m; error of all ranges to one anchor that stays, as CalibrationConfig.range_bias_sound: another tag has another delay."""
 SLOW_LENGTH = 5.0
 """m; its correlation length: fields of a room's size last longer than the 1.5 m of single reflections."""
 _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
@@ -54,9 +57,9 @@ class Hypotheses(Table):
     """Places where the robot may be."""
 
     mean: Floats
-    """(h, FIRST_ANCHOR + a)."""
+    """(h, n), n = FIRST_ANCHOR + 2 a."""
     covariance: Floats
-    """(h, FIRST_ANCHOR + a, FIRST_ANCHOR + a)."""
+    """(h, n, n)."""
     log_weight: Floats
     """(h,) the largest is 0."""
 
@@ -76,34 +79,41 @@ class Hypotheses(Table):
 
 def none(anchors: int) -> Hypotheses:
     """Return no hypothesis."""
-    n = FIRST_ANCHOR + anchors
+    n = FIRST_ANCHOR + 2 * anchors
     return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
-def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW_SIGMA) -> Hypotheses:
+def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA) -> Hypotheses:
     """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
-    slow : standard deviation of the common error of ranges to one anchor, m.
+    biases : (a,) standard deviations of each anchor's range error that stays, m. slow : of the one that fades, m.
     """
-    empty = none(anchors)
+    empty = none(len(biases))
     n = empty.mean.shape[1]
     mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
     mean[:, POSE] = poses
     covariance[:, POSE, POSE] = covariances
-    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), [LASER_SIGMA], np.full(anchors, slow)]) ** 2
-    covariance[:, np.arange(3, n), np.arange(3, n)] = prior
+    pattern, fading = np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(len(biases), slow)
+    covariance[:, np.arange(3, n), np.arange(3, n)] = np.square([*WHEEL_SIGMA, *pattern, LASER_SIGMA, *fading, *biases])
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
 
-def placed(bank: Hypotheses, which: int, pose: Floats, covariance: Floats) -> Hypotheses:
-    """Return the hypotheses with another pose (3,) and covariance (3, 3) of one of them, uncorrelated with the other
-    unknowns."""
+def placed(bank: Hypotheses, which: Ints, poses: Floats, covariances: Floats, effect: Floats) -> Hypotheses:
+    """Return the hypotheses with the poses (w, 3) and covariances (w, 3, 3) that ranges give to some of them (w,).
+
+    Parameters
+    ----------
+    effect : (w, 3, a) by how much the poses move with the error that the ranges to an anchor have in common.
+    """
     mean, whole = bank.mean.copy(), bank.covariance.copy()
-    mean[which, POSE] = pose
+    mean[which, POSE] = poses
     whole[which, POSE, :] = whole[which, :, POSE] = 0.0
-    whole[which, POSE, POSE] = covariance
+    bias = slice((FIRST_ANCHOR + mean.shape[1]) // 2, None)
+    shared = -effect @ whole[which, bias, bias]
+    whole[which, POSE, bias], whole[which, bias, POSE] = shared, shared.transpose(0, 2, 1)
+    whole[which, POSE, POSE] = covariances - shared @ effect.transpose(0, 2, 1)
     return Hypotheses(mean, whole, bank.log_weight)
 
 
@@ -133,7 +143,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     f[:, :2, 4], f[:, :2, 5] = 0.5 * turn * across, 0.5 * way * across
     f[:, 2, 4], f[:, 2, 5] = turn, way
     fade = float(np.exp(-way / SLOW_LENGTH))
-    slow = np.arange(FIRST_ANCHOR, n)
+    slow = np.arange(FIRST_ANCHOR, (FIRST_ANCHOR + n) // 2)
     f[:, slow, slow] = fade
     mean[:, :2] += shift
     mean[:, 2] = se2.wrap_angle(mean[:, 2] + (1.0 + g) * turn + m * way)

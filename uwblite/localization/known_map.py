@@ -11,7 +11,7 @@ from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult
 from ..sensor_log.anchor_names import last_places
-from .hypotheses import SLOW_LEFT, SLOW_SIGMA
+from .hypotheses import BIAS_SIGMA, SLOW_LEFT, SLOW_SIGMA
 from .range_errors import RangeErrors, range_errors
 from .walls import Walls, walls_of
 
@@ -29,6 +29,8 @@ class KnownAnchors:
     """(a,) m^2, squared height above the tag that the map's recording showed; 0 where a height was given."""
     sigma: Floats
     """(a,) m, spread of the map's range residuals."""
+    bias_sigma: Floats
+    """(a,) m, of the error that all ranges to it have in common: another tag than the map's, and the anchor's place."""
     scale: float = 0.0
     """Relative error of all ranges, 1."""
     errors: tuple[RangeErrors, ...] = ()
@@ -44,7 +46,8 @@ class KnownAnchors:
         rows = [k for k, name in enumerate(self.ids) if name in names]
         return replace(
             self, ids=tuple(self.ids[k] for k in rows), positions=self.positions[rows], bias=self.bias[rows],
-            rise=self.rise[rows], sigma=self.sigma[rows], errors=tuple(self.errors[k] for k in rows if self.errors),
+            rise=self.rise[rows], sigma=self.sigma[rows], bias_sigma=self.bias_sigma[rows],
+            errors=tuple(self.errors[k] for k in rows if self.errors),
         )  # fmt: skip
 
 
@@ -60,15 +63,25 @@ class KnownMap:
     laser_delay: float = 0.0
     """s; a scan stamped t was taken at t + laser_delay by the odometry's clock."""
 
-    @property
-    def covariance(self) -> Floats:
-        """(3, 3) m^2, rad^2; error of the map itself: common to neighbouring scans, so that no filter averages it."""
+    shape: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 3, 3)))
+    """Places (p, 2), m, and by how much the map is bent there, covariances (p, 3, 3), m and rad."""
+
+    def covariance_at(self, places: Floats) -> Floats:
+        """Return the covariances (..., 3, 3) of the map's own errors at places (..., 2): no filter averages these."""
         cells = 0.0 if self.walls is None else self.walls.rounding / np.sqrt(12.0)
-        return np.diag(np.square(_OFF) + np.square((cells, cells, 0.0)))
+        drawn = np.diag(np.square(_DRAWN) + np.square((cells, cells, 0.0)))
+        where, bent = self.shape
+        if not len(where):
+            return np.broadcast_to(drawn + _UNSTATED, (*places.shape[:-1], 3, 3))
+        away = np.square(places[..., None, :] - where).sum(axis=-1)
+        return np.asarray(drawn + bent[np.argmin(away, axis=-1)])
 
 
-_OFF = (0.02, 0.02, 0.005)
-"""m, m, rad; standard deviation of a map in cells of 0.05 m. In larger ones a wall lies anywhere within half a cell."""
+_DRAWN = (0.014, 0.014, 0.003)
+"""m, m, rad; standard deviation of a wall, and of a robot's laser upon it, in cells of 0.05 m: lidars measure a surface by its
+colour to 0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
+_UNSTATED = np.diag(np.square((0.015, 0.015, 0.004)))
+"""m^2, rad^2; shape of a map of a room or two that does not say how far it is bent."""
 _SIGMA = 0.1
 """m; spread of ranges to an anchor for which the map does not contain it."""
 _LEAST_SIGMA = 0.05
@@ -87,8 +100,8 @@ def from_result(result: StoredResult) -> KnownMap:
     if not anchors.ids and result.grid is None:
         raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: no robot can be localized in it")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
-    walls = None if result.grid is None else walls_of(result.grid)
-    return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0))
+    walls = None if result.grid is None else walls_of(replace(result.grid, missing_share=_missing_share(result.report)))
+    return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0), _shape(result.report))
 
 
 def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
@@ -108,8 +121,15 @@ def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float
         np.array([a.bias if np.isfinite(a.bias) else 0.0 for a in last.values()]),
         np.array([max(calibration.get(f"height2:{a.id}", 0.0), 0.0) for a in last.values()]),
         np.maximum(sigma, _LEAST_SIGMA),
+        np.array([np.sqrt(BIAS_SIGMA**2 + _place_variance(a)) for a in last.values()]),
         calibration.get("range_scale", 0.0),
     )
+
+
+def _place_variance(anchor: StoredAnchor) -> float:
+    """Return the variance of an anchor's place along a range from anywhere, m^2; 0 where the map does not say it."""
+    variance = 0.5 * float(np.trace(anchor.covariance))
+    return variance if np.isfinite(variance) else 0.0
 
 
 def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
@@ -124,6 +144,25 @@ def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
     away = anchors.positions[anchor] - tags
     bearings = np.arctan2(away[:, 1], away[:, 0]) - stored.headings[own]
     return replace(anchors, errors=range_errors(anchor, tags, bearings, stored.errors[own], len(anchors.ids)))
+
+
+def _missing_share(report: dict[str, Any]) -> float:
+    """Return the share of beams towards walls without a reading that a report states; nan = it does not."""
+    stated = report.get("map")
+    share = stated.get("missing_share") if isinstance(stated, dict) else None
+    return float(share) if isinstance(share, int | float) else float("nan")
+
+
+def _shape(report: dict[str, Any]) -> tuple[Floats, Floats]:
+    """Return places (p, 2) and covariances (p, 3, 3) of a report's entry `shape`; none where it has none that is sound."""
+    stated = report.get("shape") if isinstance(report.get("shape"), dict) else {}
+    try:
+        poses, covariances = (np.array(stated[name], dtype=np.float64) for name in ("poses", "covariances"))
+        places, covariances = poses.reshape(-1, 3)[:, :2], covariances.reshape(len(poses), 3, 3)
+    except (KeyError, TypeError, ValueError):
+        return np.zeros((0, 2)), np.zeros((0, 3, 3))
+    sound = np.isfinite(places).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    return places[sound], covariances[sound]
 
 
 def _calibration(report: dict[str, Any]) -> dict[str, float]:

@@ -73,7 +73,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
         passes = _both(log, replace(known, walls=None), rows, progress)
     if _lost(passes):
         raise DataError(f"the recording is found nowhere in the map for certain: {passes[0].reason}")
-    found = smoothed(*passes, known.covariance)
+    found = smoothed(*passes, known.covariance_at)
     there = np.isfinite(found.poses).all(axis=1)
     ends = passes[0].ends + passes[1].ends
     overlap = float(ends[0] / ends[1]) if ends[1] else float("nan")

@@ -78,7 +78,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
         if kind == _ODOMETRY:
             state = localizer.add_odometry(at, *log.odometry.poses[k].tolist())
             if (slot := wanted[k]) >= 0 and not state.lost:
-                poses[slot], covariances[slot] = state.pose, state.covariance - known.covariance
+                poses[slot], covariances[slot] = state.pose, state.covariance - known.covariance_at(state.pose[:2])
             reason = state.reason
         elif kind == _RANGE and log.ranges is not None:
             r = log.ranges
@@ -125,7 +125,7 @@ class Smoothed:
     """(k,) where both know the pose and it is not the same."""
 
 
-def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
+def smoothed(one: Pass, other: Pass, of_map: Callable[[Floats], Floats]) -> Smoothed:
     """Average two passes by their covariances.
 
     ``x = a + A (A + B)^-1 (b - a)``, ``P = A - A (A + B)^-1 A``. Where they contradict one another the more certain one is
@@ -133,7 +133,7 @@ def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
 
     Parameters
     ----------
-    of_map : (3, 3) covariance of the map's own errors, which both passes share.
+    of_map : from places (k, 2) to the covariances (k, 3, 3) of the map's own errors there, which both passes share.
     """
     a, b = one.poses, other.poses
     off = b - a
@@ -141,9 +141,10 @@ def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
     both = np.isfinite(off).all(axis=1)
     poses = np.where(np.isfinite(a), a, b)
     covariances = np.where(np.isfinite(one.covariances), one.covariances, other.covariances)
+    common = of_map(poses[:, :2])
     A, B, d = one.covariances[both], other.covariances[both], off[both]
     gain = A @ np.linalg.inv(A + B)
-    far = np.einsum("ni,nij,nj->n", d, np.linalg.inv(A + B + of_map), d) > _APART
+    far = np.einsum("ni,nij,nj->n", d, np.linalg.inv(A + B + common[both]), d) > _APART
     mean, joint = a[both] + np.einsum("nij,nj->ni", gain, d), A - gain @ A
     first = np.trace(A, axis1=1, axis2=2) <= np.trace(B, axis1=1, axis2=2)
     surer = np.where(first[:, None], a[both], b[both])
@@ -153,4 +154,4 @@ def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     contradicting = np.zeros(len(a), dtype=bool)
     contradicting[both] = far
-    return Smoothed(poses, covariances + of_map, contradicting)
+    return Smoothed(poses, covariances + common, contradicting)

@@ -15,8 +15,8 @@ from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .known_map import KnownMap
 from .odometer import Odometer
-from .range_likelihood import range_moments
-from .range_update import RangeFacts, ranged
+from .range_likelihood import bias_effect, range_moments
+from .range_update import RangeFacts, ranged, repeated
 from .records import LocalizerState
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
 from .walls import Rays
@@ -62,6 +62,8 @@ class PoseEstimator:
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
+        self._range_way = np.full(len(known.anchors.ids), -np.inf)
+        """(a,) m, odometer at the last range to each anchor."""
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
@@ -92,7 +94,9 @@ class PoseEstimator:
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
-        bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm)
+        share = 1.0 / repeated(fact, self._way - self._range_way[fact.anchor])
+        self._range_way[fact.anchor] = self._way
+        bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm, share)
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
         self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
@@ -163,7 +167,7 @@ class PoseEstimator:
         fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         reason = "" if self._certain else self._reason
-        pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance
+        pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         return LocalizerState(stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], far)
 
     def _laser_turn(self) -> Floats:
@@ -226,7 +230,9 @@ class PoseEstimator:
         fit, known, ranges = float(found.fit[best]), float(found.known[best]), found.ranges
         fitting = verdict.agreeing(self._bank.poses[best], ranges)
         if known < (verdict.FEW_BESIDE if proven and fitting.anchors >= 3 else verdict.FEW_ENDS) and len(ranges):
-            self._bank = hypotheses.placed(self._bank, best, *range_moments(self._bank.poses[best], ranges))
+            pose, covariance = range_moments(self._bank.poses[best], ranges)
+            effect = bias_effect(pose[None], ranges, len(self.known.anchors.ids))
+            self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)
             fitting = verdict.agreeing(self._bank.poses[best], ranges)
         pose = self._bank.poses[best].copy()
         self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting, proven) or verdict.other_unit(

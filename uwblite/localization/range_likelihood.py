@@ -87,10 +87,26 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
 
 def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
+    jacobian, weighted, error = _linear(poses, ranges)
+    return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)
+
+
+def bias_effect(poses: Floats, ranges: Ranges, anchors: int) -> Floats:
+    """Return by how much (h, 3, a) poses (h, 3) by ranges move with an error that all ranges to an anchor have in common."""
+    jacobian, weighted, _ = _linear(poses, ranges)
+    own = (ranges.anchor[:, None] == np.arange(anchors)).astype(np.float64)
+    return np.linalg.solve(weighted.transpose(0, 2, 1) @ jacobian + POOR, weighted.transpose(0, 2, 1) @ own)
+
+
+POOR = np.diag([0.01, 0.01, 0.1])
+"""Information of a pose of which nothing is known within 10 m and 3 rad."""
+
+
+def _linear(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
+    """Return the Jacobian (h, m, 3) of expected ranges, the same times their weights, and their errors (h, m), m."""
     error, offset, lever = range_errors(poses, ranges)
     distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 0.05)
     unit = offset / distance[..., None]
     jacobian = np.concatenate([unit, (unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1])[..., None]], axis=-1)
     weight = _INDEPENDENT / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
-    weighted = jacobian * weight[..., None]
-    return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)
+    return jacobian, jacobian * weight[..., None], error

@@ -39,12 +39,30 @@ class RangeFacts:
     """By the tag's place, from the map."""
 
 
-def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats, Floats]:
+def repeated(fact: RangeFacts, driven: float) -> float:
+    """Return how many ranges have the information of one independent one, so many metres after the last one to the anchor.
+
+    Multipath and shadows, which are the same until the tag has moved: the mean of errors with covariance ``exp(-d / length)``
+    every d has the variance of independent ones every ``2 length``. The white part of the noise is new every time.
+    """
+    noise = fact.errors.noise if fact.errors is not None else None
+    white, length = (0.5, _LENGTH) if noise is None else (min(noise.white**2 / fact.sigma**2, 1.0), noise.length)
+    return white + (1.0 - white) * max(2.0 * length / max(driven, _SAME_PLACE), 1.0)
+
+
+_LENGTH, _SAME_PLACE = 1.5, 0.01
+"""m; length of the errors in a map that does not say it, as RadioModel; and way below which nothing is new."""
+
+
+def ranged(
+    bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0
+) -> tuple[Hypotheses, Floats, Floats, Floats]:
     """Correct every hypothesis by one range.
 
     Parameters
     ----------
-    tag : (2,) place of the tag at the range's time in the present frame of the base, m.
+    tag : (2,) place of the tag at the range's time in the present frame of the base, m. share : of an independent range's
+        information that it has, 0..1; the likelihood is that of the whole.
 
     Returns
     -------
@@ -59,9 +77,9 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses,
     lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
     offset = bank.mean[:, :2] + lever - fact.place
     distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, 1e-4))
-    column = FIRST_ANCHOR + fact.anchor
+    columns = fact.anchor + np.array([FIRST_ANCHOR, (FIRST_ANCHOR + bank.mean.shape[1]) // 2])
     waves = pattern_waves(np.arctan2(-offset[:, 1], -offset[:, 0]) - theta)
-    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, column]
+    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, columns].sum(axis=1)
     if fact.errors is not None:
         shift += fact.errors.at(offset + fact.place)
     error = fact.range - (1.0 + fact.scale) * distance - shift
@@ -70,12 +88,12 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses,
     unit = (1.0 + fact.scale) * offset / distance[:, None]
     jacobian[:, :2] = unit
     jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]
-    jacobian[:, column] = 1.0
+    jacobian[:, columns] = 1.0
     spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
     own = np.einsum("hi,hi->h", jacobian, spread)
     sigma = np.sqrt(own + fact.sigma**2)
     weight, likelihood = _judged(error, sigma)
-    gain = spread / (own + fact.sigma**2 / np.maximum(weight, 1e-3))[:, None]
+    gain = spread / (own + fact.sigma**2 / (share * np.maximum(weight, 1e-3)))[:, None]
     gain *= (weight > 1e-3)[:, None]
     mean = bank.mean + gain * error[:, None]
     mean[:, 2] = se2.wrap_angle(mean[:, 2])

@@ -24,8 +24,6 @@ _NORMAL_RADIUS = 0.2
 _BEHIND = 0.013
 """m; the surface behind the first occupied cells' centres. A cell before it is occupied where more than a third of the rays
 that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
-_SIDE = (0.1, 0.15, 0.2, 0.25)
-"""m; distance at which the free side of a wall is searched."""
 _MOST_CELLS = 4_000_000
 """Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
 
@@ -85,6 +83,8 @@ class Walls:
     """m; of the table of nearest walls."""
     origin: Floats
     """(2,) m, its lower left corner."""
+    missing: float
+    """Likelihood that a ray towards a wall comes back without a reading."""
     nearest: NDArray[np.signedinteger]
     """(x, y) nearest wall point of each of its cells, with a line or without one; -1 = none within reach."""
 
@@ -165,7 +165,8 @@ class Walls:
         """Return how rays agree with the map at poses (h, 3).
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
-        a ray that passes a wall counts as if it ended in free space, or half of that where it has no reading.
+        a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
+        return there, to the power of a half: what is dark to one ray is dark to its neighbours.
         """
         c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
 
@@ -184,7 +185,7 @@ class Walls:
         # Up to 0.3 m before the end: beyond that it may be the wall on which the ray ends.
         t = _LOOKS[:, None, None] * np.maximum(1.0 - 0.3 / np.maximum(np.hypot(along, across), 0.3), 0.0)
         passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
-        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(_STRANGE)), value)
+        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(self.missing)), value)
         ends = rays.hit & ~unknown
         known = ends.sum(axis=1).astype(np.float64)
         share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
@@ -209,14 +210,19 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     occupied = _surface(grid.geometry, states)
     if not len(occupied):
         empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
-        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
-    lines = _lines(occupied, _free_side(grid.geometry, states, occupied), max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
-    cell = max(grid.geometry.resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
-    bare = Walls(
-        grid.geometry, states, lines.centers, lines.normals, np.zeros(len(occupied), bool), lines.normal_variance,
-        cell, *_nearest(lines.centers, cell),
-    )  # fmt: skip
-    return _facing_free_space(bare)
+        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), 1.0, none)
+    resolution = grid.geometry.resolution
+    sides = _free_side(grid.geometry, states, occupied)
+    lines = _lines(occupied, sides, max(_NORMAL_RADIUS, 3.0 * resolution))
+    normals = lines.normals * np.where((lines.normals * sides).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    one_sided = np.hypot(*sides.T) > 0.5
+    points = lines.centers - _BEHIND * normals * one_sided[:, None]
+    cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
+    origin, nearest = _nearest(points, cell)
+    missing = float(np.clip(grid.missing_share, _STRANGE, 1.0)) if np.isfinite(grid.missing_share) else _STRANGE
+    return Walls(
+        grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest
+    )
 
 
 def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats) -> Floats:
@@ -266,18 +272,6 @@ def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
     near[:, :-1] |= free[:, 1:]
     row, col = np.nonzero((states == OCCUPIED) & near)
     return geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
-
-
-def _facing_free_space(walls: Walls) -> Walls:
-    """Return the walls with normals that point to the side on which the map has free space."""
-    free = []
-    for sign in (1.0, -1.0):
-        places = [walls.points + sign * offset * walls.normals for offset in _SIDE]
-        free.append(sum((walls.state_at(p[:, 0], p[:, 1]) == FREE).astype(np.intp) for p in places))
-    turned = np.where((free[1] > free[0])[:, None], -walls.normals, walls.normals)
-    one_sided = np.minimum(free[0], free[1]) == 0
-    points = walls.points - _BEHIND * turned * one_sided[:, None]
-    return replace(walls, points=points, normals=turned, one_sided=one_sided)
 
 
 def _cells(values: Floats, origin: float, size: float) -> Ints:
