@@ -77,16 +77,18 @@ def resampling_warning(resized: int, scans: int, beams: int) -> str:
 
 
 def largest_reading(ranges: NDArray[np.float32]) -> float:
-    """Return the largest reading (k, b) that a lidar may have made, m, in place of a reach that is not stated.
+    """Return a reach, m, in place of one that is not stated: just beyond the largest of readings (k, b) that a lidar may make.
 
     Drivers write the largest number of their type where they saw nothing.
     """
     seen = ranges[np.isfinite(ranges) & (np.abs(ranges) < MOST_METRES)]
-    return float(seen.max()) if len(seen) else DEFAULT_REACH
+    return float(seen.max()) + _BEYOND if len(seen) else DEFAULT_REACH
 
 
 DEFAULT_REACH = 80.0
 """m; reach of the scanners whose recordings do not state it."""
+_BEYOND = 0.01
+"""m; a reading of the reach itself would mean that nothing was seen."""
 
 
 def without_reach(used: float) -> str:

@@ -91,6 +91,13 @@ class SensorLog:
                 raise DataError(f"the anchor's id {fault}")
         if self.scans is not None and (self.scans.ranges.ndim != 2 or len(self.scans.ranges) != len(self.scans.stamps)):
             raise DataError(f"scans.ranges has shape {self.scans.ranges.shape}, expected ({len(self.scans.stamps)}, beams)")
+        if self.scans is not None and not np.isfinite(self._laser_numbers).all():
+            raise DataError("angle_min, angle_increment, time_increment, range_min and range_max of scans must be finite")
+
+    @property
+    def _laser_numbers(self) -> list[float]:
+        s = self.scans
+        return [] if s is None else [s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max]
 
     def without(self, *, uwb: bool = False, lidar: bool = False) -> "SensorLog":
         """Return the same recording with a sensor left out."""
