@@ -1,7 +1,9 @@
 """CSV folders: round trips and clear errors."""
 
 import contextlib
+import re
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
+from uwblite.io.carmen import read_log, write_log
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
 from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
@@ -156,3 +159,18 @@ def test_tables_of_millions_of_rows_take_little_more_memory_than_their_numbers(t
     read_csv_folder(tmp_path)
     assert tracemalloc.get_traced_memory()[1] < 5 * 8 * 4 * rows + 1.2e6
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize("most", ["inf", "nan", "0.0"])
+def test_a_reach_that_is_not_stated_is_the_largest_reading(tmp_path, most):
+    """And what is written of it is read again."""
+    write_csv_folder(tmp_path / "t", recording())
+    file = tmp_path / "t" / "sensors.toml"
+    file.write_text(re.sub("range_max = .*", f"range_max = {most}", file.read_text()))
+    log = read_csv_folder(tmp_path / "t")
+    assert log.scans.range_max == pytest.approx(float(np.nanmax(log.scans.ranges[np.isfinite(log.scans.ranges)])) + 0.01)
+    assert sum("the scans state no reach" in w for w in log.notes.warnings) == 1
+    write_log(tmp_path / "x.log", replace(log, ranges=None))
+    again = read_log(tmp_path / "x.log")
+    assert again.notes.broken == 0
+    np.testing.assert_allclose(again.scans.ranges, log.scans.ranges, atol=6e-4)

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
+from uwblite import se2
 from uwblite.errors import FormatError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -119,6 +121,74 @@ def test_maps_of_other_writers_are_read(tmp_path):
     np.testing.assert_array_equal(read_map(tmp_path / "m.yaml").states(), [[OCCUPIED, UNKNOWN]])
 
 
+def foreign(tmp_path, pixels, start="", **changes):
+    """Write a map of pixels (rows, cols), and return it as it is read, with the warnings."""
+    (tmp_path / "m.pgm").write_bytes(b"P5 %d %d 255\n" % pixels.shape[::-1] + pixels.astype(np.uint8).tobytes())
+    settings = GOOD | {"image": "m.pgm"} | changes
+    (tmp_path / "m.yaml").write_text(start + "".join(f"{key}: {value}\n" for key, value in settings.items()))
+    warnings = []
+    return read_map(tmp_path / "m.yaml", warnings), warnings
+
+
+PIXELS = np.array([[0, 254, 205, 255], [205, 0, 254, 100], [254, 254, 254, 0]])
+
+
+def test_the_grey_of_unknown_cells_stays_unknown(tmp_path):
+    """nav2's map saver writes free_thresh 0.25, by which its own unknown cells would be free."""
+    usual, silent = foreign(tmp_path, PIXELS)
+    nav2, said = foreign(tmp_path, PIXELS, free_thresh="0.25")
+    np.testing.assert_array_equal(nav2.states(), usual.states())
+    assert silent == []
+    assert len(said) == 1
+    assert said[0].startswith("2 cells have the grey of unknown ones (205), which free_thresh 0.25 would make free")
+    scale, said = foreign(tmp_path, PIXELS, free_thresh="0.25", mode="scale")
+    assert np.count_nonzero(scale.states() == FREE) == np.count_nonzero(usual.states() == FREE) + 2
+    assert said == []
+
+
+def test_raw_pixels_are_percentages(tmp_path):
+    grid, said = foreign(tmp_path, np.array([[0, 100, 255], [19, 50, 66]]), mode="raw")
+    np.testing.assert_array_equal(grid.states(), [[FREE, UNKNOWN, OCCUPIED], [FREE, OCCUPIED, UNKNOWN]])
+    assert said == []
+
+
+@pytest.mark.parametrize("yaw", ["1e-9", "-1e-9", "6.283185307", "0.0"])
+def test_a_yaw_that_moves_no_cell_is_none(tmp_path, yaw):
+    grid, _ = foreign(tmp_path, PIXELS, origin=f"[1, 2, {yaw}]")
+    np.testing.assert_array_equal(grid.log_odds, foreign(tmp_path, PIXELS, origin="[1, 2, 0]")[0].log_odds)
+    np.testing.assert_array_equal(grid.geometry.origin, [1.0, 2.0])
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    assert foreign(tmp_path, PIXELS, "\ufeff")[0].states().shape == (3, 4)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3, -1])
+def test_a_map_turned_by_quarters_keeps_every_cell(tmp_path, quarters):
+    plain = foreign(tmp_path, PIXELS, origin="[0, 0, 0]")[0]
+    grid, _ = foreign(tmp_path, PIXELS, origin=f"[1, 2, {quarters * np.pi / 2}]")
+    np.testing.assert_array_equal(grid.log_odds, np.rot90(plain.log_odds, -quarters))
+    turn = se2.compose(np.array([1.0, 2.0, quarters * np.pi / 2]), np.zeros(3))
+    expected = se2.transform(turn, plain.occupied_points())
+    assert {tuple(p) for p in np.round(grid.occupied_points(), 6)} == {tuple(p) for p in np.round(expected, 6)}
+
+
+@pytest.mark.parametrize("yaw", [0.3, -1.2, 2.5])
+def test_a_turned_map_has_its_walls_where_its_origin_says(tmp_path, yaw):
+    """Every occupied cell lies within a cell of one of the picture's, and the other way round; walls have no gap."""
+    pixels = np.full((40, 60), 254)
+    pixels[0, :] = pixels[-1, :] = pixels[:, 0] = pixels[:, -1] = 0
+    plain = foreign(tmp_path, pixels, origin="[0, 0, 0]")[0]
+    grid, _ = foreign(tmp_path, pixels, origin=f"[-3, 1, {yaw}]")
+    expected = se2.transform(np.array([-3.0, 1.0, yaw]), plain.occupied_points())
+    apart = np.hypot(*(grid.occupied_points()[:, None] - expected[None]).transpose(2, 0, 1))
+    assert apart.min(axis=0).max() < 0.05
+    assert apart.min(axis=1).max() < 0.05
+    outside = ndimage.label(grid.states() != OCCUPIED)[0]
+    middle = grid.geometry.cell_of(se2.transform(np.array([-3.0, 1.0, yaw]), np.array([1.5, 1.0])))
+    assert outside[middle] not in {outside[row, col] for row, col in [(0, 0), (-1, -1), (0, -1), (-1, 0)]}
+
+
 GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupied_thresh": "0.65", "free_thresh": "0.196"}
 
 
@@ -132,9 +202,10 @@ GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupi
         ({"resolution": "0"}, "positive"),
         ({"origin": "[0, 0]"}, "origin"),
         ({"origin": "3"}, "origin must be a list"),
-        ({"origin": "[0, 0, 0.5]"}, "yaw 0"),
+        ({"origin": "[0, 0, -nan]"}, "the yaw is -nan, as some map savers write it; set it to 0"),
+        ({"origin": "[0, nan, 0]"}, "origin: 'nan' is not a number"),
         ({"free_thresh": "nan"}, "free_thresh"),
-        ({"mode": "raw"}, "mode raw"),
+        ({"mode": "grey"}, "mode grey is not read; save the map as trinary, scale or raw"),
         ({"? strange": ""}, "not 'key: value'"),
     ],
 )

@@ -13,7 +13,7 @@ from helpers.results import small_log
 from uwblite.errors import ConfigError, FormatError, UwbliteError
 from uwblite.io.bag_topics import TopicPlan
 from uwblite.io.carmen import read_log
-from uwblite.io.rosbag import BagTopics, _Collector, plan_bag, read_bag
+from uwblite.io.rosbag import BagTopics, Collector, plan_bag, read_bag
 from uwblite.io.rosbag_writer import write_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
 from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
@@ -169,7 +169,8 @@ def test_the_real_bag_gives_the_measurements_of_its_log(shared_data):
     np.testing.assert_allclose(bag.scans.ranges, log.scans.ranges, atol=6e-4)
     np.testing.assert_allclose(bag.mounting.T_base_laser, log.mounting.T_base_laser, atol=1e-6)
     np.testing.assert_allclose(bag.mounting.tag_position, log.mounting.tag_position, atol=1e-6)
-    assert "not used: /sonar_scan, /beacon" in bag.notes.warnings[0]
+    assert bag.notes.warnings[0] == "the scans are read from /scan; --scan-topic takes another (/sonar_scan)"
+    assert "not used: /beacon" in bag.notes.warnings[1]
 
 
 @pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"#ROSBAG V2.0\n" + bytes(range(256)) * 20, b"\x89MCAP0\r\n"])
@@ -225,7 +226,7 @@ def test_an_id_with_blanks_stays_one_word():
         id: str = " a b\n"
         range: float = 1.0
 
-    assert UwbMapping(stamp="").extract(Message(), "/uwb") == [("a_b", 1.0, 100.0)]
+    assert UwbMapping(stamp="").extract(Message(), "/uwb") == [("a_b", 1.0, 100.0, "")]
 
 
 @pytest.mark.slow
@@ -291,14 +292,16 @@ def test_scans_of_another_number_of_beams_are_resampled():
             time_increment=0.0, range_min=0.1, range_max=8.0, ranges=np.full(beams, 3.0, dtype=np.float32),
         )  # fmt: skip
 
-    found = _Collector(TopicPlan("/odom", "/scan", "", {}, (), (), {}))
+    found = Collector(TopicPlan("/odom", "/scan", "", {}, (), (), {}))
     for stamp, beams in enumerate([672, 679, 0, 682, 672], start=1):
         found.take("/scan", float(stamp), message(stamp, beams) if beams else replace_ranges(message(stamp, 672)))
     found.take("/scan", 6.0, message(6, 400, first=0.0))
-    assert found._scans().ranges.shape == (4, 672)
-    assert (found._scans().ranges == 3.0).all()
-    assert [w for w in found._warnings(0) if "scans" in w] == [
-        "2 scans of another geometry were skipped",
+    warnings = []
+    scans = found.scans.scans(0.0, warnings)
+    assert scans.ranges.shape == (4, 672)
+    assert (scans.ranges == 3.0).all()
+    assert warnings == [
+        "2 scans of another geometry, or without readings, were skipped",
         "2 of 4 scans have other beams than most; they were resampled to 672 beams",
     ]
 

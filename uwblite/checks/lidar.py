@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..lidar.laser_mounting import Turning, compare
+from ..lidar.laser_mounting import compare
+from ..screening import wheel_motion
 from ..sensor_log import SensorLog
 from .findings import Findings, timing
 
@@ -82,16 +83,20 @@ def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
             f"odometry's clock (laser_delay {turning.delay:+.2f} s, to be added to them)",
             "uwblite corrects small offsets; stamp both with one clock, each when its reading begins",
         )
-    if np.isfinite(turning.ratio):
-        _check_scale(turning, figures, found)
+    _check_scale(log, figures, found)
     return figures
 
 
-def _check_scale(turning: Turning, figures: dict[str, float], found: Findings) -> None:
-    figures["turn by laser / turn by wheels"] = round(turning.ratio, 3)
-    if abs(turning.ratio - 1.0) > max(0.12, 4.0 * turning.ratio_sigma):
+def _check_scale(log: SensorLog, figures: dict[str, float], found: Findings) -> None:
+    """Compare the turns of matched scans with the wheels': shifts of beams are too coarse where the laser has few."""
+    pairs = wheel_motion.compare(log)
+    ratio, sigma = (float("nan"), float("nan")) if pairs is None else wheel_motion.turn_ratio(pairs)
+    if not ratio > 0.0:
+        return
+    figures["turn by laser / turn by wheels"] = round(ratio, 3)
+    if abs(ratio - 1.0) > max(0.12, 4.0 * sigma):
         found.warning(
             "odometry",
-            f"the wheels measure about {1.0 / turning.ratio:.2f} times the turns of the laser",
+            f"the wheels measure about {1.0 / ratio:.2f} times the turns of the laser",
             "set the track width of the base; uwblite corrects it where the recording shows it",
         )

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     to = _target_format(args)
     if args.recording and kind != "map":
         raise ConfigError(f"--recording goes with a map, and {args.source} is none")
-    if kind in ("g2o", "pyfg"):
+    if kind in ("g2o", "pyfg", "isam") and to in ("", "g2o", "pyfg"):
         return _convert_graph(args)
     if kind == "map":
         return _convert_map(args, to)
@@ -81,11 +81,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _target_format(args: argparse.Namespace) -> str:
     """Return the format that --to or the target's name states; '' where neither does."""
-    from .formats import format_of
+    from .formats import format_of, format_of_name
 
     if args.to:
         return str(args.to)
-    return "mcap" if args.target.endswith(".mcap") else format_of(args.target)
+    if args.target.endswith(".mcap"):
+        return "mcap"
+    return format_of(args.target) if os.path.isdir(args.target) else format_of_name(args.target)
 
 
 def _list(args: argparse.Namespace, kind: str) -> int:
@@ -173,10 +175,19 @@ def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
 
     if format_of(args.source) == "kitti":
         raise ConfigError(f"{args.source}: KITTI poses have no times; only TUM files are read")
-    if to not in ("tum", "kitti"):
-        raise ConfigError(f"{args.target}: not a format for a trajectory; use --to tum or kitti")
+    if to not in ("tum", "kitti", "csv", "log"):
+        raise ConfigError(f"{args.target}: not a format for a trajectory; use --to tum, kitti, csv or log")
     refuse_existing(args.force, args.target)
-    return _write_trajectory(args, to, *read_tum(args.source))
+    stamps, poses = read_tum(args.source)
+    if to in ("tum", "kitti"):
+        return _write_trajectory(args, to, stamps, poses)
+    import numpy as np
+
+    from ..sensor_log import Odometry, SensorLog
+
+    order = np.argsort(stamps, kind="stable")
+    _write(args, to, SensorLog(Odometry(stamps[order], poses[order])))
+    return _say(args, {"odometry readings": len(poses)}, note="ranges.csv and scans.csv may be added" if to == "csv" else "")
 
 
 def _write_trajectory(args: argparse.Namespace, to: str, stamps: "Floats", poses: "Floats") -> int:

@@ -20,15 +20,34 @@ TRAJECTORIES = {".tum": "tum", ".kitti": "kitti"}
 
 
 def format_of(path: str) -> str:
-    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'tum', 'kitti' or 'map' (a result); '' where the name does not show it."""
+    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'kitti' or 'map' (a result); '' where none shows.
+
+    A name tells where it ends like one of the format; what it does not tell, and whether it is a bag, the content does.
+    """
+    from ..io.contents import format_of_content
+
     if os.path.isdir(path):
         if os.path.exists(os.path.join(path, "trajectory.tum")):
             return "map"
         if os.path.exists(os.path.join(path, "odometry.csv")):
             return "csv"
-        return "bag" if os.path.exists(os.path.join(path, "metadata.yaml")) else ""
-    stem = path.removesuffix(".gz")
-    ending = os.path.splitext(stem)[1].lower()
+        held = os.listdir(path)
+        return "bag" if any(n == "metadata.yaml" or n.removesuffix(".zstd").endswith(_PARTS) for n in held) else ""
+    named, content = format_of_name(path), format_of_content(path)
+    if content and (content == "bag" or not named or {content, named} <= _GRAPH_TEXTS):
+        return content
+    return named
+
+
+_PARTS = (".mcap", ".db3")
+"""Endings of the files of a ROS 2 bag's folder."""
+_GRAPH_TEXTS = {"g2o", "pyfg", "isam"}
+"""Names of graph files are mixed up: .graph is TORO's and iSAM's, .g2o is what many call any of them."""
+
+
+def format_of_name(path: str) -> str:
+    """Return the format that a name shows, '' where it shows none."""
+    ending = os.path.splitext(path.removesuffix(".gz"))[1].lower()
     return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS | TRAJECTORIES).get(ending, "")
 
 
@@ -60,9 +79,30 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     if os.path.isdir(path):
         what = "holds a map, and a recording is wanted" if kind == "map" else "holds no odometry.csv and no ROS 2 bag"
         raise FormatError(f"this folder {what}", path)
+    if kind == "librsf":
+        from ..io.librsf import read_librsf
+
+        return read_librsf(path)
+    if kind in _OTHERS:
+        raise FormatError(_OTHERS[kind], path)
     from ..io.carmen import read_log
 
-    return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
+    try:
+        return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
+    except FormatError as error:
+        if kind in ("g2o", "pyfg"):
+            what = "is a pose graph without scans (ROBOTLASER1), no recording: uwblite optimize takes it"
+            raise FormatError(what, path) from error
+        raise
+
+
+_OTHERS = {
+    "isam": "is a pose graph of iSAM, no recording: uwblite optimize says how to write it",
+    "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ --to csv), to which"
+    " ranges.csv (stamp,anchor,range,quality) and scans.csv may be added; uwblite evaluate compares with it",
+    "kitti": "is a trajectory without times, no recording",
+}
+"""What is no recording, and the verb that takes it."""
 
 
 def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":
@@ -74,20 +114,30 @@ def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":
 
 
 def graph_format(path: str) -> str:
-    """Return 'g2o' or 'pyfg' for a graph's name."""
-    kind = format_of(path)
+    """Return 'g2o' or 'pyfg' for the name of a graph to be written."""
+    kind = format_of_name(path)
     if kind not in ("g2o", "pyfg"):
         raise ConfigError(f"{path}: the name must end in .g2o or .pyfg (or .gz behind that) to show the format")
     return kind
 
 
 def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
-    """Read a pose graph of any known format; standard input is g2o."""
+    """Read a pose graph of any known format, told by its content; standard input is g2o.
+
+    Raises
+    ------
+    FormatError : it is none.
+    """
     from ..io.g2o import read_g2o
     from ..io.pyfg import read_pyfg
 
-    if path != "-" and graph_format(path) == "pyfg":
+    kind = "g2o" if path == "-" else format_of(path)
+    if kind == "pyfg":
         return read_pyfg(path, from_odometry=from_odometry)
+    if kind in ("bag", "log", "csv", "librsf"):
+        raise FormatError("is a recording, no pose graph: uwblite map makes a map of it, with graph.g2o", path)
+    if kind == "map":
+        raise FormatError(f"is a result; its pose graph is {os.path.join(path, 'graph.g2o')}", path)
     return read_g2o(path, from_odometry=from_odometry)
 
 

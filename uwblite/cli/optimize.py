@@ -231,9 +231,10 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
 
     edges = ", ".join(f"{count} {name}" for name, count in figures["edges"].items())
     lines = [f"{figures['poses']} poses, {figures['anchors']} anchors, {edges}"]
+    per = f"{figures['chi2_per_dof']:.3f} per degree of freedom" if figures["dof"] > 0 else "nothing is measured twice"
     lines.append(
-        f"chi2 {figures['chi2_initial']:.6g} -> {figures['chi2']:.9g} ({figures['chi2_per_dof']:.3f} per degree of freedom)"
-        f" in {figures['iterations']} iterations: {figures['reason']}"
+        f"chi2 {figures['chi2_initial']:.6g} -> {figures['chi2']:.9g} ({per}) in {figures['iterations']} iterations:"
+        f" {figures['reason']}"
     )
     if not figures["converged"]:
         lines.append(f"DOUBT: not converged{_WITHIN if figures['reason'] == ALL_WORK_DONE else ''}; {_TRY}")

@@ -80,9 +80,14 @@ def _read(folder: str) -> "tuple[OccupancyGrid, tuple[StoredAnchor, ...]]":
     from ..errors import ConfigError
     from ..io.map_server import read_map
     from ..io.stored_result import read_result
+    from . import console
 
     if not os.path.isdir(folder):
-        return read_map(folder), ()
+        warnings = list[str]()
+        grid = read_map(folder, warnings)
+        for warning in warnings:
+            console.note(f"uwblite: {folder}: {warning}")
+        return grid, ()
     result = read_result(folder)
     if result.grid is None:
         raise ConfigError(f"{folder} has no map.yaml: without a map there is no free space to plan in")

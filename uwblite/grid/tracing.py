@@ -110,7 +110,7 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
     met = lost = 0
     states, g = np.pad(grid.states(), 1, constant_values=UNKNOWN), grid.geometry
     for sweeps in recordings:
-        chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.int64))
+        chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.intp))
         last = None if sweeps.last is None else sweeps.last[chosen]
         far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
         far[:, ::_EVERY] = reach

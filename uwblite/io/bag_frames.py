@@ -16,6 +16,8 @@ class Frames:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Floats]] = {}
+        self.invalid: set[str] = set()
+        """Frames of which a transform was no rotation, as all zeros are none, and was left out."""
 
     def add(self, transforms: Iterable[Any]) -> None:
         """Take the transforms of a tf2_msgs/TFMessage."""
@@ -23,10 +25,17 @@ class Frames:
             shift, turn = t.transform.translation, t.transform.rotation
             pose = np.eye(4)
             quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
-            if 1e-6 < np.linalg.norm(quaternion) < 1e6:
-                pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
             pose[:3, 3] = shift.x, shift.y, shift.z
+            if not (1e-6 < np.linalg.norm(quaternion) < 1e6 and np.isfinite(pose).all()):
+                self.invalid.add(_name(t.child_frame_id))
+                continue
+            pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
             self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
+
+    @property
+    def steps(self) -> list[str]:
+        """The transforms, each as parent -> child."""
+        return [f"{parent} -> {child}" for child, (parent, _) in sorted(self._parents.items())]
 
     def check(self, frame: str) -> None:
         """Raise ConfigError where a frame is missing in the transforms; without any transform every frame is accepted."""

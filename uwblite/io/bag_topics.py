@@ -1,5 +1,6 @@
 """Which topics of a bag hold wheels, scans, an IMU, ranges and transforms; and which may hold ranges that no mapping reads."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -50,6 +51,7 @@ class TopicPlan:
     """What is read from which topic."""
 
     odometry: str
+    """Empty, or a topic of transforms: the transform from odom to the base is the odometry."""
     scan: str
     imu: str
     uwb: dict[str, tuple[UwbMapping, ...]]
@@ -58,6 +60,8 @@ class TopicPlan:
     """Topics that would have done too."""
     unread: dict[str, UwbMapping]
     """Topics that may hold ranges, with a mapping to begin with."""
+    choices: tuple[str, ...] = ()
+    """Where several topics would have done: which was chosen, and how to take another."""
 
     def role(self, name: str) -> str:
         """Return the purpose for which a topic is read; '' where it is not read."""
@@ -81,9 +85,12 @@ def plan_topics(
     ------
     ConfigError : a topic that was asked for is not there or of another type, or a mapping of the user's matches nothing.
     """
-    odometry = _named(topics, asked.odometry, ODOMETRY, "odometry") or _best(
-        topics, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual")
-    )
+    odometry = asked.odometry
+    if not odometry or _topic(topics, odometry).type != TRANSFORMS:
+        wheels = [t for t in topics if not is_truth(t.name)]
+        odometry = _named(topics, odometry, ODOMETRY, "odometry") or _best(
+            wheels, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual")
+        )
     scan = _named(topics, asked.scan, SCAN, "scans") or _best(topics, SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
     imu = "" if asked.imu == NONE else _named(topics, asked.imu, IMU, "headings")
     if not asked.imu:
@@ -106,8 +113,22 @@ def plan_topics(
     kept = uwb if asked.uwb else {name: m for name, m in uwb.items() if f"{name}_raw" not in uwb}
     spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN, IMU) and t.name not in (odometry, scan, imu)]
     spare += [name for name in uwb if name not in kept]
+    choices = []
+    for kind, taken, named, what, option in (
+        (ODOMETRY, odometry, asked.odometry, "odometry is", "--odometry-topic"),
+        (SCAN, scan, asked.scan, "scans are", "--scan-topic"),
+    ):
+        alike = [t.name for t in topics if t.type == kind and t.name != taken]
+        if taken and alike and not named:
+            choices.append(f"the {what} read from {taken}; {option} takes another ({', '.join(alike)})")
     tf = tuple(t.name for t in topics if t.type == TRANSFORMS)
-    return TopicPlan(odometry, scan, imu, kept, tf, tuple(spare), {} if asked.uwb else unread)
+    return TopicPlan(odometry, scan, imu, kept, tf, tuple(spare), {} if asked.uwb else unread, tuple(choices))
+
+
+def is_truth(topic: str) -> bool:
+    """Return whether a topic is named as the truth, which is no odometry."""
+    words = re.split(r"[/_\-]", topic.lower())
+    return any(word in ("gt", "truth", "groundtruth") for word in words)
 
 
 def unread_warning(plan: TopicPlan) -> str:

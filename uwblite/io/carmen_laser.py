@@ -16,12 +16,10 @@ from .carmen_messages import BrokenLine, numbers, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
 from .carmen_stamps import LineClock
-from .scan_geometry import ScanGeometry, resampled, resampling_warning
+from .scan_geometry import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""
-DEFAULT_RANGE_MAX = 80.0
-"""m; reach of the scanners whose logs (FLASER) do not give it. PARAM robot_front_laser_max wins."""
 POSE_TOLERANCE = 0.01
 """m or rad; a laser whose pose on the robot varies more than this is reported."""
 
@@ -178,9 +176,9 @@ class LaserMessages:
         return ScanGeometry(*(stated if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
 
     def _reach(self, layout: Layout, params: Params) -> float:
-        """Return the range, m, from which a reading saw nothing."""
+        """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""
         given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
-        return layout.range_max or given or DEFAULT_RANGE_MAX
+        return layout.range_max or given or DEFAULT_REACH
 
     def _merged(
         self, kept: Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]

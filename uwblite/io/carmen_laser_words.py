@@ -5,6 +5,7 @@ import re
 from dataclasses import dataclass
 
 from ..errors import ConfigError
+from ..sensor_log import MOST_METRES
 from .carmen_messages import BrokenLine, numbers, stamp_of
 
 MAX_BEAMS = 100_000
@@ -55,12 +56,14 @@ def parse_head(name: bytes, tokens: list[bytes]) -> Layout:
         raise BrokenLine(f"{what} announces {beams} readings")
     if name == b"FLASER":
         return Layout(beams)
-    angle_min, fov, increment, range_max = numbers(tokens[2:6], what, 4)
+    angle_min, fov, increment = numbers(tokens[2:5], what, 3)
+    stated = float(tokens[5])
+    range_max = stated if 0.0 < stated <= MOST_METRES else 0.0  # an infinite one is none
     if increment == 0.0:
         increment = fov / max(beams - 1, 1)
     if abs(increment) * (beams - 1) > 2.1 * math.pi or abs(angle_min) > 2.1 * math.pi:
         raise BrokenLine(f"{what}: {beams} readings {increment:g} rad apart are more than a turn")
-    return Layout(beams, angle_min, increment, max(range_max, 0.0))
+    return Layout(beams, angle_min, increment, range_max)
 
 
 def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int, float]:

@@ -99,7 +99,7 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
     fov = scans.angle_increment * max(beams - 1, 0)
     head = (
         f"ROBOTLASER1 {_LASER_TYPE} {scans.angle_min:.9f} {fov:.9f} {scans.angle_increment:.9f} "
-        f"{scans.range_max:g} 0.01 0 {beams} "
+        f"{_reach(scans):g} 0.01 0 {beams} "
     ).encode()
     for start in range(0, len(scans.stamps), _SCANS_AT_A_TIME):
         part = slice(start, start + _SCANS_AT_A_TIME)
@@ -116,6 +116,11 @@ def _without_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:
     """Return readings as CARMEN writes them: 0 for invalid, the maximum range for nothing seen."""
     ranges = scans.ranges[part]
     # A reading that rounds up to the maximum range would turn into "nothing seen".
-    seen = np.clip(ranges, 0.0, scans.range_max - 0.001)
+    seen = np.clip(ranges, 0.0, _reach(scans) - 0.001)
     invalid = ~(ranges >= scans.range_min)
-    return np.where(np.isposinf(ranges), scans.range_max, np.where(invalid, 0.0, seen)).astype(np.float32)
+    return np.where(np.isposinf(ranges), _reach(scans), np.where(invalid, 0.0, seen)).astype(np.float32)
+
+
+def _reach(scans: LaserScans) -> float:
+    """Return the maximum range, m, to the millimetre, as readings are written: one of a finer step would be no maximum."""
+    return round(scans.range_max, 3)

@@ -31,6 +31,7 @@ from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
 from .folders import replacing_folder
+from .scan_geometry import largest_reading, without_reach
 from .settings_toml import to_toml
 from .source import finite, open_source
 
@@ -146,17 +147,20 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     FormatError : odometry.csv is missing, or a file is not what it should be.
     """
     path = Path(folder)
-    digest = hashlib.sha256()
+    digest, warnings = hashlib.sha256(), list[str]()
     sensors = Sensors()
     if (path / "sensors.toml").exists():
-        sensors = from_dict(Sensors, parse_toml("".join(_lines(path / "sensors.toml", digest)), str(path / "sensors.toml")))
+        stated = parse_toml("".join(_lines(path / "sensors.toml", digest)), str(path / "sensors.toml"))
+        if isinstance(scanner := stated.get("scans"), dict) and scanner.get("range_max") != scanner.get("range_max"):
+            scanner["range_max"] = np.inf  # nan states none either
+        sensors = from_dict(Sensors, stated)
     table = _in_order(_table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest))
     ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
-    scans = _read_scans(path / "scans.csv", sensors.scans, digest) if (path / "scans.csv").exists() else None
+    scans = _read_scans(path / "scans.csv", sensors.scans, digest, warnings) if (path / "scans.csv").exists() else None
     gyro = _read_gyro(path / "gyro.csv", digest) if (path / "gyro.csv").exists() else None
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
-    notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest())
+    notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest(), warnings=tuple(warnings))
     return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes, gyro=gyro)
 
 
@@ -262,7 +266,7 @@ def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
     return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)
 
 
-def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> LaserScans | None:
+def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash", warnings: list[str]) -> LaserScans | None:
     stamps, readings, beams = array("d"), array("f"), 0
     for k, (line, row) in enumerate(_rows(path, digest)):
         if k == 0 and _is_header(row):
@@ -285,9 +289,11 @@ def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> 
         )
     order = np.argsort(stamps, kind="stable")
     ranges = np.array(readings).reshape(-1, beams)[order]
+    g, reach = geometry, geometry.range_max
     with np.errstate(invalid="ignore"):
-        ranges[~(ranges >= geometry.range_min)] = np.nan
-    g = geometry
-    return LaserScans(
-        np.array(stamps)[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, g.range_max
-    )
+        ranges[~(ranges >= g.range_min)] = np.nan
+        if not g.range_min < reach < np.inf:
+            reach = largest_reading(ranges)
+            warnings.append(without_reach(reach))
+            ranges[ranges > np.float32(reach)] = np.inf
+    return LaserScans(np.array(stamps)[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)

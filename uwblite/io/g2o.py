@@ -20,10 +20,12 @@ I is the upper triangle of the information matrix in the chart e = Z^-1 (Xi^-1 X
 import os
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import WIDE, Floats, Ints, Wides
+from ..errors import FormatError
 from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
@@ -86,13 +88,18 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
 
     index = {"pose": pose_of, "landmark": landmark_of}
     lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
-    plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
+    try:
+        plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
+    except FormatError as error:
+        if error.line is None or error.line not in toro.lines:
+            raise
+        raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
     plain["landmark_range"] = measured("landmark_range")
     poses = given_places(vertices, pose_of, len(pose_ids), content)
     anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
     fixed = records["FIX"].names[:, 0]
     graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
-    return GraphFile.checked(
+    file = GraphFile.checked(
         graph,
         tuple(map(str, pose_ids.tolist())),
         tuple(map(str, landmark_ids.tolist())),
@@ -100,6 +107,14 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
         content,
         from_odometry,
     )
+    return replace(file, warnings=(*_degrees(steps), *file.warnings))
+
+
+_ROOTS = (
+    "in TORO's order (I11 I12 I22 I33 I13 I23). iSAM and gtsam write another EDGE2: the root R of the information row by row"
+    " (R11 R12 R13 R22 R23 R33); write such a line as EDGE_SE2 with the upper triangle of R^T R"
+)
+"""Of EDGE2 lines that are not TORO's."""
 
 
 def write_g2o(
@@ -200,7 +215,7 @@ def _numbered(ids: Wides, names: Sequence[Ints]) -> tuple[Wides, Ints]:
 def _check(content: RecordFile, pose_ids: Wides, landmark_ids: Wides, ends: Ints, lines: Ints, ranged: Records) -> None:
     """Raise FormatError where the records make no graph."""
     if len(pose_ids) == 0:
-        raise content.error("holds no poses; is this a g2o file?")
+        raise content.error(_no_poses(content))
     both = np.intersect1d(pose_ids, landmark_ids)
     if len(both):
         raise content.error(f"vertex {both[0]} is used as a pose and as a landmark")
@@ -210,3 +225,30 @@ def _check(content: RecordFile, pose_ids: Wides, landmark_ids: Wides, ends: Ints
     bad = np.flatnonzero(~(ranged.numbers[:, 1] > 0))
     if len(bad):
         raise content.error("the information of a range must be positive", int(ranged.lines[bad[0]]))
+
+
+def _no_poses(content: RecordFile) -> str:
+    """Return the words on a file without poses, with those that it has."""
+    words = ", ".join(f"{count} {tag}" for tag, count in sorted(content.skipped.items(), key=lambda row: -row[1])[:5])
+    text = f"holds no poses; its lines are {words}" if words else "holds no poses; is this a g2o file?"
+    if _ISAM & set(content.skipped):
+        text += (
+            ". ODOMETRY and LANDMARK are iSAM's: write them as EDGE_SE2 and EDGE_SE2_XY, in the order of iSAM's numbers (dx dy"
+            " dtheta, then the upper triangle of the information matrix row by row: R^T R of iSAM's root R)"
+        )
+    return text
+
+
+_ISAM = {"ODOMETRY", "LANDMARK"}
+
+
+def _degrees(steps: Records) -> tuple[str, ...]:
+    """Return the words on edges that turn by more than a turn: angles in degrees look so."""
+    beyond = np.abs(steps.numbers[:, 2]) > 2.0 * np.pi
+    if not beyond.any():
+        return ()
+    first = int(np.argmax(beyond))
+    return (
+        f"{int(beyond.sum())} of {len(beyond)} edges turn by more than a turn (the first by {steps.numbers[first, 2]:.4g} in"
+        f" line {steps.lines[first]}): are the angles degrees? They must be radians, in edges and vertices",
+    )

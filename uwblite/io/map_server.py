@@ -2,8 +2,8 @@
 
 Image row 0 is the top, that is the largest y; ``origin`` is the pose of the lower left corner. A pixel x stands for
 the probability p = (255 - x) / 255 of being occupied. On loading, p > occupied_thresh is occupied, p < free_thresh is free
-and the rest unknown. The usual pixels 0, 254 and 205 give p = 1, 0.004 and 0.19608, so free_thresh must not
-exceed 0.196 or everything unknown becomes free.
+and the rest unknown. The usual pixels 0, 254 and 205 give p = 1, 0.004 and 0.19608, so that by its rules a free_thresh above
+0.196 makes everything unknown free.
 """
 
 import os
@@ -87,46 +87,118 @@ def encode_pgm(image: Image) -> bytes:
     return f"P5\n{width} {height}\n255\n".encode() + image.tobytes()
 
 
-def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
+def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) -> OccupancyGrid:
     """Read a map from its YAML file and the image named there (PGM or PNG).
 
-    Modes trinary (the default) and scale are read, by the rules of map_server. Occupied and free cells get fixed
-    log-odds: the file holds no more than the three states.
+    Modes trinary (the default), scale and raw are read, by the rules of map_server, but for one: the grey of unknown cells,
+    205, stays unknown where free_thresh would make it free, as in what nav2's map saver writes by default. Occupied and free
+    cells get fixed log-odds: the file holds no more than the three states. A map whose origin is turned is sampled on a grid
+    along the axes.
+
+    Parameters
+    ----------
+    warnings : takes what was read otherwise than the file has it.
 
     Raises
     ------
     FormatError : a file is missing or is not what it should be.
     """
-    name = os.fspath(path)
-    settings = _parse_yaml(read_bounded(name, _MOST_YAML_BYTES).decode(errors="replace"), name)
+    name, said = os.fspath(path), [] if warnings is None else warnings
+    settings = _parse_yaml(read_bounded(name, _MOST_YAML_BYTES).decode("utf-8-sig", errors="replace"), name)
     image = _text(settings, "image", name)
     image_path = os.path.join(os.path.dirname(name), image)
     pixels = _read_picture(image_path)[::-1]
     resolution = _number(settings, "resolution", name)
-    origin = _numbers(settings, "origin", name)
+    origin = _origin(settings, name)
     occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
     if not LEAST_CELL <= resolution <= LARGEST_CELL or len(origin) != 3 or max(map(abs, origin)) > 1e7:
         raise FormatError("resolution must be positive (0.0001 to 1000 m) and origin must be a place [x, y, yaw]", name)
-    if origin[2] != 0.0:
-        raise FormatError(f"origin is turned by {origin[2]} rad; only maps with yaw 0 are read", name)
     mode = str(settings.get("mode", "trinary"))
-    if mode not in ("trinary", "scale"):
-        raise FormatError(f"mode {mode} is not read; use trinary or scale", name)
+    if mode not in ("trinary", "scale", "raw"):
+        raise FormatError(f"mode {mode} is not read; save the map as trinary, scale or raw", name)
     negate = str(settings.get("negate", "0")).lower() in ("1", "true")
-    log_odds = _log_odds(pixels, negate, occupied, free)
+    log_odds = _log_odds(pixels, negate, occupied, free, mode)
+    if mode == "trinary" and not negate and (count := _keep_unknown(log_odds, pixels, free)):
+        said.append(
+            f"{count} cells have the grey of unknown ones ({PIXEL_UNKNOWN}), which free_thresh {free:g} would make free: they"
+            " stay unknown (free_thresh: 0.196 says so to every program)"
+        )
     if (walls := int(np.count_nonzero(log_odds > 0))) > _MOST_OCCUPIED:
         raise FormatError(f"{walls} of {log_odds.size} cells are occupied; is negate right in the YAML file?", name)
-    return OccupancyGrid(GridGeometry(resolution, np.array(origin[:2]), *log_odds.shape), log_odds)
+    grid = OccupancyGrid(GridGeometry(resolution, np.array(origin[:2]), *log_odds.shape), log_odds)
+    # A turn that moves no cell to another's place is none: sums of angles leave 1e-9 where 0 was meant.
+    yaw = float(np.angle(np.exp(1j * origin[2])))
+    if abs(yaw) * float(np.hypot(*log_odds.shape)) < _HALF_A_CELL:
+        return grid
+    turned = _turned(grid, yaw)
+    if turned.geometry.cells > MOST_PIXELS:
+        raise FormatError("is too large to be turned as its origin says; turn the picture and set the yaw to 0", name)
+    return turned
 
 
-def _log_odds(pixels: Image, negate: bool, occupied: float, free: float) -> NDArray[np.float32]:
-    """Return the states of cells from their pixels (rows, cols, channels); transparent ones are unknown."""
+_HALF_A_CELL = 0.5
+
+
+def _origin(settings: dict[str, str | list[str]], name: str) -> list[float]:
+    """Return the pose of the lower left corner.
+
+    Raises
+    ------
+    FormatError : it is none; older map savers wrote a yaw that is no number.
+    """
+    value = settings.get("origin")
+    if isinstance(value, list) and len(value) == 3 and value[2].lower().lstrip("+-.") == "nan":
+        raise FormatError(f"origin: the yaw is {value[2]}, as some map savers write it; set it to 0 in the YAML file", name)
+    return _numbers(settings, "origin", name)
+
+
+def _keep_unknown(log_odds: NDArray[np.float32], pixels: Image, free: float) -> int:
+    """Make cells of the grey of unknown ones unknown where the threshold makes them free; return how many there were."""
+    if not free > 1.0 - PIXEL_UNKNOWN / 255.0:
+        return 0
+    grey = pixels[:, :, 0] == PIXEL_UNKNOWN
+    for channel in range(1, 3 if pixels.shape[2] >= 3 else 1):
+        grey &= pixels[:, :, channel] == PIXEL_UNKNOWN
+    grey &= log_odds < 0.0
+    log_odds[grey] = 0.0
+    return int(np.count_nonzero(grey))
+
+
+def _turned(grid: OccupancyGrid, yaw: float) -> OccupancyGrid:
+    """Return a map, turned about its lower left corner by an angle, rad, on a grid along the axes: each cell takes the state of
+    the one that its centre falls on."""
+    g, turn = grid.geometry, np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    corners = (turn @ (g.resolution * np.array([[0, g.cols, 0, g.cols], [0, 0, g.rows, g.rows]], dtype=np.float64))).T
+    low = g.resolution * np.floor(corners.min(axis=0) / g.resolution + 1e-6)
+    cols, rows = np.ceil((corners.max(axis=0) - low) / g.resolution - 1e-6).astype(int).tolist()
+    found = np.zeros((rows, cols), dtype=np.float32)
+    if rows * cols > MOST_PIXELS:
+        return OccupancyGrid(GridGeometry(g.resolution, g.origin + low, rows, cols), found)
+    x = low[0] + g.resolution * (np.arange(cols) + 0.5)
+    for row in range(rows):
+        y = low[1] + g.resolution * (row + 0.5)
+        col = np.floor((turn[0, 0] * x + turn[1, 0] * y) / g.resolution + 1e-6).astype(np.intp)
+        line = np.floor((turn[0, 1] * x + turn[1, 1] * y) / g.resolution + 1e-6).astype(np.intp)
+        inside = np.flatnonzero((col >= 0) & (col < g.cols) & (line >= 0) & (line < g.rows))
+        found[row, inside] = grid.log_odds[line[inside], col[inside]]
+    return OccupancyGrid(GridGeometry(g.resolution, g.origin + low, rows, cols), found)
+
+
+def _log_odds(pixels: Image, negate: bool, occupied: float, free: float, mode: str) -> NDArray[np.float32]:
+    """Return the states of cells from their pixels (rows, cols, channels); transparent ones are unknown.
+
+    In mode raw a pixel is a percentage, and above 100 unknown.
+    """
     colours = 3 if pixels.shape[2] >= 3 else 1
     total = pixels[:, :, 0].astype(np.uint16)
     for channel in range(1, colours):
         total += pixels[:, :, channel]
     p = np.arange(255 * colours + 1) / (255.0 * colours)
-    p = p if negate else 1.0 - p
+    if mode == "raw":
+        percent = np.rint(255.0 * p)
+        p = np.where(percent <= 100.0, percent / 100.0, 0.5 * (occupied + free))
+    else:
+        p = p if negate else 1.0 - p
     log_odds = np.select([p > occupied, p < free], [_READ_ODDS, -_READ_ODDS], 0.0).astype(np.float32)[total]
     if pixels.shape[2] in (2, 4):
         log_odds[pixels[:, :, -1] == 0] = 0.0

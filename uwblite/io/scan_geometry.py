@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
+from ..sensor_log import MOST_METRES
 
 _SAME_VIEW = 0.03
 """Share of the field of view by which geometries of one lidar differ at most."""
@@ -73,3 +74,26 @@ def resampled(ranges: NDArray[np.float32], have: ScanGeometry, want: ScanGeometr
 def resampling_warning(resized: int, scans: int, beams: int) -> str:
     """Say that scans of another number of beams were resampled."""
     return f"{resized} of {scans} scans have other beams than most; they were resampled to {beams} beams"
+
+
+def largest_reading(ranges: NDArray[np.float32]) -> float:
+    """Return a reach, m, in place of one that is not stated: just beyond the largest of readings (k, b) that a lidar may make.
+
+    Drivers write the largest number of their type where they saw nothing.
+    """
+    seen = ranges[np.isfinite(ranges) & (np.abs(ranges) < MOST_METRES)]
+    return float(seen.max()) + _BEYOND if len(seen) else DEFAULT_REACH
+
+
+DEFAULT_REACH = 80.0
+"""m; reach of the scanners whose recordings do not state it."""
+_BEYOND = 0.01
+"""m; a reading of the reach itself would mean that nothing was seen."""
+
+
+def without_reach(used: float) -> str:
+    """Say that the reach of the lidar is not stated, and which is used, m."""
+    return (
+        f"the scans state no reach (range_max is 0, infinite or no number): the largest reading is used, {used:.2f} m; what was"
+        " beyond reach cannot be told from what was not measured"
+    )

@@ -31,9 +31,9 @@ _PIPE_PATIENCE = 10.0
 
 _GZIP = b"\x1f\x8b"
 _OTHER_FORMATS = (
-    (b"#ROSBAG", "this is a ROS 1 bag; turn it into a log first: uwblite convert"),
-    (b"\x89MCAP", "this is an MCAP bag; turn it into a log first: uwblite convert"),
-    (b"SQLite format 3", "this is an SQLite file (ROS 2 bag?); turn it into a log first: uwblite convert"),
+    (b"#ROSBAG", "this is a ROS 1 bag, not text; bags are read from files, and not through a pipe"),
+    (b"\x89MCAP", "this is an MCAP bag, not text; bags are read from files, and not through a pipe"),
+    (b"SQLite format 3", "this is an SQLite file (ROS 2 bag?), not text; bags are read from files, and not through a pipe"),
     (b"PK\x03\x04", "this is a zip archive; unpack it first"),
     (b"\x28\xb5\x2f\xfd", "this is zstd-compressed; unpack it first (only gzip is read directly)"),
     (b"BZh", "this is bzip2-compressed; unpack it first (only gzip is read directly)"),

@@ -17,10 +17,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from typing import Any
+from numbers import Integral
+from typing import Any, NamedTuple
 
 from ..config import from_dict, parse_toml
 from ..errors import ConfigError
+
+
+class Reading(NamedTuple):
+    """One range in a message."""
+
+    anchor: str
+    range: float
+    """m."""
+    quality: float
+    """0..100."""
+    tag: str = ""
+    """Id of the tag that measured; '' where the message does not tell."""
+
+
+_TAGS = (
+    "tagId", "tag_id", "tagID", "tag", "id_tag", "requester_id", "requesterId", "source_id", "sourceId", "src_id", "srcId",
+    "origin_id", "originId", "initiator_id", "initiatorId",
+)  # fmt: skip
+"""Usual names of the field with the tag's id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +55,7 @@ class UwbMapping:
     """Field of the message that holds a list of readings; empty: the message itself is one reading."""
     anchor: str = "id"
     """Field of the reading with the anchor's id; 'topic:REGEX' takes it from the first group in the topic's name;
-    'index' takes the place in the array where the range is an array."""
+    'index' takes the place in the array where the range is an array, which may also have an array of ids beside it."""
     range: str = "range"
     """Field of the reading with the distance."""
     unit: float = 1.0
@@ -46,6 +66,9 @@ class UwbMapping:
     """Field of the reading with a quality of 0..100; empty: none."""
     anchor_format: str = "{}"
     """How a numeric id is written: '{}' as it is, '{:04X}' as four hexadecimal digits."""
+    tag: str = ""
+    """Field of the reading, or of the message, with the id of the tag that measured, or 'topic:REGEX'; empty: the first of
+    the usual names (tag_id, tagId, requester_id ...) that is there."""
     only: dict[str, int] = field(default_factory=dict)
     """Fields of the reading that must have these values, e.g. the tag's id where there are several tags; with 'index' a
     field that is an array is asked at the place of the range."""
@@ -54,8 +77,8 @@ class UwbMapping:
         """Return whether the mapping is meant for a topic; ``pkg/Name`` and ``pkg/msg/Name`` are one type."""
         return fnmatchcase(topic, self.topic) and fnmatchcase(short_type(message_type), short_type(self.type))
 
-    def extract(self, message: Any, topic: str) -> list[tuple[str, float, float]]:
-        """Return (anchor id, range in m, quality) of every reading in a message.
+    def extract(self, message: Any, topic: str) -> list[Reading]:
+        """Return every reading in a message.
 
         An array with a place for each anchor holds zeros or nan where an anchor was out of reach: these are no readings.
 
@@ -68,12 +91,27 @@ class UwbMapping:
         for reading in readings:
             value = _field(reading, self.range, self)
             quality = float(_field(reading, self.quality, self)) if self.quality else 100.0
-            if self.anchor == "index":
-                measured = [(k, float(v)) for k, v in enumerate(value) if self._wanted(reading, k)]
-                found += [(self._name(k), v * self.unit, quality) for k, v in measured if math.isfinite(v) and v != 0.0]
+            tag = self._tag(reading, message, topic)
+            if hasattr(value, "__len__"):
+                ids = range(len(value)) if self.anchor == "index" else _field(reading, self.anchor, self)
+                pairs = zip(range(len(value)), ids, value, strict=False)
+                measured = [(name, float(v)) for k, name, v in pairs if self._wanted(reading, k)]
+                usable = [(self._name(name), v) for name, v in measured if math.isfinite(v) and v != 0.0]
+                found += [Reading(name, v * self.unit, quality, tag) for name, v in usable]
             elif self._wanted(reading):
-                found.append((self._anchor(reading, topic), float(value) * self.unit, quality))
+                found.append(Reading(self._anchor(reading, topic), float(value) * self.unit, quality, tag))
         return found
+
+    def _tag(self, reading: Any, message: Any, topic: str) -> str:
+        """Return the id of the tag that measured, '' where the message does not tell."""
+        if self.tag.startswith("topic:"):
+            match = re.search(self.tag.removeprefix("topic:"), topic)
+            return match.group(1) if match and match.groups() else ""
+        for name in (self.tag,) if self.tag else _TAGS:
+            for holder in (reading, message):
+                if name != self.anchor and isinstance(value := getattr(holder, name, None), str | Integral):
+                    return self._name(value)
+        return ""
 
     def _wanted(self, reading: Any, place: int | None = None) -> bool:
         """Return whether the fields of `only` have their values, in an array the value at a place."""
@@ -116,7 +154,7 @@ def short_type(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> list[tuple[str, float, float]]:
+def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> list[Reading]:
     """Return the readings of a message by the first mapping that finds some.
 
     Mappings with the same patterns describe forms of one kind of message: fields that were renamed between releases, or

@@ -12,9 +12,9 @@ _ANCHOR, _TAG, _UNKNOWN = ord("A"), ord("T"), ord("U")
 
 def _two_way(source: int, target: int) -> UwbMapping:
     """Return the mapping of a range between such ends: the anchor is the end that is not the tag."""
-    anchor = "uwb_id1" if target == _TAG else "uwb_id2"
+    anchor, tag = ("uwb_id1", "uwb_id2") if target == _TAG else ("uwb_id2", "uwb_id1")
     only = {"type_id1": source, "type_id2": target}
-    return UwbMapping(type="uwb_msgs/TwoWayRangeStamped", anchor=anchor, range="range_raw", only=only)
+    return UwbMapping(type="uwb_msgs/TwoWayRangeStamped", anchor=anchor, tag=tag, range="range_raw", only=only)
 
 
 KNOWN = (
@@ -29,11 +29,11 @@ KNOWN = (
     UwbMapping(type="gtec_msgs/*Ranging", anchor="anchor_id", unit=0.001, stamp=""),
     # nooploop-dev/nlink_parser: LinktrackNodeframe2, LinktrackNodeframe3, LinktrackNode2, LinktrackTagframe0;
     # a header came later.
-    UwbMapping(type="nlink_parser*/LinktrackNodeframe[23]", readings="nodes", range="dis"),
-    UwbMapping(type="nlink_parser*/LinktrackTagframe0", anchor="index", range="dis_arr"),
+    UwbMapping(type="nlink_parser*/LinktrackNodeframe[23]", readings="nodes", tag="id", range="dis"),
+    UwbMapping(type="nlink_parser*/LinktrackTagframe0", anchor="index", tag="id", range="dis_arr"),
     # uwb_msgs: TwoWayRangeStamped; the names were in capitals first.
     *(_two_way(*ends) for ends in ((_TAG, _ANCHOR), (_ANCHOR, _TAG), (_UNKNOWN, _ANCHOR), (_UNKNOWN, _UNKNOWN))),
-    UwbMapping(type="uwb_msgs/TwoWayRangeStamped", anchor="UWB_ID2", range="range_raw"),
+    UwbMapping(type="uwb_msgs/TwoWayRangeStamped", anchor="UWB_ID2", tag="UWB_ID1", range="range_raw"),
     # ntu-aris/uwb_driver, wang-chen/uwb_driver (Time Domain P4xx), and its kin in lps-ros.
     UwbMapping(type="*/UwbRange", anchor="responder_id", range="distance"),
     # Pozyx: ruvu/common pozyx_ros/DeviceRanges and pozyx_msgs/Ranges in m, utahrobotics/pozyx_ros DeviceRange in mm.
@@ -52,5 +52,7 @@ KNOWN = (
     # PX4: SensorUwb; its time counts from the start of the flight controller.
     UwbMapping(type="px4_msgs/SensorUwb", anchor="mac_dest", range="distance", stamp="", anchor_format="{:04X}"),
     # TIERS data sets: one topic for each pair of nodes.
-    UwbMapping(topic="/uwb/*/distance", type="sensor_msgs/Range", anchor="topic:([^/]+)/distance$"),
+    UwbMapping(
+        topic="/uwb/*/distance", type="sensor_msgs/Range", anchor="topic:([^/]+)/distance$", tag="topic:([^/]+)/[^/]+/distance$"
+    ),
 )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..sensor_log import LONGEST_RANGE
 from .uwb_mapping import UwbMapping, short_type
 
 _HINT = re.compile(r"uwb|dwm?\d|rang(e|es|ing)\b|anchor|beacon|pozyx|decawave|linktrack|toa\b|twr|ultra.?wide", re.I)
@@ -23,7 +24,7 @@ _OTHER_RANGE = re.compile(r"sonar|ultra.?sonic|infra.?red|\bir\b|cliff|bumper|pr
 _RANGE = re.compile(r"((measured|raw|uwb)_)?(ranges?|distances?|dist|dis)(_?arr(ay)?)?(_?(mm|cm|m|raw|meas|met(er|re)s?))?")
 """Name of a field with a distance."""
 _ID = re.compile(
-    r"((anchor|dest(ination)?|responder|remote|target|beacon|node|peer|mac|uwb)_?)?(device_?)?(id2?|addr(ess)?|mac|dest|name)"
+    r"((anchor|dest(ination)?|responder|remote|target|beacon|node|peer|mac|uwb)_?)?(device_?)?(ids?2?|addr(ess)?|mac|dest|name)s?"
 )
 """Name of a field with whom the distance leads to."""
 _NOT_ID = re.compile(r"tag|origin|source|src|requester|seq|frame|msg|message|session|own|self")
@@ -84,7 +85,9 @@ def _mapping(reading: Any, kind: str, hinted: bool) -> dict[str, Any] | None:
     if single and ids:
         return {"anchor": ids[0], "range": single[0], "unit": _unit(single[0], values[single[0]])}
     if lists:
-        return {"anchor": "index", "range": lists[0], "unit": _unit(lists[0], values[lists[0]][0])}
+        beside = [n for n, v in values.items() if _is_id(n) and n not in lists and _is_ids(v, len(values[lists[0]]))]
+        anchor = min(beside, key=lambda name: (_NOT_ID.search(name.lower()) is not None, name.lower() == "id"), default="index")
+        return {"anchor": anchor, "range": lists[0], "unit": _unit(lists[0], np.max(values[lists[0]]))}
     if hinted and kind in ("std_msgs/Float32", "std_msgs/Float64"):
         return {"anchor": "topic:([^/]+)$", "range": "data"}
     return None
@@ -99,15 +102,23 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == 1 and len(value) > 0 and value.dtype.kind in "fiu"
 
 
+def _is_ids(value: Any, count: int) -> bool:
+    """Return whether a field holds an id for each of so many ranges."""
+    texts = isinstance(value, list | tuple) and all(isinstance(v, str) for v in value)
+    numbers = isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iu"
+    return (texts or numbers) and len(value) == count
+
+
 def _is_id(name: str) -> bool:
     return _ID.fullmatch(name.lower()) is not None and _NOT_ID.match(name.lower()) is None
 
 
 def _unit(name: str, value: Any) -> float:
-    """Return metres per unit: by the name, and millimetres for whole numbers."""
+    """Return metres per unit: by the name; millimetres for whole numbers, and for those that no radio reaches in metres."""
     if name.lower().endswith("cm"):
         return 0.01
-    return 0.001 if name.lower().endswith("mm") or isinstance(value, int | np.integer) else 1.0
+    whole = isinstance(value, int | np.integer)
+    return 0.001 if name.lower().endswith("mm") or whole or float(value) > LONGEST_RANGE else 1.0
 
 
 def _word_of_topic(topic: str) -> str:

@@ -35,7 +35,7 @@ def as_points(points: ArrayLike, name: str = "points") -> Floats:
 def voxel_filter(points: ArrayLike, size: float) -> Floats:
     """Return the mean (m, 2) of the points (n, 2) in each occupied square of an edge, m, by x and y of the squares."""
     points = as_points(points)
-    return mean_by_key(cell_number(np.zeros(len(points), dtype=np.int64), points, size), points)[1]
+    return mean_by_key(cell_number(np.zeros(len(points), dtype=WIDE), points, size), points)[1]
 
 
 def statistical_outlier_filter(points: ArrayLike, neighbours: int, std_ratio: float) -> Bools:

@@ -51,7 +51,7 @@ def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> Bools:
     free : (k, bearings) m, see FreeSpace.ranges; of all clouds.
     """
     distance = np.sqrt(x * x + y * y)
-    bins = ((np.arctan2(y, x) + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.int64)
+    bins = ((np.arctan2(y, x) + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.intp)
     bins *= bins < _BEARINGS
     return np.asarray(distance < free[i[:, None], bins] - _MARGIN)
 

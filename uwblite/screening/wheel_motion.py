@@ -260,6 +260,14 @@ def way_ratio(pairs: Pairs) -> float:
     return undiluted(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY, float("nan"))
 
 
+def turn_ratio(pairs: Pairs) -> tuple[float, float]:
+    """Return the turn by the lidar / the turn by the wheels, and its standard deviation; nan where clear turns are too few."""
+    own = pairs.rows(pairs.measured)
+    each = ratios(own.wheels[:, 2:], own.lidar[:, 2:], _CLEAR_TURN)[1]
+    ratio = undiluted(own.wheels[:, 2:], own.lidar[:, 2:], _CLEAR_TURN, float("nan"))
+    return ratio, sigma_of_median(each) if len(each) else float("nan")
+
+
 def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
     """Return the longest stretch in which distances or turns have another ratio than elsewhere."""
     for columns, clear in ((slice(0, 2), _CLEAR_WAY), (slice(2, 3), _CLEAR_TURN)):
