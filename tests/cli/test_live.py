@@ -16,8 +16,10 @@ from helpers.virtual_recording import live_devices
 
 from uwblite import se2
 from uwblite.cli import main
+from uwblite.cli.live import line_of
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
+from uwblite.localization.records import LocalizerState
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,13 @@ def room(tmp_path_factory):
     log = folder / "run.log"
     log.write_text("\n".join(lines) + "\n")
     return folder, log, poses
+
+
+def test_a_pose_that_is_not_known_is_null():
+    unknown = LocalizerState(1.0, np.full(3, np.nan), np.full((3, 3), np.nan), 0.0, np.zeros(3), True)
+    assert json.loads(line_of(unknown))["pose"] is None
+    known = dataclasses.replace(unknown, pose=np.array([1.0, 2.0, 0.5]))
+    assert json.loads(line_of(known))["pose"] == [1.0, 2.0, 0.5]
 
 
 @pytest.fixture
