@@ -92,6 +92,13 @@ def test_what_is_finished_is_kept_and_what_was_made_otherwise_is_not_replaced_un
     assert inode(out / "monday") != first
 
 
+def test_a_table_of_another_s_is_not_replaced(recordings, tmp_path, capsys):
+    (tmp_path / "batch.csv").write_text("mine\n")
+    assert main(["batch", *recordings[:1], "--out", str(tmp_path), "--force"]) == 1
+    assert "was not written by uwblite" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["batch.csv"]
+
+
 def test_a_process_that_is_killed_costs_its_own_recording_alone(recordings, tmp_path, monkeypatch):
     """As the system does where memory runs out; processes that are forked know the function that is put in here."""
     monkeypatch.setattr(batch, "map_one", killed_on_notes)

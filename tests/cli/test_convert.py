@@ -168,6 +168,10 @@ def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):
     assert main(words) == 1
     assert "exists" in capsys.readouterr().err
     assert main([*words, "--force"]) == 0
+    (tmp_path / "nav2" / "nav2_params.yaml").write_text("mine: 1\n")
+    assert main([*words, "--force"]) == 1
+    assert "was not written by uwblite" in capsys.readouterr().err
+    assert (tmp_path / "nav2" / "nav2_params.yaml").read_text() == "mine: 1\n"
     assert main(["convert", str(tmp_path / "map"), str(tmp_path / "map"), "--to", "nav2", "--force"]) == 1
     assert "is the map itself" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "map"), str(tmp_path / "map" / "map.pgm"), "--to", "nav2", "--force"]) == 1

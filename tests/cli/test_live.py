@@ -17,9 +17,11 @@ from helpers.virtual_recording import live_devices
 
 from uwblite import se2
 from uwblite.cli import main
+from uwblite.cli.live import line_of
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
 from uwblite.localization.live_feed import LiveFeed
+from uwblite.localization.records import LocalizerState
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +58,13 @@ def test_ranges_of_a_tag_that_the_log_named_too_late_are_left_out_and_reported_o
     list(feed.take("".join(late[-3:]).encode()))
     assert said == ["left out: tag 1 is none of the robot's 1 tags; they count from 0"]
     assert not states[-1].lost
+
+
+def test_a_pose_that_is_not_known_is_null():
+    unknown = LocalizerState(1.0, np.full(3, np.nan), np.full((3, 3), np.nan), 0.0, np.zeros(3), True)
+    assert json.loads(line_of(unknown))["pose"] is None
+    known = dataclasses.replace(unknown, pose=np.array([1.0, 2.0, 0.5]))
+    assert json.loads(line_of(known))["pose"] == [1.0, 2.0, 0.5]
 
 
 @pytest.fixture

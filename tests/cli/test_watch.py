@@ -161,12 +161,14 @@ def test_an_earlier_watch_left_a_map(watched):
     [
         (["-"], "name the plain log"), (["run.log.gz"], "name the plain log"), (["."], "is a folder"),
         (["run.log", "--out", "map"], "already holds a result"), (["run.log", "--set", "grid.none=1"], "grid.none"),
+        (["pipe"], "only a file"),
         (["run.log", "--host", "256.1.1.1"], ""),
     ],
 )  # fmt: skip
 def test_what_cannot_be_watched_is_one_clear_line(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     make_map(tmp_path / "map")
+    os.mkfifo(tmp_path / "pipe")
     assert main(["watch", "--port", "0", *words]) in (1, 2)
     output = capsys.readouterr().err
     assert message in output

@@ -49,6 +49,10 @@ def test_a_recording_survives_a_folder(tmp_path):
     with pytest.raises(ConfigError, match="--force"):
         write_csv_folder(tmp_path / "t", log)
     write_csv_folder(tmp_path / "t", log, force=True)
+    (tmp_path / "t" / "sensors.toml").write_text("[scans]\n# of my own\n")
+    with pytest.raises(ConfigError, match="was not written by uwblite"):
+        write_csv_folder(tmp_path / "t", log, force=True)
+    assert "of my own" in (tmp_path / "t" / "sensors.toml").read_text()
 
 
 def test_odometry_alone_is_enough_and_order_does_not_matter(tmp_path):

@@ -1,5 +1,7 @@
 """A log is followed as it grows, goes on in its next part, or begins again."""
 
+import os
+
 import pytest
 
 from uwblite.errors import FormatError
@@ -71,3 +73,19 @@ def test_whole_is_whole(tmp_path):
     file = GrowingFile(str(path), whole=True)
     assert file.skipped == 0
     assert b"".join(iter(file.read, b"")) == text
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder"])
+def test_only_a_file_is_followed_and_nothing_waits_for_a_pipe(tmp_path, kind):
+    odd, log, part = tmp_path / "odd", tmp_path / "run.log", tmp_path / "run.2.log"
+    os.mkfifo(odd) if kind == "pipe" else odd.mkdir()
+    with pytest.raises(FormatError, match=r"odd: cannot be followed: "):
+        GrowingFile(str(odd))
+    log.write_bytes(b"one\nCOMMENT continued in run.2.log\n")
+    os.mkfifo(part) if kind == "pipe" else part.mkdir()
+    file = GrowingFile(str(log))
+    assert file.read().startswith(b"one")
+    assert file.read() == b""
+    log.unlink()
+    odd.rename(log)
+    assert file.read() == b""

@@ -7,6 +7,7 @@ import pytest
 
 from uwblite.drivers.log_file import LogFile
 from uwblite.io.log_tail import LogTail
+from uwblite.server.live import watch_status
 
 
 def odom(t, x=0.0):
@@ -126,3 +127,20 @@ def test_a_file_that_may_not_be_read_is_one_that_does_not_grow(tmp_path, monkeyp
     assert not tail.poll()
     monkeypatch.undo()
     assert tail.poll()
+
+
+def test_a_pipe_in_the_place_of_the_log_is_said_and_does_not_hold_anything_up(tmp_path):
+    log = tmp_path / "run.log"
+    write(log, odom(0.0))
+    tail = LogTail(str(log))
+    assert tail.poll()
+    log.unlink()
+    assert tail.is_file
+    os.mkfifo(log)
+    assert not tail.poll()
+    assert not tail.is_file
+    assert "only a file can be followed" in watch_status(tail, None, 0.0, "")["summary"]
+    log.unlink()
+    write(log, odom(1.0))
+    assert tail.poll()
+    assert (tail.is_file, tail.restarts) == (True, 1)

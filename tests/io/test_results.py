@@ -119,6 +119,28 @@ def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):
 
 
 @pytest.mark.usefixtures("small_picture")
+@pytest.mark.parametrize("foreign", ["beside nothing", "changed", "added", "instead of report.json"])
+def test_a_file_that_uwblite_did_not_write_is_never_replaced(tmp_path, foreign):
+    """A folder of pictures of one's own; a map that was cleaned up by hand; a file that the result did not have."""
+    folder = tmp_path / "map"
+    folder.mkdir()
+    if foreign != "beside nothing":
+        write_result(folder, [small_log()], small_result(lidar=foreign != "added"), RECORD)
+    name = {"added": "map.pgm", "instead of report.json": "report.json"}.get(foreign, "map.png")
+    (folder / name).write_bytes(b"mine")
+    before = contents(folder)
+    with pytest.raises(ConfigError, match=r"was not written by uwblite, or was changed since; move it away"):
+        check_target(folder, force=True)
+    with pytest.raises(ConfigError, match=r"was not written by uwblite"):
+        write_result(folder, [small_log()], small_result(), RECORD)
+    assert contents(folder) == before
+    for file in folder.iterdir() if foreign == "instead of report.json" else [folder / name]:
+        file.rename(tmp_path / file.name)
+    write_result(folder, [small_log()], small_result(), RECORD)
+    assert (tmp_path / name).read_bytes() == b"mine"
+
+
+@pytest.mark.usefixtures("small_picture")
 def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     folder = tmp_path / "map"
     check_target(folder, force=False)

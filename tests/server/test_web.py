@@ -203,3 +203,27 @@ def test_an_open_page_is_asked_for_by_address():
     assert page.handle("GET", "/", {"host": f"robot:{port}"}).status == 200
     assert page.handle("GET", "/", {"host": f"evil.example:{port}"}).status == 403
     server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        ("GET / HTTP/1.1\r\nHost: {host}\r\nContent-Length: 4", "abcd"),
+        ("GET / HTTP/1.1\r\nHost: {host}\r\nHost: elsewhere", ""),
+        ("GET / HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked", "0\r\n\r\n"),
+        ("HEAD / HTTP/1.1\r\nHost: {host}\r\nContent-Length: x", ""),
+        ("POST /closure HTTP/1.1\r\nHost: {host}\r\nContent-Length: 2\r\nContent-Length: 2", "{}"),
+        ("POST /closure HTTP/1.1\r\nHost: {host}\r\nContent-Length: 2\r\nTransfer-Encoding: chunked", "{}"),
+    ],
+)
+def test_a_request_whose_end_is_in_doubt_is_refused_and_the_connection_closed(served, head, body):
+    _, server = served
+    text = head.format(host=f"127.0.0.1:{server.server_address[1]}") + "\r\n\r\n" + body
+    with socket.create_connection(server.server_address, timeout=10) as connection:
+        connection.sendall(text.encode() + b"GET /smuggled HTTP/1.1\r\n\r\n")
+        answer = b""
+        while piece := connection.recv(1 << 16):
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert answer.count(b"HTTP/1.1") == 1
+    assert b"Connection: close" in answer

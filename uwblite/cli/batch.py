@@ -52,12 +52,17 @@ class Outcome(NamedTuple):
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
+    from pathlib import Path
+
+    from ..io.folders import refuse_foreign, unmarked
     from ..io.locks import sole_writer
+    from ..report.batch import table_csv
     from . import console
     from .options import name_recordings_once
 
     name_recordings_once(args)
     tasks = tasks_of(args)
+    refuse_foreign(unmarked(Path(args.out), ("batch.csv", "batch.html"), "batch.csv", table_csv([])))
     with sole_writer(args.out):
         os.makedirs(args.out, exist_ok=True)
         rows = _rows(args, tasks)

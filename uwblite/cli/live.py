@@ -1,6 +1,7 @@
 """`uwblite localize --live`: the pose as JSON lines while a robot drives."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -162,7 +163,7 @@ def line_of(state: "LocalizerState") -> str:
 
     fields: dict[str, Any] = {
         "stamp": round(state.stamp, 6),
-        "pose": [round(v, 5) for v in state.pose.tolist()],
+        "pose": [round(v, 5) for v in state.pose.tolist()] if math.isfinite(state.pose.sum()) else None,
         "covariance": [[float(f"{v:.4g}") for v in row] for row in state.covariance.tolist()],
         "quality": round(state.quality, 3),
         "lost": state.lost,

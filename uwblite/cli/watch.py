@@ -89,8 +89,9 @@ def _folder(args: argparse.Namespace) -> str:
 
     if args.log == "-" or args.log.endswith(".gz"):
         raise ConfigError(f"{args.log} does not grow in a way that can be followed; name the plain log that is being written")
-    if os.path.isdir(args.log):
-        raise ConfigError(f"{args.log} is a folder; name the log that is being written")
+    if os.path.exists(args.log) and not os.path.isfile(args.log):
+        what = "a folder" if os.path.isdir(args.log) else "a pipe or a device, and only a file can be followed"
+        raise ConfigError(f"{args.log} is {what}; name the log that is being written")
     folder = args.out or f"{os.path.splitext(args.log)[0]}_watch"
     check_target(folder, force=args.force or not args.out)
     return str(folder)

@@ -30,7 +30,7 @@ from ..errors import ConfigError, FormatError
 from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
-from .folders import replacing_folder
+from .folders import refuse_foreign, replacing_folder, unmarked
 from .scan_geometry import largest_reading, without_reach
 from .settings_toml import to_toml
 from .source import finite, open_source
@@ -83,16 +83,20 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
 
     Raises
     ------
-    ConfigError : the folder holds such files already and force is not given.
+    ConfigError : the folder holds such files already and force is not given, or uwblite has not written them.
     """
     path = Path(folder)
-    if (path / "odometry.csv").exists() and not force:
-        raise ConfigError(f"{path} already holds a recording; use --force to replace it, or another folder")
+    present = [path / name for name in _FILES if (path / name).is_file()]
+    if present and not force:
+        raise ConfigError(f"{path} already holds a recording ({present[0].name}); use --force to replace it, or another folder")
+    refuse_foreign(unmarked(path, _FILES, "sensors.toml", _MARK))
     with replacing_folder(path, _FILES.__contains__) as waiting:
         _write_tables(waiting, log)
 
 
-_FILES = {"odometry.csv", "gyro.csv", "ranges.csv", "scans.csv", "sensors.toml"}
+_FILES = ("odometry.csv", "gyro.csv", "ranges.csv", "scans.csv", "sensors.toml")
+_MARK = f"# {ScanGeometry.__doc__}"
+"""How sensors.toml begins with comments."""
 
 
 def _write_tables(path: Path, log: SensorLog) -> None:

@@ -10,7 +10,7 @@ import ctypes
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -57,6 +57,25 @@ def check_free(folder: str | os.PathLike[str], owned: Owned) -> None:
     blocked = next((p for p in inside if owned(p.name) and p.is_dir() and not p.is_symlink()), None)
     if blocked is not None:
         raise ConfigError(f"{blocked} is a folder, and a file of this name is to be written; move it away")
+
+
+def refuse_foreign(files: Iterable[Path]) -> None:
+    """Refuse to replace files that somebody else has written.
+
+    Raises
+    ------
+    ConfigError : there is one.
+    """
+    for file in files:
+        raise ConfigError(f"{file} was not written by uwblite, or was changed since; move it away, or choose another folder")
+
+
+def unmarked(folder: Path, names: Iterable[str], mark: str, start: str) -> list[Path]:
+    """Return the files of a folder with these names, unless the one called `mark` begins as uwblite writes it."""
+    with suppress(OSError), open(folder / mark, "rb") as stream:
+        if stream.read(len(start.encode())) == start.encode():
+            return []
+    return [folder / name for name in names if (folder / name).is_file()]
 
 
 def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:

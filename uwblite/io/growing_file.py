@@ -1,7 +1,10 @@
 """A log that is being written, read as it grows, over all its parts."""
 
+import errno
 import os
 import re
+import stat
+from io import FileIO
 from pathlib import Path
 
 from ..errors import FormatError
@@ -17,6 +20,20 @@ _NEXT_PART = re.compile(rb"^COMMENT continued in ([^\n]+)\n", re.MULTILINE)
 _MARK_BYTES = 1024
 
 
+def _open(path: Path) -> FileIO:
+    """Open a regular file, or raise OSError."""
+    return open(path, "rb", buffering=0, opener=_regular)
+
+
+def _regular(path: str, flags: int) -> int:
+    """Open a file without waiting: a pipe would hold the opening until somebody writes into it."""
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return handle
+    os.close(handle)
+    raise OSError(errno.EINVAL, "it is a pipe, a device or a folder, and only a file can be followed")
+
+
 class GrowingFile:
     """Follow a file from its head, and what it holds already from near its end or whole.
 
@@ -29,7 +46,7 @@ class GrowingFile:
 
     Raises
     ------
-    FormatError : it cannot be opened.
+    FormatError : it cannot be opened, or is no regular file.
     """
 
     def __init__(self, path: str, *, whole: bool = False) -> None:
@@ -37,7 +54,7 @@ class GrowingFile:
         self.restarts = 0
         """How often the file was begun again."""
         try:
-            self._file = open(self.path, "rb", buffering=0)  # noqa: SIM115
+            self._file = _open(self.path)
             size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
             raise FormatError(f"cannot be followed: {error.strerror or error}", path) from None
@@ -68,7 +85,7 @@ class GrowingFile:
         try:
             if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
                 return b""
-            other = open(self.path, "rb", buffering=0)  # noqa: SIM115
+            other = _open(self.path)
         except OSError:
             return b""
         self._file.close()
@@ -82,9 +99,12 @@ class GrowingFile:
         following = self.path.with_name(os.path.basename(named[-1].decode("utf-8", "replace").strip())) if named else None
         if following is None or not following.is_file():
             return b""
+        try:
+            part = _open(following)
+        except OSError:
+            return b""
         self._file.close()
-        self.path, self._end = following, b""
-        self._file = open(following, "rb", buffering=0)  # noqa: SIM115
+        self.path, self._end, self._file = following, b"", part
         return self._file.read(_PIECE)
 
     def close(self) -> None:

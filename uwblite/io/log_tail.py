@@ -81,6 +81,11 @@ class LogTail:
         """Time from the first stamp to the last, s."""
         return max(self.last - self.first, 0.0)
 
+    @property
+    def is_file(self) -> bool:
+        """Whether its path is a file or nothing, and no pipe, device or folder, which cannot be followed."""
+        return os.path.isfile(self.path) or not os.path.exists(self.path)
+
     def odometry(self) -> tuple[Floats, Floats]:
         """Return stamps (n,), s, and poses (n, 3), m, m, rad, of the wheels, a few a second and the latest."""
         newer = self._latest if self._latest and self._latest[0] > self._odometry[-4] else ()

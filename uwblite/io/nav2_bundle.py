@@ -13,6 +13,7 @@ import json
 import math
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from ..arrays import Floats
 from ..errors import ConfigError
 from ..grid.occupancy_grid import UNKNOWN, OccupancyGrid
 from .files import write_text
-from .folders import replacing_folder
+from .folders import refuse_foreign, replacing_folder, unmarked
 from .map_server import write_map
 from .stored_result import StoredResult
 
@@ -94,11 +95,12 @@ def write_nav2_bundle(folder: str | os.PathLike[str], result: StoredResult) -> t
 
     Raises
     ------
-    ConfigError : the result has no grid.
+    ConfigError : the result has no grid, or the folder holds such files that uwblite has not written.
     OSError : the disk is full or may not be written; the folder is as it was.
     """
     if result.grid is None:
         raise ConfigError(f"{result.folder} has no map.yaml: nav2 needs a map")
+    refuse_foreign(unmarked(Path(folder), FILES, "nav2_params.yaml", _PARAMS.split(":")[0]))
     with replacing_folder(folder, FILES.__contains__) as place:
         write_map(place, result.grid)
         write_map(place, keepout_mask(result.grid), name="keepout_mask")

@@ -18,6 +18,7 @@ hash of every other file.
 """
 
 import hashlib
+import json
 import os
 import re
 from collections.abc import Sequence
@@ -34,8 +35,8 @@ from ..report.html import render
 from ..report.picture import PictureAnchor, draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
-from .files import write_text
-from .folders import check_free, mend, replacing_folder
+from .files import sha256_of, write_text
+from .folders import check_free, mend, refuse_foreign, replacing_folder
 from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .plain_edges import plain_edges
@@ -77,7 +78,8 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
 
     Raises
     ------
-    ConfigError : it holds a result and force is not given, it is not a folder, or a folder in it has the name of a file.
+    ConfigError : it holds a result and force is not given, it is not a folder, a folder in it has the name of a file, or a
+        file of such a name is no part of a result, or was changed since.
     OSError : it cannot be written.
     """
     path = Path(folder)
@@ -87,9 +89,21 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     if present and not force:
         raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use --force to replace it, or another --out")
     check_free(path, is_of_result)
+    if present:
+        repair_result(path)
+        refuse_foreign(path / name for name in present if not _is_written(path, name))
     nearest = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise PermissionError(13, os.strerror(13), str(nearest))
+
+
+def _is_written(folder: Path, name: str) -> bool:
+    """Return whether a file is as the result in its folder was written: report.json knows the hash of every other file."""
+    try:
+        hashes = json.loads((folder / "report.json").read_bytes())["files"]
+        return name == "report.json" or hashes.get(name) == sha256_of(folder / name)
+    except (OSError, ValueError, RecursionError, LookupError, TypeError, AttributeError):
+        return not (folder / name).exists()
 
 
 def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> list[str]:
@@ -105,8 +119,9 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
 
     Raises
     ------
-    OSError : the disk is full or cannot be written; an earlier result is untouched.
+    ConfigError, OSError : as for `check_target`, or the disk is full; an earlier result is untouched.
     """
+    check_target(folder, force=True)
     with replacing_folder(folder, is_of_result) as waiting:
         _write_trajectories(waiting, result)
         stamps, recording = result.keyframe_stamps, result.keyframe_recording

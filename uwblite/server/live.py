@@ -86,6 +86,7 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
     summary = f"{os.path.basename(tail.path)}: {tail.seconds:.0f} s, {tail.bytes / 1e6:.1f} MB"
     summary += f", {tail.broken} broken lines" if tail.broken else ""
     summary += ", begun again" if tail.restarts else ""
+    summary += "" if tail.is_file else "; a pipe, a device or a folder now has its name, and only a file can be followed"
     trail = _trail(tail, result)
     return {
         "summary": summary,

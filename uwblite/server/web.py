@@ -12,7 +12,7 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from .requests import Page, Response
+from .requests import Page, Response, text_response
 
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 1 << 16
@@ -116,17 +116,30 @@ class _Handler(BaseHTTPRequestHandler):
         super().handle_one_request()
 
     def do_GET(self) -> None:
-        self._answer(b"")
+        """Answer a request, or close the connection: where a request ends must not be a matter of opinion."""
+        length = self.headers.get("Content-Length", "0" if self.command != "POST" else "")
+        number = length.isascii() and length.isdigit()
+        if fault := self._fault(number and not int(length[:9])):
+            self._refuse(400, fault)
+        elif not number or len(length) > 9 or int(length) > MOST_BYTES:
+            self._refuse(413, "too long")
+        else:
+            self._answer(self.rfile.read(int(length)))
 
-    def do_POST(self) -> None:
-        length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit()) or len(length) > 9 or int(length) > MOST_BYTES:
-            self.close_connection = True
-            self._send(Response(413, "text/plain", b"too long"))
-            return
-        self._answer(self.rfile.read(int(length)))
+    do_POST = do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
 
-    do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
+    def _fault(self, empty: bool) -> str:
+        """Return why the head of a request cannot be trusted (RFC 9112, sections 3.2 and 6.3), "" where it can."""
+        for name in ("Host", "Content-Length"):
+            if len(self.headers.get_all(name, ())) > 1:
+                return f"more than one {name}"
+        if "Transfer-Encoding" in self.headers:
+            return "a body is sent with its length"
+        return "" if empty or self.command == "POST" else "only a POST has a body"
+
+    def _refuse(self, status: int, why: str) -> None:
+        self.close_connection = True
+        self._send(text_response(why, status))
 
     def _answer(self, body: bytes) -> None:
         self.server.asked(self.connection)
@@ -140,9 +153,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", response.kind)
         if response.stream is None:
             self.send_header("Content-Length", str(len(response.body)))
-        else:
+        self.close_connection |= response.stream is not None
+        if self.close_connection:
             self.send_header("Connection", "close")
-            self.close_connection = True
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Referrer-Policy", "no-referrer")
