@@ -9,7 +9,8 @@ from typing import Any, get_type_hints
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from uwblite.io.settings_toml import field_docs, permitted, shown_fields, toml_value
+from uwblite.field_docs import field_docs
+from uwblite.io.settings_toml import permitted, shown_fields, toml_value
 from uwblite.mapping import MappingConfig
 from uwblite.pipeline.mapping_config import preset
 

@@ -4,10 +4,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .arrays import Floats, Ints
+from .field_docs import documented
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class Notice:
     """A warning, or a reason not to trust a result."""
@@ -23,6 +25,7 @@ class Notice:
         return self.text
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorEstimate:
     """One anchor as the map has it."""
@@ -54,6 +57,7 @@ class AnchorEstimate:
     """Ranges shorter than the distance to its place, by more than noise."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEstimate:
     """One calibration value that the recording was asked for."""
@@ -91,6 +95,7 @@ OUTCOMES = {
 """What may become of a candidate for a loop closure, and its name for people."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
     """One candidate pair of sub-maps or keyframes and what became of it."""
@@ -118,6 +123,7 @@ class LoopClosure:
         return self.outcome == "accepted"
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class StageSummary:
     """One stage: its input and its result."""
@@ -129,6 +135,7 @@ class StageSummary:
     """Named counts and figures (JSON-ready)."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class MapResult:
     """The map of one or more recordings."""
