@@ -18,7 +18,7 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 
 FLOORS = (
     ("errors", "arrays", "findings"),
-    ("validation",),
+    ("validation", "field_docs"),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
     ("constraints", "odometry", "grid"),
@@ -236,7 +236,7 @@ def vendored(tmp_path_factory):
 USE = """
 from acme._x import uwblite
 from acme._x.uwblite.cli import main
-from acme._x.uwblite.io.settings_toml import field_docs
+from acme._x.uwblite.field_docs import field_docs
 from acme._x.uwblite.odometry.keyframes import KeyframeConfig
 assert field_docs(KeyframeConfig)["distance"]
 assert not [m for m in sys.modules if m.split(".")[0] == "uwblite"]

@@ -170,6 +170,19 @@ def test_every_python_example_works(document, prepared, workspace, capsys):
         exec(compile(text, document.name, "exec"), {})
 
 
+@pytest.mark.slow
+def test_every_python_example_passes_mypy(tmp_path):
+    files = []
+    for document in DOCUMENTS:
+        for number, (_, text) in enumerate(blocks(document, "python")):
+            files.append(tmp_path / f"{document.stem.lower()}_{number}.py")
+            files[-1].write_text(text)
+    assert len(files) >= 10
+    words = [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), "--strict", *map(str, files)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_sample_mappings_are_valid():
     for info, text in blocks(ROOT / "docs" / "formats.md", "toml"):
         assert parse_constraints(text) if "constraints" in info else parse_mappings(text)

@@ -10,8 +10,10 @@ import numpy as np
 from .arrays import Bools, Floats, Ints
 from .config import setting
 from .errors import ConfigError
+from .field_docs import documented
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenAnchor:
     """An anchor whose place is known."""
@@ -26,6 +28,7 @@ class GivenAnchor:
     """From an earlier map: it may have been moved since."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenPose:
     """Where the robot was at a time."""
@@ -40,6 +43,7 @@ class GivenPose:
     """Which of several recordings the stamp belongs to: 1, 2, ... as they are named to `map`."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenDistance:
     """The distance between two anchors."""
@@ -52,6 +56,7 @@ class GivenDistance:
     """m."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenLandmark:
     """A landmark in the scans, by its place in the map made without distances to it."""
@@ -64,6 +69,7 @@ class GivenLandmark:
     """Of a round column, m: its centre is then sought nearby. 0 = not a column."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenLandmarkDistance:
     """The true distance between two landmarks; of columns, between their centres."""
@@ -76,6 +82,7 @@ class GivenLandmarkDistance:
     """m; of landmarks that are no columns it includes how well their places were read off the map."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class GivenClosure:
     """Two times at which the robot was at the same place, or places at a known pose to each other."""
@@ -90,6 +97,7 @@ class GivenClosure:
     """Which of several recordings the stamps belong to."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class ForbiddenClosure:
     """Two times whose places must not be matched with each other: they only look the same."""
@@ -102,6 +110,7 @@ class ForbiddenClosure:
     """Which of several recordings the stamps belong to."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class Constraints:
     """Everything that is known beforehand."""
@@ -134,6 +143,7 @@ class Constraints:
         return allowed
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Clock:
     """When the poses of a graph were."""

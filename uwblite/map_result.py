@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 
 from .arrays import Bools, Floats, Ints
+from .field_docs import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorEstimate:
     """One anchor as the map has it."""
@@ -42,6 +44,7 @@ class AnchorEstimate:
     """Ranges shorter than the distance to its place, by more than noise."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEstimate:
     """One calibration value that the recording was asked for."""
@@ -79,6 +82,7 @@ OUTCOMES = {
 """What may become of a candidate for a loop closure, and its name for people."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
     """One candidate pair of sub-maps or keyframes and what became of it."""
@@ -106,6 +110,7 @@ class LoopClosure:
         return self.outcome == "accepted"
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class StageSummary:
     """One stage: its input and its result."""
@@ -117,6 +122,7 @@ class StageSummary:
     """Named counts and figures (JSON-ready)."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class MapResult:
     """The map of one or more recordings."""

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.config import from_dict, override, parse_toml
-from uwblite.io.settings_toml import differences, field_docs, to_toml, toml_value
+from uwblite.field_docs import field_docs
+from uwblite.io.settings_toml import differences, to_toml, toml_value
 from uwblite.pipeline.mapping_config import MappingConfig
 
 

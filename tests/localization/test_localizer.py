@@ -293,7 +293,8 @@ def test_another_scanner_may_have_another_number_of_rays():
     localizer = robot(known()).localizer
     localizer.add_scan(0.0, np.full(181, 2.0), SCANNER)
     localizer.add_scan(0.1, np.full(91, 2.0), dataclasses.replace(SCANNER, angle_increment=2 * SCANNER.angle_increment))
-    localizer.add_scan(0.2, np.full(91, 2.0))
+    localizer.add_scan(0.2, [])
+    localizer.add_scan(0.3, np.full(91, 2.0))
 
 
 def test_values_that_no_device_measures_change_nothing(drive):

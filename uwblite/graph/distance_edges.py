@@ -8,11 +8,13 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..field_docs import documented
 from ..validation import Shape
 from .graph import EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorDistanceEdges(EdgeTable):
     """Distance between two anchors: e = |a_i - a_j| - d."""
@@ -46,6 +48,7 @@ class AnchorDistanceEdges(EdgeTable):
         return Linearization(residuals, (("anchors", self.i, by_i), ("anchors", self.j, -by_i)))
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class PointDistanceEdges(EdgeTable):
     """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.

@@ -22,6 +22,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
+from ..field_docs import documented
 from ..validation import Shape, array_fields, require_index, require_type, settle
 from .robust import SQUARED, Kernel
 
@@ -141,6 +142,7 @@ class UnknownKey(NamedTuple):
         return f"{self.kind}{anchor}{tag}{f'#{self.recording + 1}' if self.recording else ''}"
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """Scalar unknowns."""
@@ -169,6 +171,7 @@ class Calibration:
         return np.array([key.kind in kinds for key in self.keys], dtype=bool)
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
     """Estimates, which of them are fixed, and the measurements between them."""
@@ -264,6 +267,7 @@ def whiten(sqrt_information: Floats, values: Floats) -> Floats:
     return np.einsum("eij,ej...->ei...", sqrt_information, values)
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorEdges(EdgeTable):
     """Priors of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""

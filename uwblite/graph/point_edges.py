@@ -8,11 +8,13 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..field_docs import documented
 from ..validation import Shape
 from .graph import EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkEdges(EdgeTable):
     """Position of a landmark, which is stored as an anchor, in the frame of a pose: e = X^-1 a - z."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..field_docs import documented
 from ..validation import Shape
 from .graph import Block, EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
@@ -49,6 +50,7 @@ def _by_pose(*columns: Floats) -> Floats:
     return np.stack(columns).transpose(2, 1, 0)
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePoseEdges(EdgeTable):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
@@ -80,6 +82,7 @@ class RelativePoseEdges(EdgeTable):
         return Linearization(residuals.T, (("poses", self.i, by_i), ("poses", self.j, by_j)))
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryEdges(EdgeTable):
     """Motion from pose i to pose j by odometry, corrected by its calibration.
@@ -203,6 +206,7 @@ _LEAST_SCALE = 0.1
 """Least scale that errors are divided by: odometry is not ten times too long."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanEdges(EdgeTable):
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.

@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..field_docs import documented
 from ..validation import Shape
 from .graph import Block, EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
@@ -17,6 +18,7 @@ _LEAST_SQUARE = 1e-4
 """m^2; a range shorter than the anchor's height keeps a horizontal distance of a centimetre."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeEdges(EdgeTable):
     """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).

@@ -46,6 +46,7 @@ import numpy as np
 from ..arrays import Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
+from ..field_docs import documented
 from .anchor_subproblem import with_anchors_solved
 from .descent_rules import as_much_again, extrapolated, relaxed
 from .factorization import Factor
@@ -59,6 +60,7 @@ Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
     """When the optimisation ends, and how small its first steps are."""
@@ -80,6 +82,7 @@ class SolverConfig:
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverSummary:
     """Summary of an optimisation, with the reason for its end."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
+from ..field_docs import documented
 
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
@@ -16,6 +17,7 @@ _MARGIN = 2
 """Cells added on every side of the area that a map must contain."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class GridGeometry:
     """A regular grid of square cells; row 0 has the smallest y, column 0 the smallest x."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..arrays import Bools, Floats
 from ..config import setting
 from ..errors import ConfigError
+from ..field_docs import documented
 from .geometry import GridGeometry
 from .ray_counter import WEIGHT_UNIT, RayCounter
 
@@ -76,6 +77,7 @@ class GridConfig:
                 raise ConfigError(f"grid.{name} must be positive, not {getattr(self, name)}")
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
     """A map of cells."""

@@ -1,43 +1,19 @@
 """Settings as commented TOML, as `uwblite config` prints them and a result keeps them; config.parse_toml reads them back."""
 
-import ast
 import dataclasses
-import sys
 from collections.abc import Mapping
-from itertools import pairwise
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ..config import ADVANCED, RANGE, flat, range_text, to_dict
 from ..errors import ConfigError
+from ..field_docs import field_docs
 
 
 def differences(config: Any, base: Any) -> list[str]:
     """Return the settings that differ from those of a base, as `override` takes them."""
     theirs = dict(flat(to_dict(base)))
     return [f"{name}={toml_value(v)}" for name, v in flat(to_dict(config)) if v != theirs.get(name)]
-
-
-def field_docs(cls: type) -> dict[str, str]:
-    """Return the docstring under each field of a settings class, by name; empty where the source is not at hand.
-
-    `inspect` asks the module's loader where there is no file, so that the source is found in a zip too.
-    """
-    import inspect
-
-    try:
-        tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
-    except OSError:
-        return {}
-    body = next((node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__), [])
-    docs = {}
-    for node, below in pairwise([*body, ast.Pass()]):
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        constant = below.value if isinstance(below, ast.Expr) else None
-        text = constant.value if isinstance(constant, ast.Constant) else None
-        docs[node.target.id] = " ".join(text.split()) if isinstance(text, str) else ""
-    return docs
 
 
 def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: bool = True) -> str:

@@ -10,10 +10,12 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Floats
 from ..config import setting
+from ..field_docs import documented
 from ..validation import as_array, require_finite, require_shape
 from .point_cloud import as_points, make_tree
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class IcpConfig:
     """How two clouds are aligned."""
@@ -34,6 +36,7 @@ class IcpConfig:
     """m^2; a match with a greater mean squared distance between nearest points is rejected (the paper's sigma)."""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
     """Pose of the source in the target, and its covariance."""

@@ -159,13 +159,13 @@ class Localizer:
 
         Raises
         ------
-        DataError : the scan has another number of rays than those before it by the same scanner.
+        DataError : the scan has another number of rays than those before it by the same scanner, and some.
         """
         (stamp,), readings = _numbers(stamp=stamp), as_array(ranges, "ranges")
         if scanner is not None and scanner != self.scanner:
-            self.scanner, self._rays = scanner, len(readings)
+            self.scanner, self._rays = scanner, 0
         self._rays = self._rays or len(readings)
-        require_shape(readings, "ranges", (self._rays,))
+        require_shape(readings, "ranges", (self._rays if len(readings) else 0,))
         if self.scanner is not None and self.scanner.usable and self.known.walls is not None:
             for at, entry in self._scan_clock.take(stamp, self._measured, self._silences, (readings, self.scanner)):
                 scan = Scan(at + self.known.laser_delay, *entry)

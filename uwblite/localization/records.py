@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arrays import Floats
+from ..field_docs import documented
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class Scanner:
     """Geometry of a lidar, with the field names of sensor_msgs/LaserScan."""
@@ -27,6 +29,7 @@ class Scanner:
         return bool(np.isfinite((self.angle_min, self.angle_increment, self.time_increment)).all())
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalizerState:
     """Present estimate of the robot's pose."""

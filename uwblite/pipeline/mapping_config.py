@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ..errors import ConfigError
+from ..field_docs import documented
 from ..graph.calibration import CalibrationConfig
 from ..graph.robust import SQUARED
 from ..graph.solver import SolverConfig
@@ -22,6 +23,7 @@ from ..radio.range_noise import RangeNoiseConfig
 from ..radio.trilateration import TrilaterationConfig
 
 
+@documented
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     """All settings, a group per stage."""

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..errors import DataError
+from ..field_docs import documented
 from ..validation import require_finite, require_index, require_type
 from .notes import LogNotes, Screening
 from .sensors import Gyro, LaserScans, Odometry, SensorMounting, UwbRanges
@@ -45,18 +46,25 @@ def fault_of_id(name: str) -> str:
     return ""
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorLog:
     """One recording. `ranges` and `scans` are None when the sensor was not there."""
 
     odometry: Odometry
+    """Poses of the base by the wheels, see sensor_log.Odometry."""
     ranges: UwbRanges | None = None
+    """Distances to anchors, see sensor_log.UwbRanges."""
     scans: LaserScans | None = None
+    """Scans of one lidar, see sensor_log.LaserScans."""
     mounting: SensorMounting = field(default_factory=SensorMounting)
+    """Where laser, tag and anchors are, see sensor_log.SensorMounting."""
     notes: LogNotes = field(default_factory=LogNotes)
+    """Where it comes from, and what the reader saw besides."""
     screening: Screening | None = None
     """What screening found; None before it."""
     gyro: Gyro | None = None
+    """Heading of a gyro, see sensor_log.Gyro."""
 
     def __post_init__(self) -> None:
         kinds = {"odometry": Odometry, "gyro": Gyro, "ranges": UwbRanges, "scans": LaserScans}

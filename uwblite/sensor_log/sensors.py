@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..errors import DataError
+from ..field_docs import documented
 from ..validation import settle
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry(Table):
     """Wheel odometry: poses of the base in the drifting odom frame."""
@@ -55,6 +57,7 @@ def plausible(ranges: Floats) -> Bools:
     return (ranges > SHORTEST_RANGE) & (ranges < LONGEST_RANGE)
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class UwbRanges:
     """Distances between the tag on the robot and fixed anchors."""
@@ -99,6 +102,7 @@ class UwbRanges:
         return UwbRanges(self.stamps[which], anchor.astype(np.intp), self.ranges[which], self.quality[which], ids, tag)
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class Gyro(Table):
     """The heading of a gyro, from an arbitrary zero, with its bias."""
@@ -112,6 +116,7 @@ class Gyro(Table):
         settle(self, "gyro", {"stamps": ("g",), "heading": ("g",)})
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserScans(Table):
     """2D scans with the field names of sensor_msgs/LaserScan; all scans share one geometry."""
@@ -149,6 +154,7 @@ class LaserScans(Table):
         return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
 
 
+@documented
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMounting:
     """Mounting of the sensors on the base."""
