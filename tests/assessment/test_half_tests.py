@@ -68,8 +68,10 @@ def test_halves_are_compared_where_both_decide(monkeypatch, missing):
     monkeypatch.setattr(half_tests, "_calibration", calibrated)
     monkeypatch.setattr(half_tests, "_check_sign_of_turns", lambda recording, task: alone.append(recording))
     monkeypatch.setattr(half_tests, "_compare", lambda one, other, task: compared.append((one, other)))
-    each = [SimpleNamespace(has_scans=True), SimpleNamespace(has_scans=False, rows=slice(10, 31))]
-    half_tests.check_halves(SimpleNamespace(ranges=1), SimpleNamespace(recordings=SimpleNamespace(each=each), stages=stages))
+    log = SimpleNamespace(ranges=1)
+    each = [SimpleNamespace(has_scans=True), SimpleNamespace(has_scans=False, rows=slice(10, 31), log=log)]
+    task = SimpleNamespace(recordings=SimpleNamespace(each=each), stages=stages)
+    half_tests.check_halves(SimpleNamespace(ranges=1, anchor_ids=("A", "B")), task)
     assert alone == ([] if missing == 0 else each[1:])
     assert asked == [(10, 20), (20, 31)]
     assert compared == ([(1, 2)] if missing is None else [])

@@ -1,6 +1,6 @@
 """Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 
 from ..errors import Cancelled
 from ..graph.solver import SolverSummary
@@ -58,13 +58,6 @@ class Stages:
         """Add a warning."""
         self.warnings.append(Notice(kind, text, figures))
 
-    def withdraw(self, kind: str, figure: str, but: Container[object] = ()) -> None:
-        """Remove all warnings of a kind that have a figure, but those where it is one of some values."""
-        self.warnings = [
-            notice for notice in self.warnings
-            if notice.kind != kind or figure not in notice.figures or notice.figures[figure] in but
-        ]  # fmt: skip
-
     def doubt(self, kind: str, text: str, **figures: object) -> None:
         """Add a reason not to trust the result."""
         self.doubts.append(Notice(kind, text, figures))
@@ -73,14 +66,6 @@ class Stages:
         """Turn a doubt into a warning, and add the reason that settles it."""
         self.doubts.remove(doubt)
         self.warn(doubt.kind, f"{doubt.text}; {by}", **doubt.figures)
-
-    def mark(self) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
-        """Return the warnings and doubts reported so far."""
-        return tuple(self.warnings), tuple(self.doubts)
-
-    def back_to(self, mark: tuple[tuple[Notice, ...], tuple[Notice, ...]]) -> None:
-        """Restore an earlier list of notices, because the stages that reported the later ones run again."""
-        self.warnings, self.doubts = list(mark[0]), list(mark[1])
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
