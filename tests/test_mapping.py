@@ -24,12 +24,9 @@ from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.floor import with_noise_shown
-from uwblite.pipeline import anchor_moves, final_stages
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.final_stages import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
-from uwblite.radio.change_points import Move
-from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import Odometry, UwbRanges
 
@@ -121,52 +118,6 @@ def test_equal_input_gives_equal_bytes_whoever_computes(minute):
     same_bytes(one, build_map(minute))
     with ThreadPoolExecutor(2) as executor:
         same_bytes(one, build_map(minute, executor=executor))
-
-
-def test_names_that_turn_out_right_as_recorded_are_not_estimated_anew(minute, monkeypatch):
-    """Moves are taken back once the trajectory has been estimated with them: it goes on from the first optimisation."""
-    log = minute.without(lidar=True)
-    plain = build_map(log)
-    proposed = iter([lambda logs: logs, lambda logs: None])
-    monkeypatch.setattr(anchor_moves, "first_with_moves_apart", lambda estimate, task, logs: [replace(log) for log in logs])
-    monkeypatch.setattr(anchor_moves, "with_moves_apart", lambda estimate, task, logs: next(proposed)(logs))
-    result = build_map(log)
-    assert [stage.name for stage in result.stages].count("first optimisation") == 2
-    assert [stage.name for stage in plain.stages].count("first optimisation") == 1
-    assert result.trajectory.tobytes() == plain.trajectory.tobytes()
-    assert (result.warnings, result.doubts) == (plain.warnings, plain.doubts)
-
-
-@pytest.mark.parametrize(("order", "short", "computed", "kept"), [
-    ("ABA", (3, 3), 2, "A"), ("ABA", (4, 3), 2, "B"), ("BAB", (0, 0), 2, "B"), ("ABC", (), 3, "C"), ("BA", (), 2, "A"),
-])  # fmt: skip
-def test_a_pass_with_the_names_of_an_earlier_one_is_not_computed_again(minute, monkeypatch, order, short, computed, kept):
-    """A: as recorded, B and C: renamed at another moment. The result is that of the names kept alone, remarks included: where
-    they come round, those of the map with fewer ranges that are too short, the earlier where both have as many."""
-    log, passes = minute.without(lidar=True), []
-    places = [AnchorHypothesis(np.array([x, 0.0]), 0.0, 0.1, 0.0, 0.1) for x in (0.0, 1.0)]
-    name, moments = log.ranges.anchor_ids[0], {"B": log.ranges.stamps[0] + 20.0, "C": log.ranges.stamps[0] + 30.0}
-
-    def called(which, logs):
-        moves = {name: [Move(moments[which], moments[which], *places)]} if which in moments else {}
-        return None if which == "end" else [anchor_moves._renamed(one, moves) for one in logs]
-
-    def result_of(names):
-        proposed = iter([*names, "end"])
-        for function in ("first_with_moves_apart", "with_moves_apart"):
-            monkeypatch.setattr(anchor_moves, function, lambda estimate, task, logs: called(next(proposed), logs))
-        return build_map(log)
-
-    alone, counts = result_of(kept), iter(short)
-    monkeypatch.setattr(anchor_moves, "short_ranges", lambda estimate: next(counts))
-    final = final_stages.final_optimisation
-    monkeypatch.setattr(final_stages, "final_optimisation", lambda *given: passes.append(1) or final(*given))
-    result = result_of(order)
-    assert len(passes) == computed
-    assert result.trajectory.tobytes() == alone.trajectory.tobytes()
-    assert [a.id for a in result.anchors] == [a.id for a in alone.anchors]
-    assert all(a.position.tobytes() == b.position.tobytes() for a, b in zip(result.anchors, alone.anchors, strict=True))
-    assert (result.warnings, result.doubts) == (alone.warnings, alone.doubts)
 
 
 def test_the_recording_is_not_changed_and_progress_is_reported_in_order(minute):

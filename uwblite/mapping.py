@@ -18,7 +18,8 @@ from .errors import DataError
 from .map_result import MapResult
 from .pipeline import (
     anchor_heights,
-    anchor_moves,
+    anchor_places,
+    anchor_presence,
     closure_rounds,
     constraint_edges,
     final_stages,
@@ -26,9 +27,7 @@ from .pipeline import (
     lidar_stages,
     map_frame,
     mirror_images,
-    moved_anchors,
     odometry_units,
-    place_agreement,
     radio_stages,
     scan_selection,
     surface_adjustment,
@@ -77,12 +76,13 @@ def build_map(
     logs = [scan_selection.prepared(log, config) for log in logs]
     config = odometry_units.with_units_checked(config, logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
-    estimate, task, logs = _in_sound_units(task, logs)
+    estimate, task = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)
-    estimate, task = _with_moves_apart(estimate, task, logs)
-    # Last of all: moves of anchors are sought on the trajectory before, on which their limits were set.
+    for stage in _stages(task):
+        estimate = stage(estimate, task)
+        task = task.following(estimate)
     estimate, covariance = final_stages.without_range_errors(estimate, task)
-    stages.note(anchor_moves.said_of_places(task, estimate.anchor_ids))
+    stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, covariance, grid, task)
 
@@ -99,49 +99,17 @@ def _require_types(logs: object, config: object, constraints: object) -> None:
         require_type(constraints, "constraints", Constraints)
 
 
-def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, list[SensorLog]]:
+def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
     """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
     estimate, config = radio_stages.first_optimisation(task), task.config
     factors = odometry_units.odometry_unit_factors(estimate, task)
     if np.all(factors == 1.0):
-        return estimate, task, logs
+        return estimate, task
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
     # A unit that was set by the ranges gives no information about the unit of the ranges.
     free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
     task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
-    return radio_stages.first_optimisation(task), task, logs
-
-
-def _with_moves_apart(estimate: Estimate, task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
-    """Go through all stages, and again with each place of an anchor that was moved as an anchor of its own.
-
-    Names that a pass had before end the search, for it would go round: the better of both is kept, see short_ranges.
-    """
-    before, as_recorded = task.stages.mark(), (estimate, task)
-    renamed, first = anchor_moves.first_with_moves_apart(estimate, task, logs), None
-    for left in reversed(range(_MOST_MOVES)):
-        if renamed is not None:
-            if first is not None and anchor_moves.named_so(first[1], renamed):
-                if anchor_moves.short_ranges(first[0]) <= anchor_moves.short_ranges(estimate):
-                    estimate, task, said = first
-                    task.stages.back_to(said)
-                break
-            task.stages.back_to(before)
-            estimate, task = as_recorded
-            # Moves that were taken back leave the recordings as they were.
-            if any(log is not other for log, other in zip(renamed, logs, strict=True)):
-                estimate, task = anchor_moves.optimised_with_names(renamed, estimate, task)
-        for stage in _stages(task):
-            estimate = stage(estimate, task)
-            task = task.following(estimate)
-        if not left or (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
-            break
-        first = first or (estimate, task, task.stages.mark())
-    return estimate, task
-
-
-_MOST_MOVES = 3
-"""How often, at most, a map begins again because anchors were moved while it was recorded."""
+    return radio_stages.first_optimisation(task), task
 
 
 def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
@@ -156,18 +124,18 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
             yield turn_checks.with_slip_in_turns
         if config.use_loops:
             yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
+            yield anchor_places.decide_places
             yield radio_stages.select_range_priors
             if config.refinement.rounds:
                 yield lidar_stages.refine_jointly
-            yield moved_anchors.separate_moved_anchors
-            if config.refinement.rounds:
                 yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
         yield lidar_stages.check_map_consistency
+    if not (task.recordings.have_scans and config.use_loops):
+        yield anchor_places.decide_places
     if given.landmark_distances:
         yield landmark_ties.tie_landmarks
-    yield place_agreement.merge_places_that_agree
-    yield moved_anchors.name_new_and_absent_anchors
+    yield anchor_presence.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images
     yield map_frame.align_axes

@@ -130,7 +130,7 @@ def test_an_anchor_of_two_recordings_stands_where_the_first_has_it():
     assert names == [("C", "D", "A#2")[k] for k in two.ranges.anchor.tolist()]
 
 
-def test_a_third_recording_links_two_and_a_moved_anchor_is_named():
+def test_a_third_recording_links_two_and_a_moved_anchor_has_a_place_of_its_own():
     """The first and the second share no anchor; the third shares two with either, and has one where the first has not."""
     world = {"A": (0.0, 0.0), "B": (9.0, 1.0), "C": (2.0, 8.0), "D": (-7.0, 3.0), "E": (-4.0, -6.0), "F": (5.0, -8.0)}
     frames, all_ids = np.array([[0.0, 0.0, 0.0], [2.0, 5.0, 1.1], [-3.0, 1.0, -2.0]]), ("ABC", "DEF", "ABCDE")
@@ -142,15 +142,10 @@ def test_a_third_recording_links_two_and_a_moved_anchor_is_named():
         graph = replace(estimate.graph, anchors=se2.transform(se2.inverse(frame), places))
         estimates.append(replace(estimate, graph=graph))
         poses.append(poses[-1] + count)
-    warned = []
     recordings = SimpleNamespace(each=[SimpleNamespace(first=k, name=f"{k}.log") for k in poses[:3]])
-    stages = SimpleNamespace(warn=lambda kind, text, **figures: warned.append((kind, figures)))
-    joined = join(estimates, SimpleNamespace(recordings=recordings, stages=stages))
+    joined = join(estimates, recordings)
     assert joined.anchor_ids == ("A", "B", "C", "D", "E", "F", "C#3")
     expected = [*world.values(), (32.0, 38.0)]
     np.testing.assert_allclose(joined.graph.anchors, expected, atol=1e-6)
     for number, (first, frame) in enumerate(zip(poses[:3], frames, strict=True)):
         np.testing.assert_allclose(joined.graph.poses[first], se2.compose(frame, estimates[number].graph.poses[0]), atol=1e-6)
-    (kind, figures), = warned
-    assert (kind, figures["anchor"], figures["recording"], figures["new_id"]) == ("moved-anchor", "C", 3, "C#3")
-    assert figures["distance"] == pytest.approx(np.hypot(30.0, 30.0), abs=1e-3)

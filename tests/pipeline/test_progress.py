@@ -29,19 +29,6 @@ def test_a_callback_that_returns_false_stops_and_none_goes_on():
         Stages(lambda *call: False, None).report("one", 1, 2)
 
 
-def test_stages_that_run_again_are_forgotten():
-    stages = Stages(None, None)
-    stages.warn("a", "first", metres=1.0)
-    stages.doubt("b", "second")
-    mark = stages.mark()
-    stages.warn("c", "third")
-    stages.doubt("d", "fourth")
-    stages.doubt("e", "fifth")
-    stages.back_to(mark)
-    assert [(n.kind, str(n), n.figures) for n in stages.warnings] == [("a", "first", {"metres": 1.0})]
-    assert [(n.kind, n.text) for n in stages.doubts] == [("b", "second")]
-
-
 @pytest.mark.parametrize(("count", "where"), [(1, ""), (2, "recording 2: ")])
 def test_what_the_screening_found_is_taken_over(count, where):
     remarks = (warning("jump", "it jumps"), doubt("gap", "it is silent"))
@@ -50,15 +37,3 @@ def test_what_the_screening_found_is_taken_over(count, where):
     stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])
     assert [(n.kind, n.text) for n in stages.warnings] == [("jump", where + "it jumps")]
     assert [(n.kind, n.text) for n in stages.doubts] == [("gap", where + "it is silent")]
-
-
-def test_what_was_withdrawn_since_is_said_again_where_stages_run_again():
-    stages = Stages(None, None)
-    stages.warn("moved-anchor", "first", new_id="A#2")
-    stages.warn("other", "second")
-    before = stages.mark()
-    stages.withdraw("moved-anchor", "new_id")
-    stages.warn("other", "third")
-    assert [w.text for w in stages.warnings] == ["second", "third"]
-    stages.back_to(before)
-    assert [w.text for w in stages.warnings] == ["first", "second"]

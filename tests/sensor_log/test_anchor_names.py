@@ -2,14 +2,14 @@
 
 import pytest
 
-from uwblite.sensor_log.anchor_names import first_place, last_places, name_and_number, numbered, radio_name
+from uwblite.sensor_log.anchor_names import first_place, last_places, name_and_number, place_name, radio_name
 
 
 def test_names_of_places():
     assert name_and_number("5C0B") == ("5C0B", 1)
     assert name_and_number("5C0B@3") == ("5C0B", 3)
     assert name_and_number("user@home") == ("user@home", 1)
-    assert numbered("5C0B@3", 1) == "5C0B@3#2"
+    assert [place_name("5C0B", *at) for at in ((1, 0), (3, 0), (1, 1), (3, 1))] == ["5C0B", "5C0B@3", "5C0B#2", "5C0B@3#2"]
     assert [first_place(name) for name in ("5C0B@3#2", "5C0B@3", "5C0B")] == ["5C0B@3", "5C0B@3", "5C0B"]
 
 

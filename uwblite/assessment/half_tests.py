@@ -25,6 +25,7 @@ from ..pipeline.estimate import Estimate, Task
 from ..pipeline.progress import Stages
 from ..pipeline.radio_stages import bootstrapped, dead_reckoning
 from ..pipeline.recordings import Recording, gather
+from ..sensor_log.anchor_names import radio_name
 
 _CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
 """Differences between halves that no faultless base has: of lengths, of turns, and of turns per metre, rad/m."""
@@ -43,7 +44,7 @@ def check_halves(estimate: Estimate, task: Task) -> Iterator[Finding]:
             continue
         if "range-scatter" not in kinds(task.stages.findings):
             # Ranges that are no distances give no anchors by either half; a bootstrap would be useless.
-            yield from _check_sign_of_turns(recording, task)
+            yield from _check_sign_of_turns(_with_places(recording, estimate), task)
         rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
         halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
         if halves[0] is None or halves[1] is None:
@@ -112,6 +113,15 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
             f"apart, {mirrored:.1f} m when mirrored): the odometry's turns are wrong in one of the halves"
         )
         yield doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
+
+
+def _with_places(recording: Recording, estimate: Estimate) -> Recording:
+    """Return a recording with each place of an anchor that was moved as an anchor of its own."""
+    ranges, names = estimate.ranges, estimate.anchor_ids
+    if ranges is None or recording.log.ranges is None or len(set(map(radio_name, names))) == len(names):
+        return recording
+    measured = replace(recording.log.ranges, anchor=ranges.anchor[recording.has(ranges.pose)], anchor_ids=names)
+    return replace(recording, log=replace(recording.log, ranges=measured))
 
 
 _TRIANGLE = 3

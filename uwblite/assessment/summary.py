@@ -15,7 +15,6 @@ from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
-from ..pipeline.anchor_moves import SHORT
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
@@ -26,6 +25,8 @@ from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not concern all anchors."""
+_SHORT = 0.5
+"""m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _IMPLAUSIBLE_BIAS = 1.6
@@ -136,7 +137,7 @@ def _anchor(
     scatter = spread_about_median(own)
     # Readings that are no distances, or were left out as made on the way from place to place, are not short.
     measured = own[ranges.alive[ranges.anchor == k]]
-    short = int(np.sum(measured + max(bias, 0.0) < -max(limit, SHORT)))
+    short = int(np.sum(measured + max(bias, 0.0) < -max(limit, _SHORT)))
     if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
@@ -182,7 +183,7 @@ def _reason_of_short_ranges(short: int, count: int) -> str:
     """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
     if not many_short(short, count):
         return ""
-    return f"{short} of its {count} ranges are too short for its place by {SHORT} m or more: it stood elsewhere for a time?"
+    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"
 
 
 def _with_times(

@@ -1,8 +1,8 @@
 """Many recordings in one graph: anchors have ids, so recordings of other days and robots share a frame.
 
 Each recording is bootstrapped on its own. The anchors that two have in common then give the pose of one in the frame of
-the other; one that was moved in between is left out of this, gets a place of its own for each recording (``5C0B`` and
-``5C0B#2``) and is reported. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
+the other; one that does not agree is left out of this and has a place for each recording (``5C0B`` and ``5C0B#2``), until
+anchor_places decides. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
 Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
 """
 
@@ -20,27 +20,25 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
-from ..sensor_log.anchor_names import first_place, numbered
-from .estimate import Estimate, Task
+from ..sensor_log.anchor_names import first_place, place_name
+from .estimate import Estimate
 from .recordings import Recording, Recordings
 from .shared_anchors import Pairs, Places, agreement, other_place, places_of, together
 
 
-def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
+def join(estimates: Sequence[Estimate], recordings: Recordings) -> Estimate:
     """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
 
     Recordings are joined in the order of how many anchors they share with those already joined, so that a third may link two.
 
     Parameters
     ----------
-    estimates : of each recording, in its own frame and numbering.
-    task : takes a warning for each anchor that was moved.
+    estimates : of each of the recordings, in its own frame and numbering.
 
     Raises
     ------
     DataError : a recording shares fewer than two placed anchors with the others, or no two have places that agree.
     """
-    recordings = task.recordings
     found = [places_of(estimate) for estimate in estimates]
     placed = found[0]
     motions = [np.zeros(3) for _ in estimates]
@@ -55,21 +53,10 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
         called = list(own.names)
         for k, name in enumerate(own.names):
             if name in placed.names and (k, placed.names.index(name)) not in agree:
-                called[k] = other_place(own, placed, agree, k) or numbered(name, number)
-                off = float(np.hypot(*(own.at[k] - placed.at[placed.names.index(name)])))
-                warn_of_moved_anchor(task, name, off, number, called[k])
+                called[k] = other_place(own, placed, agree, k) or place_name(name, 1, number)
                 names[number][names[number].index(name)] = called[k]
         placed = together(placed, own, called)
     return _one_graph(estimates, motions, names, recordings)
-
-
-def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: int, new_id: str) -> None:
-    """Warn that an anchor stands elsewhere in a recording (0, 1, ...) than before, by a distance, m."""
-    task.stages.warn(
-        "moved-anchor",
-        f"anchor {anchor} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {new_id}",
-        anchor=anchor, distance=round(distance, 4), recording=recording + 1, new_id=new_id,
-    )  # fmt: skip
 
 
 def _laid_on(found: Places, placed: Places, recording: Recording) -> tuple[Floats, Pairs]:

@@ -1,6 +1,6 @@
 """Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ..errors import Cancelled
@@ -64,25 +64,9 @@ class Stages:
         """Add a warning."""
         self.findings.append(warning(kind, text, **figures))
 
-    def withdraw(self, kind: str, figure: str, but: Container[object] = ()) -> None:
-        """Remove all warnings of a kind that have a figure, but those where it is one of some values."""
-        self.findings = [
-            finding for finding in self.findings
-            if finding.severity != WARNING or finding.kind != kind or figure not in finding.figures
-            or finding.figures[figure] in but
-        ]  # fmt: skip
-
     def doubt(self, kind: str, text: str, **figures: object) -> None:
         """Add a reason not to trust the result."""
         self.findings.append(doubt(kind, text, **figures))
-
-    def mark(self) -> tuple[Finding, ...]:
-        """Return what was found so far."""
-        return tuple(self.findings)
-
-    def back_to(self, mark: tuple[Finding, ...]) -> None:
-        """Restore earlier findings, because the stages that made the later ones run again."""
-        self.findings = list(mark)
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""

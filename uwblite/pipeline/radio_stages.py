@@ -58,7 +58,7 @@ def first_optimisation(task: Task, known: Sequence[Estimate | None] = ()) -> Est
     ]
     if len(estimates) == 1:
         return anchor_heights.with_likelier_heights(estimates[0], task.config)
-    joined = _optimised(replace(joining.join(estimates, task), alone=tuple(estimates)), task)
+    joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
     return anchor_heights.with_likelier_heights(joined, task.config)
 
 

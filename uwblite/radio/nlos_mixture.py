@@ -25,6 +25,8 @@ _CLEAN = 15.0
 """Prior number of ranges in the core: a few ranges alone determine neither tail nor gross errors."""
 _NARROWED, _PARTS = 5, 32
 """Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
+_LEAST_WILD = 1e-3
+"""Share of gross errors that no number of ranges without one excludes."""
 _WIDEST = 2.0
 """Least width of the distribution of gross errors, m."""
 
@@ -52,6 +54,12 @@ class RangeMixture:
         core = (1.0 - self.tail - self.wild) * normal
         return core / (core + self.tail * late + self.wild / self.width + 1e-300)
 
+    def log_density(self, errors: Floats) -> Floats:
+        """Return the logarithm of the probability density (m,) of each error, 1/m."""
+        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
+        wild = max(self.wild, _LEAST_WILD)
+        return np.asarray(np.log((1.0 - self.tail - self.wild) * normal + self.tail * late + wild / self.width))
+
     def mode(self) -> float:
         """Return the likeliest error, m."""
         low, high = 0.0, 3.0 * self.sigma
@@ -76,16 +84,16 @@ class RangeMixture:
         return slope / (core + self.tail * late + self.wild / self.width + 1e-300)
 
 
-def fit(errors: Floats, least_sigma: float) -> RangeMixture:
+def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> RangeMixture:
     """Fit the mixture to errors.
 
     Parameters
     ----------
     errors : (m,) measured minus expected, m; m >= 1.
-    least_sigma : the core is not narrower, m.
+    least_sigma, most_sigma : the core is not narrower, and not wider, m.
     """
     centre, sigma = shortest_half(errors)
-    sigma = max(sigma, least_sigma)
+    sigma = min(max(sigma, least_sigma), most_sigma)
     width = max(float(np.ptp(errors)), _WIDEST)
     tail, detour, wild = 0.2, 4.0 * sigma, 0.05
     for _ in range(_ROUNDS):
@@ -99,7 +107,7 @@ def fit(errors: Floats, least_sigma: float) -> RangeMixture:
         detour = max(float(parts[1] @ _mean_detour(off, sigma, detour)) / max(float(slow), 1e-9), _SHORTEST * sigma)
         before = centre
         centre += float(parts[0] @ off) / max(float(core), 1e-9)
-        sigma = max(float(np.sqrt(parts[0] @ (errors - centre) ** 2 / max(float(core), 1e-9))), least_sigma)
+        sigma = min(max(float(np.sqrt(parts[0] @ (errors - centre) ** 2 / max(float(core), 1e-9))), least_sigma), most_sigma)
         if abs(centre - before) < 1e-4 * sigma:
             break
     return RangeMixture(centre, sigma, tail, detour, wild, width)

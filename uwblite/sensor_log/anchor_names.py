@@ -24,9 +24,12 @@ def name_and_number(name: str) -> tuple[str, int]:
     return (base, int(number)) if mark and number.isdigit() else (name, 1)
 
 
-def numbered(anchor: str, recording: int) -> str:
-    """Return the name of an anchor that stands elsewhere in a recording (0, 1, ...) than before."""
-    return f"{anchor}#{recording + 1}"
+def place_name(radio: str, number: int, recording: int) -> str:
+    """Return the name of a radio's place, the first, second ... (1, 2, ...) of those that it has in a recording (0, 1, ...).
+
+    Of the first recording in which it is heard, which has the number 0 here, the recording is not named.
+    """
+    return radio + (f"@{number}" if number > 1 else "") + (f"#{recording + 1}" if recording else "")
 
 
 def first_place(anchor: str) -> str:
