@@ -31,6 +31,9 @@ _SET_BACK, _IN_A_ROW = 0.5, 4
 """s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
 
 
+_WORK = 4_000_000
+"""Operations of a step from which on it uses no further measurement: after a silence many are due at once, and where the pose
+is not known each is compared with many places."""
 _BEYOND = 1e8
 """m and rad; a pose or a heading farther from zero is invalid: differences between such numbers lose all digits."""
 
@@ -76,12 +79,18 @@ class Localizer:
         return self._waiting.refused + self._leaps
 
     @property
+    def work(self) -> int:
+        """Operations on elements of arrays in the last step: what a step costs, whatever else the computer does."""
+        return self._estimator.work
+
+    @property
     def ends(self) -> Floats:
         """(2,) numbers of rays on walls, and in known space, while the pose was known."""
         return self._estimator.ends.copy()
 
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
+        self._estimator.work = 0
         wheels = np.array([x, y, theta], dtype=np.float64)
         wheels[~(np.abs(wheels) < _BEYOND)] = np.nan
         stamp += self._clock_shift
@@ -125,6 +134,7 @@ class Localizer:
         ------
         DataError : there are more ids than ranges, or fewer.
         """
+        self._estimator.work = 0
         values = np.asarray(metres, dtype=np.float64).reshape(-1)
         if len(anchor_ids) != len(values):
             raise DataError(f"{len(anchor_ids)} anchor ids for {len(values)} ranges; one id belongs to each range")
@@ -146,6 +156,7 @@ class Localizer:
         stamp : s, of the first ray, on the lidar's clock. ranges : (b,) m; inf = nothing seen, nan = invalid.
         scanner : geometry, where it is not the one of before.
         """
+        self._estimator.work = 0
         self.scanner = scanner or self.scanner
         if self.scanner is not None and self.scanner.usable and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
@@ -197,12 +208,16 @@ class Localizer:
         due = self._waiting.reached(self._odometer.stamp)
         ranged = [until for until, entry in due if isinstance(entry, Range)]
         poses = dict(zip(ranged, self._odometer.at(np.array(ranged)), strict=True)) if ranged else {}
-        for until, entry in due:
+        free = not any(isinstance(entry, Scan) for _, entry in due)
+        for k, (until, entry) in enumerate(due):
+            if self._estimator.work > _WORK:
+                self._waiting.put_back(due[k:])
+                break
             if isinstance(entry, Scan):
                 self._estimator.use_scan(scan_rays(self._odometer, self._laser, entry))
             else:
                 self._use_range(entry, until, poses[until])
-        self._estimator.search_or_check(free=not any(isinstance(entry, Scan) for _, entry in due))
+        self._estimator.search_or_check(free=free)
 
     def _bridge_silence(self) -> None:
         """Where the odometry is silent, let the robot stand, and increase the uncertainty of the pose."""

@@ -65,6 +65,10 @@ class Waiting:
         if np.isfinite(until):
             self._entries.append((until, entry))
 
+    def put_back(self, entries: list[tuple[float, Range | Scan]]) -> None:
+        """Keep measurements that were reached for the next step."""
+        self._entries = entries + self._entries
+
     def latest(self, now: float) -> float:
         """Return until when sensors have measured, s, where the odometry's last stamp is now; -inf = not beyond it."""
         ahead = {until for until, _ in self._entries if until > now}
