@@ -155,7 +155,7 @@ def _missing_share(report: dict[str, Any]) -> float:
 
 def _shape(report: dict[str, Any]) -> tuple[Floats, Floats]:
     """Return places (p, 2) and covariances (p, 3, 3) of a report's entry `shape`; none where it has none that is sound."""
-    stated = report.get("shape") if isinstance(report.get("shape"), dict) else {}
+    stated: Any = report.get("shape")
     try:
         poses, covariances = (np.array(stated[name], dtype=np.float64) for name in ("poses", "covariances"))
         places, covariances = poses.reshape(-1, 3)[:, :2], covariances.reshape(len(poses), 3, 3)
