@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from .. import se2
 from ..arrays import Floats
 from ..errors import DataError
+from ..odometry.gyro_turns import GyroTurns
+from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
-from .gyro_turns import GyroTurns
 from .known_map import KnownMap
-from .odometer import Odometer
 from .pose_estimator import PoseEstimator
 from .range_update import RangeFacts
 from .records import LocalizerState, Scanner

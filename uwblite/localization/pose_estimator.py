@@ -11,10 +11,10 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .known_map import KnownMap
-from .odometer import Odometer
 from .range_likelihood import MOMENTS, bias_effect, range_moments
 from .range_update import RangeFacts, ranged, repeated
 from .records import LocalizerState

@@ -7,8 +7,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..odometry.attached import beam_origins
+from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting
-from .odometer import Odometer
 from .records import Scanner
 from .walls import Rays
 
