@@ -8,6 +8,7 @@ from uwblite.localization.comparison import PlaceSearch, _no_repetition
 from uwblite.localization.known_map import KnownAnchors, KnownMap
 from uwblite.localization.range_likelihood import range_errors
 from uwblite.localization.range_update import RangeFacts
+from uwblite.localization.search import UNIT
 from uwblite.localization.verdict import CERTAIN
 from uwblite.localization.window import Window, WindowRange
 
@@ -35,7 +36,8 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
     now = se2.compose(path[-1], driven)
     found = None
     while not places.idle:
-        found = places.advance(nobody, now)
+        found, work = places.advance(nobody, now)
+        assert work <= 2 * UNIT
     assert found is not None
     best = found.bank.poses[np.argmax(found.weight)]
     # Odometry and map have one frame here, and the ranges are exact.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.localization.odometer import Odometer
 from uwblite.localization.records import Scanner
 from uwblite.localization.sensing import LEAD, TRACK_RAYS, Range, Scan, Waiting, scan_rays
+from uwblite.odometry.odometer import Odometer
 from uwblite.sensor_log import SensorMounting
 
 MOUNTING = SensorMounting(T_base_laser=np.array([0.2, 0.05, 0.1]))

@@ -11,7 +11,7 @@ from . import hypotheses, likelihood_field, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .sensing import TRACK_RAYS
-from .walls import Rays
+from .walls import PER_FACTOR, PER_RAY, Rays
 from .window import Ranges, Window
 
 INDEPENDENT_RAYS = 15.0
@@ -24,10 +24,10 @@ _SIGMA_SCAN = (0.2, 0.2, 0.06)
 """m, m, rad; of a place that the search found by scans."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
-_AT_ONCE = 8
-"""Places whose rays are compared with the map at once, a unit of work of 3 ms."""
-_UNITS = 2
-"""Units of work of a step."""
+_AT_ONCE, _MATCHED_AT_ONCE = 8, 16
+"""Places whose rays are compared with the map at once, and that are matched by their scans at once."""
+_WORK = search.UNIT
+"""Operations of a step from which on it begins no further unit of work."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; limit of the area of the robot in a map without a grid."""
 
@@ -76,7 +76,7 @@ class PlaceSearch:
         self._odom = np.zeros(3)
         self._present = np.zeros((0, 3))
         """(h, 3) poses of the present hypotheses, as of that time."""
-        self._steps: Generator[None, None, Comparison] | None = None
+        self._steps: Generator[int, None, Comparison] | None = None
 
     @property
     def idle(self) -> bool:
@@ -97,8 +97,9 @@ class PlaceSearch:
         """Cancel a running search."""
         self._steps = None
 
-    def advance(self, bank: Hypotheses, odom: Floats) -> Comparison | None:
-        """Do some units of work; return how well each place explains the window's measurements, if that was the last unit.
+    def advance(self, bank: Hypotheses, odom: Floats) -> tuple[Comparison | None, int]:
+        """Do some units of work; return how well each place explains the window's measurements, if that was the last unit, and
+        the operations that were done.
 
         Parameters
         ----------
@@ -106,17 +107,18 @@ class PlaceSearch:
         odom : (3,) present pose in the odometry frame.
         """
         if self._steps is None:
-            return None
+            return None, 0
+        done = 0
         self._present = se2.compose(bank.poses, se2.between(odom, self._odom))
         try:
-            for _ in range(_UNITS):
-                next(self._steps)
+            while done < _WORK:
+                done += next(self._steps)
         except StopIteration as end:
             self._steps = None
-            return self._brought(end.value, bank, odom)
-        return None
+            return self._brought(end.value, bank, odom), done
+        return None, done
 
-    def _compared(self, ranges: Ranges, rays: Rays, ago: Floats) -> Generator[None, None, Comparison]:
+    def _compared(self, ranges: Ranges, rays: Rays, ago: Floats) -> Generator[int, None, Comparison]:
         """Search for places and weight them, and the present hypotheses, as of the search's beginning.
 
         Parameters
@@ -129,9 +131,11 @@ class PlaceSearch:
         """
         recent = rays.rows(ago <= _SEARCH_LOOKS)
         found = yield from search.places(self._field, recent, ranges, self._bounds)
-        yield
-        started = self._started(found.poses, ranges, recent)
-        yield
+        parts = []
+        for start in range(0, max(len(found.poses), 1), _MATCHED_AT_ONCE):
+            parts.append(self._started(found.poses[start : start + _MATCHED_AT_ONCE], ranges, recent))
+            yield hypotheses.MATCHES * PER_FACTOR * len(parts[-1]) * min(len(recent.hit), TRACK_RAYS)
+        started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
         weight = range_likelihood.range_likelihood(poses, ranges)
         fit, known = np.zeros((2, len(poses)))
@@ -140,7 +144,7 @@ class PlaceSearch:
                 part = slice(start, start + _AT_ONCE)
                 agreement = self.walls.agreement(poses[part], rays)
                 fit[part], known[part] = agreement.log_likelihood, agreement.known
-                yield
+                yield PER_RAY * len(poses[part]) * len(rays.hit)
             weight += INDEPENDENT_RAYS * (1.0 + float(ago.max())) * fit
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])

@@ -50,6 +50,8 @@ _INDEPENDENT = 20.0
 """Points of a scan whose errors are independent: those of one wall share the cells' rounding."""
 _GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 """m; gate and kernel width of each iteration of a scan's match."""
+MATCHES = len(_GATES)
+"""Iterations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

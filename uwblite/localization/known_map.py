@@ -10,9 +10,9 @@ from ..arrays import Floats
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult
+from ..radio.range_errors import RangeErrors, range_errors
 from ..sensor_log.anchor_names import last_places
 from .hypotheses import BIAS_SIGMA, SLOW_LEFT, SLOW_SIGMA
-from .range_errors import RangeErrors, range_errors
 from .walls import Walls, walls_of
 
 

@@ -141,7 +141,8 @@ class LiveFeed:
         silent = self.silence.silent(quiet)
         if not quiet:
             return replace(state, silent=silent) if silent else state
-        drift = np.diag(np.full(3, (UNSEEN_SPEED * quiet) ** 2))
+        away = UNSEEN_SPEED * quiet
+        drift = np.diag(np.square([away, away, min(away, np.pi)]))
         state = replace(state, age=quiet, silent=silent, covariance=state.covariance + drift)
         if quiet <= self._patience.lost:
             return state

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from .. import se2
 from ..arrays import Floats
 from ..errors import DataError
+from ..odometry.gyro_turns import GyroTurns
+from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from ..validation import as_array, require_shape, require_type
-from .gyro_turns import GyroTurns
 from .known_map import KnownMap
-from .odometer import Odometer
 from .pose_estimator import PoseEstimator
 from .range_update import RangeFacts
 from .records import LocalizerState, Scanner
@@ -33,6 +33,9 @@ _SET_BACK, _IN_A_ROW = 0.5, 4
 """s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
 
 
+_WORK = 4_000_000
+"""Operations of a step from which on it uses no further measurement: after a silence many are due at once, and where the pose
+is not known each is compared with many places."""
 _BEYOND = 1e8
 """m and rad; a pose or a heading farther from zero is invalid: differences between such numbers lose all digits."""
 
@@ -80,6 +83,11 @@ class Localizer:
         return self._waiting.refused + self._leaps
 
     @property
+    def work(self) -> int:
+        """Operations on elements of arrays in the last step: what a step costs, whatever else the computer does."""
+        return self._estimator.work
+
+    @property
     def ends(self) -> Floats:
         """(2,) numbers of rays on walls, and in known space, while the pose was known."""
         return self._estimator.ends.copy()
@@ -88,6 +96,7 @@ class Localizer:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
         stamp, *pose = _numbers(stamp=stamp, x=x, y=y, theta=theta)
         wheels = np.array(pose)
+        self._estimator.work = 0
         wheels[~(np.abs(wheels) < _BEYOND)] = np.nan
         stamp += self._clock_shift
         if stamp < self._measured - _SET_BACK:
@@ -137,6 +146,7 @@ class Localizer:
             raise DataError(f"anchor_ids must be a list of names, not {anchor_ids!r:.60}")
         if not 0 <= tag < len(self.mounting.tags):
             raise DataError(f"tag {tag} is none of the robot's {len(self.mounting.tags)} tags; they count from 0")
+        self._estimator.work = 0
         if len(anchor_ids) != len(values):
             raise DataError(f"{len(anchor_ids)} anchor ids for {len(values)} ranges; one id belongs to each range")
         good = plausible(values)
@@ -166,6 +176,7 @@ class Localizer:
             self.scanner, self._rays = scanner, 0
         self._rays = self._rays or len(readings)
         require_shape(readings, "ranges", (self._rays if len(readings) else 0,))
+        self._estimator.work = 0
         if self.scanner is not None and self.scanner.usable and self.known.walls is not None:
             for at, entry in self._scan_clock.take(stamp, self._measured, self._silences, (readings, self.scanner)):
                 scan = Scan(at + self.known.laser_delay, *entry)
@@ -215,12 +226,16 @@ class Localizer:
         due = self._waiting.reached(self._odometer.stamp)
         ranged = [until for until, entry in due if isinstance(entry, Range)]
         poses = dict(zip(ranged, self._odometer.at(np.array(ranged)), strict=True)) if ranged else {}
-        for until, entry in due:
+        free = not any(isinstance(entry, Scan) for _, entry in due)
+        for k, (until, entry) in enumerate(due):
+            if self._estimator.work > _WORK:
+                self._waiting.put_back(due[k:])
+                break
             if isinstance(entry, Scan):
                 self._estimator.use_scan(scan_rays(self._odometer, self._laser, entry))
             else:
                 self._use_range(entry, until, poses[until])
-        self._estimator.search_or_check(free=not any(isinstance(entry, Scan) for _, entry in due))
+        self._estimator.search_or_check(free=free)
 
     def _bridge_silence(self) -> None:
         """Where the odometry is silent, let the robot stand, and increase the uncertainty of the pose."""

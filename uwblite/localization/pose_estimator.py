@@ -11,15 +11,15 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .known_map import KnownMap
-from .odometer import Odometer
-from .range_likelihood import bias_effect, range_moments
+from .range_likelihood import MOMENTS, bias_effect, range_moments
 from .range_update import RangeFacts, ranged, repeated
 from .records import LocalizerState
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
-from .walls import Rays
+from .walls import PER_FACTOR, PER_RAY, Rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 _FRESH_WAY = 0.1
@@ -53,6 +53,8 @@ class PoseEstimator:
         self.known = known
         self.ends = np.zeros(2)
         """Of rays on walls, and in known space, while the pose was known."""
+        self.work = 0
+        """Operations on elements of arrays since the caller last set it to 0."""
         self._odometer = odometer
         self._bank = hypotheses.none(len(known.anchors.ids))
         self._places = PlaceSearch(known)
@@ -76,6 +78,7 @@ class PoseEstimator:
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
         self._bank = hypotheses.moved(self._bank, step, 0.0, self.known.anchors.slow_sigma)
+        self.work += 4 * self._bank.covariance.size * self._bank.mean.shape[1]
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
@@ -97,6 +100,7 @@ class PoseEstimator:
         share = 1.0 / repeated(fact, self._way - self._range_way[fact.anchor])
         self._range_way[fact.anchor] = self._way
         bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm, share)
+        self.work += 8 * bank.covariance.size
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
         self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
@@ -117,6 +121,7 @@ class PoseEstimator:
         self._bank = hypotheses.matched(before, walls, rays, fresh, found=self._certain)
         some = turned.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
+        self.work += len(before) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
@@ -140,7 +145,8 @@ class PoseEstimator:
             self._lose("the ranges do not fit what was measured before; was the robot carried?")
         odom = self._odometer.pose
         if free and not self._places.idle:
-            compared = self._places.advance(self._bank, odom)
+            compared, done = self._places.advance(self._bank, odom)
+            self.work += done
             if compared is None:
                 return
             if not self._certain:
@@ -230,6 +236,7 @@ class PoseEstimator:
         fit, known, ranges = float(found.fit[best]), float(found.known[best]), found.ranges
         fitting = verdict.agreeing(self._bank.poses[best], ranges)
         if known < (verdict.FEW_BESIDE if proven and fitting.anchors >= 3 else verdict.FEW_ENDS) and len(ranges):
+            self.work += MOMENTS
             pose, covariance = range_moments(self._bank.poses[best], ranges)
             effect = bias_effect(pose[None], ranges, len(self.known.anchors.ids))
             self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)

@@ -9,12 +9,16 @@ from .window import Ranges
 _INDEPENDENT = 0.5
 """Share of the window's ranges that count as independent: they are a quarter of a metre apart, and a part of their errors is
 correlated over 1.5 m."""
+PER_RANGE = 25
+"""Operations on elements of arrays for the likelihood of a range at a pose."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
 _AT_ONCE = 512
 """Poses of the lattice whose ranges fit into the processor's cache."""
 _MOST_MOMENTS = 40
-"""Most ranges from which moments are computed, to bound the time."""
+"""Most ranges from which moments are computed, to bound the work."""
+MOMENTS = PER_RANGE * _MOST_MOMENTS * 17 * 17 * 9
+"""Operations for the moments."""
 
 
 def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:

@@ -7,9 +7,9 @@ from scipy.special import ndtr
 
 from .. import se2
 from ..arrays import Floats
+from ..radio.range_errors import RangeErrors
 from ..radio.tag_pattern import pattern_waves
 from .hypotheses import FIRST_ANCHOR, PATTERN, Hypotheses, symmetric
-from .range_errors import RangeErrors
 
 _TAIL, _DETOUR, _WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0
 """Share of ranges with a detour and its mean, m; share of gross errors and their width, m: the mixture of radio.nlos_mixture.

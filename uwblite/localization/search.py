@@ -7,8 +7,8 @@ ICRA 2016); unlike there, all poses near the best score are kept, not the best a
 not decided here. Where no wall is visible, headings and places are tried by the ranges alone. What is found is refined and
 compared by all measurements of the window.
 
-The functions are generators that pause after every unit of work, a few thousand places: a caller that must keep pace with a
-lidar does some units between two scans.
+The functions are generators that pause after every unit of work and yield its operations, those on one element of an array:
+a caller that must keep pace with a lidar does a few units between two scans.
 """
 
 from collections.abc import Generator
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .likelihood_field import CELL, FARTHEST, LEVELS, Field
-from .range_likelihood import range_likelihood, refined_by_ranges
+from .range_likelihood import PER_RANGE, range_likelihood, refined_by_ranges
 from .walls import Rays
 from .window import Ranges
 
@@ -48,8 +48,12 @@ class Places:
     """No equally good place was left out."""
 
 
-Steps = Generator[None, None, Places]
-"""A running search; it pauses after every unit of work and returns its result."""
+Steps = Generator[int, None, Places]
+"""A running search; it yields the operations of every unit of work and returns its result."""
+UNIT = 1_000_000
+"""Operations of a unit of work at most: 1 to 2 ms on one core."""
+_PER_POINT, _PER_PLACE = 3, 10
+"""Operations for a point of a scan at a place, and for a range to a place."""
 
 
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
@@ -96,9 +100,8 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
     if not len(rows):
         return Places(np.zeros((0, 3)), False)
-    yield
     offsets = _offsets(field, points, headings)
-    yield
+    yield _PER_PLACE * offsets.size
     nodes = yield from _top_nodes(len(headings), rows, cols)
     complete, least = True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
@@ -108,7 +111,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
         if len(kept) > _MOST_NODES:
             complete = False
             kept = kept[np.argpartition(-scores[kept], _MOST_NODES)[:_MOST_NODES]]
-            yield
+            yield from _pause(len(scores))
         nodes = _children(nodes[kept], 2 ** (level - 1))
         yield from _pause(len(nodes))
         scores = yield from _scored(field, level - 1, offsets, nodes)
@@ -134,13 +137,13 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     for start in range(0, len(tried), _RANGED_AT_ONCE):
         part = slice(start, start + _RANGED_AT_ONCE)
         weight[part] += range_likelihood(tried[part], few, wider=0.5 * CELL)
-        yield
+        yield PER_RANGE * len(few) * len(tried[part])
     order = np.argsort(-weight, kind="stable")
     order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
     return (yield from _distinct(tried[order], complete and len(tried) == len(poses)))
 
 
-def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[None, None, NDArray[np.int32]]:
+def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[int, None, NDArray[np.int32]]:
     """Return every heading with every square of the coarsest level, as nodes (n, 3): heading, row, column."""
     nodes = np.empty((headings, len(rows), 3), dtype=np.int32)
     at_once = max(1, _MANY // len(rows))
@@ -159,7 +162,7 @@ def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     return cells[..., 1] * field.free.shape[1] + cells[..., 0]
 
 
-def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -> Generator[None, None, Floats]:
+def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -> Generator[int, None, Floats]:
     """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
@@ -168,7 +171,7 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
         heading, row, col = nodes[part].T.astype(np.intp)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
         scores[part] = values.sum(axis=1, dtype=np.intp) / (255.0 * offsets.shape[1])
-        yield
+        yield _PER_POINT * values.size
     return scores
 
 
@@ -176,7 +179,7 @@ _AT_ONCE = 4096
 """Nodes scored at once, a unit of work of 2 ms, so that they fit into the processor's cache."""
 
 
-def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats) -> Generator[None, None, float]:
+def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats) -> Generator[int, None, float]:
     """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
     best = nodes[_highest(scores)]
     yield from _pause(len(scores))
@@ -188,14 +191,14 @@ def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], sco
     return float(found.max(initial=0.0))
 
 
-def _pause(count: int) -> Generator[None, None, None]:
+def _pause(count: int) -> Generator[int, None, None]:
     """Pause after work on so many nodes or poses, if that was a unit of work by itself."""
     if count > _MANY:
-        yield
+        yield count
 
 
-_CENTRES_AT_ONCE = 400_000
-"""Places times ranges that are compared at once, a unit of work of 2 ms."""
+_CENTRES_AT_ONCE = UNIT // _PER_PLACE
+"""Places times ranges that are compared at once."""
 _MANY = 20_000
 """Nodes or poses that take a millisecond or so to make, to compare or to sort."""
 
@@ -213,7 +216,7 @@ def _children(nodes: NDArray[np.int32], half: int) -> NDArray[np.int32]:
     return (nodes[:, None] + shift).reshape(-1, 3)
 
 
-def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[None, None, Bools]:
+def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[int, None, Bools]:
     """Return where (n,) the robot may be by its ranges alone, for any heading, within a half width of a place, m.
 
     The tag was within |t| of its present place: a range disagrees if it is off by more than that, the cell and four sigmas.
@@ -231,7 +234,7 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[None, Non
         # A range that is one metre off counts like one that is ten metres off.
         cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
         if k % at_once == at_once - 1:
-            yield
+            yield _PER_PLACE * at_once * len(centre)
     return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
 
 
@@ -249,12 +252,15 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     for start in range(0, len(poses), _RANGED_AT_ONCE):
         part = slice(start, start + _RANGED_AT_ONCE)
         cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
-        yield
+        yield PER_RANGE * len(few) * len(cost[part])
     order = np.flatnonzero(cost <= cost.min(initial=np.inf) + _RANGE_RIVAL)
     order = order[np.argsort(cost[order], kind="stable")]
     tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
-    yield
-    return (yield from _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS))
+    for start in range(0, len(tried), _REFINED_AT_ONCE):
+        part = slice(start, start + _REFINED_AT_ONCE)
+        tried[part] = refined_by_ranges(tried[part], ranges)
+        yield _PER_REFINED * len(tried[part]) * len(ranges)
+    return (yield from _distinct(tried, 0 < len(order) <= _MOST_RIVALS))
 
 
 def _some(ranges: Ranges) -> Ranges:
@@ -265,7 +271,9 @@ def _some(ranges: Ranges) -> Ranges:
 _PER_SCORE = 30.0
 """Log-likelihood by which a score of 1 is better than one of 0: of fifteen rays, each about ten times likelier on a wall."""
 _RANGED_AT_ONCE, _MOST_RIVALS = 1024, 4096
-"""Poses that are tried at once, a unit of work of 2 ms, and that may be as good before the search is not complete."""
+"""Poses that are tried at once, and that may be as good before the search is not complete."""
+_REFINED_AT_ONCE, _PER_REFINED = 8, 8 * 60
+"""Poses that are refined at once, and operations for a range in eight iterations of that."""
 _RANGE_RIVAL = 12.0
 """Log-likelihood by which a place may be worse than the best one before it is refined."""
 
@@ -280,8 +288,8 @@ def _distinct(poses: Floats, complete: bool) -> Steps:
         x, y, turn = (left - left[0]).T
         left = left[(np.hypot(x, y) > _SAME[0]) | (np.abs(se2.wrap_angle(turn)) > _SAME[1])]
         if done > _MANY:
+            yield _PER_PLACE * done
             done = 0
-            yield
     return Places(kept, complete and not len(left))
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..odometry.attached import beam_origins
+from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting
-from .odometer import Odometer
 from .records import Scanner
 from .walls import Rays
 
@@ -64,6 +64,10 @@ class Waiting:
         """Keep a measurement until the odometry has reached a time, s."""
         if np.isfinite(until):
             self._entries.append((until, entry))
+
+    def put_back(self, entries: list[tuple[float, Range | Scan]]) -> None:
+        """Keep measurements that were reached for the next step."""
+        self._entries = entries + self._entries
 
     def latest(self, now: float) -> float:
         """Return until when sensors have measured, s, where the odometry's last stamp is now; -inf = not beyond it."""

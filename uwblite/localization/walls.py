@@ -17,6 +17,8 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from ..lidar.point_cloud import Lines, estimate_normals, make_tree
 
+PER_RAY, PER_FACTOR = 140, 45
+"""Operations on elements of arrays for the agreement of a ray with the map at a pose, and for its quadratic form."""
 REACH = 0.5
 """m; largest distance of a neighbouring wall."""
 _NORMAL_RADIUS = 0.2

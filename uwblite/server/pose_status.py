@@ -42,10 +42,12 @@ class PoseStatus:
             self._trail.append(state.pose[:2].round(2).tolist())
         sigma = np.sqrt(np.diag(state.covariance))
         place = f", known to {math.hypot(sigma[0], sigma[1]):.2f} m" if np.isfinite(sigma).all() and not state.lost else ""
-        advice = [f"the pose is not known: {state.reason or 'drive on, past walls and anchors'}"] if state.lost else []
+        advice = []
         if state.age:
-            advice.insert(0, f"the pose is {state.age:.0f} s old: no data; is the recorder still running?")
+            advice.append(f"the pose is {state.age:.0f} s old: no data; is the recorder still running?")
         else:
+            if state.lost:
+                advice.append(f"the pose is not known: {state.reason or 'drive on, past walls and anchors'}")
             advice += [f"nothing from {name} for {age:.0f} s: {CONSEQUENCES[name]}" for name, age in state.silent.items()]
         age = f"{state.age:.0f} s old, " if state.age else ""
         moved = "has been moved since the map was made, or its line of sight is blocked"

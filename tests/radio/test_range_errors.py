@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwblite.localization.range_errors import range_errors
+from uwblite.radio.range_errors import range_errors
 
 WHITE = 0.04
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
-from ..odometry.gyro import GAP, bias_of, reading_of
 from ..sensor_log import Gyro, Odometry
+from .gyro import GAP, bias_of, reading_of
 
 _SECONDS = 60.0
 """s; length of the time that is compared."""

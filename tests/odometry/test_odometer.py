@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.localization.odometer import Odometer
+from uwblite.odometry.odometer import Odometer
 
 
 def driven(count, period=0.1, speed=0.4, turn=0.3):

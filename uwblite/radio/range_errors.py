@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ..arrays import Floats, Ints, spread
-from ..radio.range_noise import RangeNoise, RangeNoiseConfig, learn
-from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA, pattern_waves
+from .range_noise import RangeNoise, RangeNoiseConfig, learn
+from .tag_pattern import HARMONICS, PATTERN_SIGMA, pattern_waves
 
 _CONSTANT = 0.1
 """m; common error of the ranges to one anchor, everywhere."""
