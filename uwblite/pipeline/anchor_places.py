@@ -112,7 +112,7 @@ def _radios(estimate: Estimate, task: Task) -> list[_Radio]:
         rows = rows[np.lexsort((ranges.stamps[rows], recording[rows]))]
         if not len(rows):
             continue
-        some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MovePolicy.most_ranges)).round().astype(np.int64))
+        some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MovePolicy.most_ranges)).round().astype(np.intp))
         own = rows[some]
         unknown = ranges.calibration[own[0], 2] >= 0
         height = float(np.sqrt(max(values[own[0], 2], 0.0)))

@@ -17,7 +17,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
     # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
     heard = np.flatnonzero(ranges.ranges > 0.0)
-    counts = np.zeros((len(names), number), dtype=np.int64)
+    counts = np.zeros((len(names), number), dtype=np.intp)
     np.add.at(counts, (ranges.anchor[heard], recording_of[ranges.pose[heard]]), 1)
     for k in np.flatnonzero(estimate.placed).tolist():
         present = counts[names == names[k]].sum(axis=0) > 0

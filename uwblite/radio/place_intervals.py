@@ -112,7 +112,7 @@ class PlaceModel:
 
     def one_place(self) -> Explanation:
         """Return the explanation by one place, at the likeliest height."""
-        none, height = np.zeros(len(self.track.ranges), dtype=np.int64), self.track.heights[0]
+        none, height = np.zeros(len(self.track.ranges), dtype=np.intp), self.track.heights[0]
         return self.explanation(none, self.likeliest(height, [slice(None)]), height, self.worth(none))
 
     def worth(self, place: Ints) -> Floats:
@@ -227,7 +227,7 @@ class PlaceModel:
         level, shares = self.track.level(best.height), self.worth(best.place)[own]
         alone = float(shares @ self._likely(level, best.found[int(best.place[own[0]])], own))
         new = np.flatnonzero(np.diff(self.track.recording[own])) + 1
-        starts = np.union1d(np.linspace(least, len(own) - least, MovePolicy.splits).astype(np.int64), new)
+        starts = np.union1d(np.linspace(least, len(own) - least, MovePolicy.splits).astype(np.intp), new)
         waiting = {(k, k) for k in starts.tolist() if least <= k <= len(own) - least}
         split: tuple[float, tuple[int, int], list[AnchorHypothesis]] = (alone, (0, 0), [])
         tried: set[tuple[int, int]] = set()
