@@ -42,6 +42,10 @@ class Finding:
         return self.text
 
 
+WHEELS_AGAINST_LIDAR = "wheels-against-lidar"
+"""Kind of a finding of which only a map can tell whether it is a doubt."""
+
+
 def doubt(kind: str, text: str, **figures: Any) -> Finding:
     """Return a reason not to trust the result."""
     return Finding(kind, DOUBT, text, figures=figures)

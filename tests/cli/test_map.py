@@ -175,7 +175,7 @@ def test_a_dry_run_maps_and_writes_nothing(short_log, tmp_path, monkeypatch, cap
 
 @pytest.mark.slow
 def test_check_of_the_sample(room_log, capsys):
-    assert main(["check", str(room_log)]) == 0
+    assert main(["check", str(room_log), "--map"]) == 0
     text = capsys.readouterr().out
     assert "bias guess" in text
     assert "next: uwblite map" in text
@@ -186,19 +186,19 @@ def test_check_of_the_sample(room_log, capsys):
 
 def test_there_is_nothing_to_complain_about_in_what_the_readme_cuts_off_the_sample(room_log, tmp_path, capsys):
     assert main(["convert", str(room_log), str(tmp_path / "run.log"), "--end", "60", "-q"]) == 0
-    assert main(["check", str(tmp_path / "run.log"), "--quick"]) == 0
+    assert main(["check", str(tmp_path / "run.log")]) == 0
     assert "nothing to complain about" in capsys.readouterr().out
 
 
 def test_check_shows_programs_figures_and_cost(short_log, capsys):
-    assert main(["check", str(short_log), "--json", "--quick"]) == 0
+    assert main(["check", str(short_log), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["figures"]["lidar"]["beams"] == 682
     assert summary["expected cost of map"]["megabytes"] > 50
 
 
 def test_check_exits_with_3_where_a_finding_spoils_the_map(minute_log, capsys):
-    assert main(["check", str(minute_log), "--laser-flipped", "--quick"]) == 3
+    assert main(["check", str(minute_log), "--laser-flipped"]) == 3
     assert "mounted upright" in capsys.readouterr().out
 
 

@@ -42,7 +42,7 @@ def folder(tmp_path_factory, room_log):
 
 
 @pytest.mark.parametrize(
-    "words", ["--help", "--version", "map --help", "config", "check small.log --quick", "check small.log --quick --json"]
+    "words", ["--help", "--version", "map --help", "config", "check small.log", "check small.log --json"]
 )
 def test_a_full_stdout_is_one_line(folder, words):
     code, _, output = shell(f"$UWBLITE {words} >/dev/full", folder)
@@ -53,7 +53,7 @@ def test_a_full_stdout_is_one_line(folder, words):
 @pytest.mark.parametrize(
     ("words", "code", "streams"), [
         (words, code, streams)
-        for words, code in (("--help", 0), ("config", 0), ("check small.log --quick", 0), ("frob", 2), ("check none", 1))
+        for words, code in (("--help", 0), ("config", 0), ("check small.log", 0), ("frob", 2), ("check none", 1))
         for streams in (">&-", "2>&-", ">&- 2>&-", "2>/dev/full", ">&- 2>/dev/full <&-")
         # What loads numpy takes a second.
         if " small" not in words or streams.startswith(">&- 2")
@@ -80,7 +80,7 @@ def test_closed_standard_input_is_one_line(folder):
 @pytest.mark.slow
 def test_names_that_are_no_text_reach_no_terminal_and_spoil_no_result(folder):
     name = os.fsdecode(HOSTILE)
-    for command in ('$UWBLITE check "$NAME" --quick', '$UWBLITE map "$NAME" --out "$OUT" --force', '$UWBLITE check "$NAME.x"'):
+    for command in ('$UWBLITE check "$NAME"', '$UWBLITE map "$NAME" --out "$OUT" --force', '$UWBLITE check "$NAME.x"'):
         code, out, output = shell(command, folder, NAME=name, OUT=os.fsdecode(b"o\xff\x1bc"))
         assert code in (0, 1, 3), output
         assert (out + output).decode().replace("\n", "").isprintable()

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
-from ..findings import WARNING, Finding, doubt, kinds, of_severity, warning
+from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, of_severity, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.progress import WHEELS_AGAINST_LIDAR, of_recordings
+from ..pipeline.progress import of_recordings
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .certainty import allowed_error
 

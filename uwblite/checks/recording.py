@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..errors import DataError
-from ..findings import DOUBT
+from ..findings import DOUBT, WHEELS_AGAINST_LIDAR
 from ..findings import Finding as MapFinding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.screen import screen
@@ -90,7 +90,9 @@ def _check_screening(log: SensorLog, doubts: tuple[MapFinding, ...] | None, foun
     if not sensors:
         found.serious("log", "neither ranges nor scans are left to constrain the trajectory", "odometry alone drifts")
     for remark in screening.findings if screening is not None else ():
-        if remark.severity == DOUBT and (doubts is None or remark.kind in {doubt.kind for doubt in doubts}):
+        if remark.kind == WHEELS_AGAINST_LIDAR and doubts is None:
+            found.warning("log", remark.text, "a map is doubted for it, unless its ranges agree with the lidar there")
+        elif remark.severity == DOUBT and (doubts is None or remark.kind in {doubt.kind for doubt in doubts}):
             found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")

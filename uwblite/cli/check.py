@@ -15,6 +15,7 @@ HELP = "say what is wrong with a recording and what to do about it, before mappi
 EPILOG = """\
 examples:
   uwblite check run.log                    findings, worst first; exit code 3 where one spoils the map
+  uwblite check run.log --map              also what only a map can tell; takes as long as one
   uwblite check run.log.gz --json          the same for a script
   uwblite check run.log --laser-flipped    does the laser agree with the wheels that way?
 """
@@ -24,8 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    text = "make no map: no scales and biases, no doubts of a map, a coarser estimate of the time"
-    parser.add_argument("--quick", action="store_true", help=text)
+    text = "map it as well: scales, biases, clock offsets and the doubts of that map; takes as long as a map"
+    parser.add_argument("--map", action="store_true", help=text)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
 
@@ -39,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     from .options import apply_mounting, bag_choices
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
-    diagnosis, seconds = (diagnose(log), model_seconds(log)) if args.quick else examined(log)
+    diagnosis, seconds = examined(log) if args.map else (diagnose(log), model_seconds(log))
     cost = expected_cost(log, seconds)
-    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost))
+    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost, mapped=args.map))
     return 3 if diagnosis.serious else 0
 
 
@@ -91,7 +92,7 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> d
     }
 
 
-def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> list[str]:
+def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, mapped: bool = True) -> list[str]:
     """Return the findings and figures as lines of text."""
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
     for finding in diagnosis.findings:
@@ -103,6 +104,8 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> l
     if cost:
         grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
         lines.append(f"expected cost: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
+    if not mapped:
+        lines.append(_ONLY_A_MAP)
     serious = len(diagnosis.serious)
     lines.append(
         f"fix the {serious} serious finding{'s' if serious > 1 else ''} first"
@@ -110,6 +113,12 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> l
         else f"next: uwblite map {name} --out map/"
     )
     return lines
+
+
+_ONLY_A_MAP = (
+    "only a map tells: scales, biases and clock offsets; anchors that moved or have a mirror image; whether the sensors agree "
+    "throughout (--map here, or `uwblite map`)"
+)
 
 
 def _counts(figures: dict[str, Any]) -> str:

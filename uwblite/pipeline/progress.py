@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ..errors import Cancelled
-from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
+from ..findings import DOUBT, WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, of_severity, warning
 from ..graph.solver import SolverSummary
 from ..map_result import StageSummary
 from ..sensor_log import SensorLog
@@ -88,10 +88,6 @@ def of_recordings(logs: Sequence[SensorLog]) -> list[Finding]:
         own = () if log.screening is None else log.screening.findings
         found += [replace(finding, text=where + finding.text, recording=number + 1) for finding in own]
     return found
-
-
-WHEELS_AGAINST_LIDAR = "wheels-against-lidar"
-"""Kind of a finding of which the map may show that it is a warning only."""
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:
