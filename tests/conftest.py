@@ -13,6 +13,9 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 """Real recordings under other licences; they are no part of this repository."""
 
+os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / ".hypothesis"))
+# What tests start finds this package and no other, from any folder.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
 # A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -29,6 +32,17 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="slow; run with --slow"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def started_here(tmp_path_factory):
+    """An empty folder, in which all tests start, whatever lies in the user's own; none leaves anything there."""
+    folder, before = tmp_path_factory.mktemp("started_here"), Path.cwd()
+    os.chdir(folder)
+    yield folder
+    os.chdir(before)
+    left = sorted(p.name for p in folder.iterdir())
+    assert not left, f"tests have left {left} in the folder they were started in"
 
 
 @pytest.fixture(scope="session")
