@@ -2,6 +2,8 @@
 
 import os
 import signal
+import time
+from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -12,7 +14,11 @@ from hypothesis import HealthCheck, settings
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 """Real recordings under other licences; they are no part of this repository."""
+ABSENT = "real recordings, whose licences keep them out of this repository (UWBLITE_SHARED_DATA names their folder)"
 
+os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / ".hypothesis"))
+# What tests start finds this package and no other, from any folder.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
 # A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -24,18 +30,61 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    if config.getoption("--slow"):
-        return
-    for item in items:
-        if "slow" in item.keywords:
-            item.add_marker(pytest.mark.skip(reason="slow; run with --slow"))
+    if not config.getoption("--slow"):
+        slow = [item for item in items if "slow" in item.keywords]
+        items[:] = [item for item in items if "slow" not in item.keywords]
+        config.hook.pytest_deselected(items=slow)
+
+
+def pytest_configure(config):
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        config.pluginmanager.register(Remaining(config))
+
+
+class Remaining:
+    """Says now and then how much of the tests is done, and how long the rest will take."""
+
+    def __init__(self, config):
+        self.config, self.done, self.began, self.said = config, 0, None, 0.0
+
+    def pytest_sessionstart(self, session):
+        self.session = session
+
+    def pytest_runtest_logfinish(self):
+        now = time.monotonic()
+        if self.began is None:
+            self.began = self.said = now
+        self.done += 1
+        if now - self.said < SAID_EVERY or self.done >= self.session.testscollected:
+            return
+        self.said = now
+        left = (now - self.began) * (self.session.testscollected / self.done - 1.0)
+        reporter = self.config.pluginmanager.get_plugin("terminalreporter")
+        reporter.ensure_newline()
+        share = self.done / self.session.testscollected
+        reporter.write_line(f"{share:.0%} of {self.session.testscollected} tests, about {max(round(left / 60), 1)} min to go")
+
+
+SAID_EVERY = 20.0
+"""s."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def started_here(tmp_path_factory):
+    """An empty folder, in which all tests start, whatever lies in the user's own; none leaves anything there."""
+    folder, before = tmp_path_factory.mktemp("started_here"), Path.cwd()
+    os.chdir(folder)
+    yield folder
+    os.chdir(before)
+    left = sorted(p.name for p in folder.iterdir())
+    assert not left, f"tests have left {left} in the folder they were started in"
 
 
 @pytest.fixture(scope="session")
 def shared_data():
     """Folder with real recordings; the test is skipped where it is absent."""
     if not SHARED.is_dir():
-        pytest.skip(f"real recordings absent: {SHARED}")
+        pytest.skip(ABSENT)
     return SHARED
 
 
@@ -93,7 +142,9 @@ def log(room_log):
     return read_log(room_log)
 
 
-def pytest_terminal_summary(terminalreporter):
-    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "recordings absent" in str(report.longrepr)]
-    if skipped:
-        terminalreporter.write_sep("!", f"{len(skipped)} tests on real recordings SKIPPED: {SHARED} is absent", yellow=True)
+def pytest_terminal_summary(terminalreporter, config):
+    reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in terminalreporter.stats.get("skipped", []))
+    if reasons:
+        terminalreporter.write_line("skipped: " + "; ".join(f"{count} for {why}" for why, count in reasons.most_common()))
+    if not config.getoption("--slow"):
+        terminalreporter.write_line("slow tests are left out; --slow runs them too")

@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -97,10 +98,14 @@ def prepared(tmp_path_factory):
         for words in commands(text):
             if words[0] == "uwblite":
                 assert main(words[1:]) == 0
+            elif words[0] == "cd":
+                monkeypatch.chdir(words[1])
             else:
                 subprocess.run(words, check=True)
+        # What git ignores is all that the documents' commands leave in a clone.
+        assert {p.name for p in folder.iterdir()} == {"tests", "out"}
         assert main(["map", "run.log", "--out", "map", "-q"]) == 0
-    return folder
+        return Path.cwd()
 
 
 @pytest.fixture
@@ -135,6 +140,7 @@ def test_every_command_runs(document, prepared, workspace, capsys):
                 continue
             if words == [".", ".venv/bin/activate"]:
                 continue
+            assert words[0] != "cd", "the documents stay in the folder of the README"
             allowed = (0, 3) if words[1:2] in (["map"], ["check"]) else (0,)
             if words[0] == "uwblite":
                 code, output = main(words[1:]), capsys.readouterr()

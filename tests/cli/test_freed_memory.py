@@ -66,9 +66,9 @@ def test_without_proc_it_is_given_back_where_a_stage_is_over(monkeypatch, tmp_pa
     assert trimmed == [0, 0]
 
 
-def test_memory_is_given_back_within_and_between_the_stages_of_a_map(monkeypatch, room_log, tmp_path):
+def test_memory_is_given_back_within_and_between_the_stages_of_a_map(monkeypatch, short_log, tmp_path):
     times = []
     monkeypatch.setattr(freed_memory.FreedMemory, "give_back", lambda self, *, over: times.append(over))
-    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "-q"]) in (0, 3)
+    assert main(["map", str(short_log), "--out", str(tmp_path / "map"), "-q"]) in (0, 3)
     assert sum(times) > 10
     assert not all(times)

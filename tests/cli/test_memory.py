@@ -18,6 +18,7 @@ def system(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "_PROC", str(tmp_path / "proc"))
     monkeypatch.setattr(memory, "_CGROUPS", str(tmp_path / "cgroup"))
     monkeypatch.setattr(memory, "address_space", lambda: 0)
+    monkeypatch.setattr(sys, "maxsize", (1 << 63) - 1)
 
     def write(name, text):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -77,6 +78,12 @@ def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeyp
     page = memory._pages()[0] // 61_000
     assert memory.shortage(299.0 - 60_000 * page / 1e6) is None
     assert "ulimit -v" in memory.shortage(301.0 - 60_000 * page / 1e6).text
+
+
+def test_a_system_of_32_bits_addresses_so_much(system, monkeypatch):
+    monkeypatch.setattr(sys, "maxsize", (1 << 31) - 1)
+    assert sizes() == [1 << 31]
+    assert "32-bit" in memory.shortage(3000.0).text
 
 
 def limited(monkeypatch, size):

@@ -71,9 +71,16 @@ def test_an_earlier_log_is_not_touched(tmp_path, monkeypatch):
     assert (tmp_path / "taken.log").read_text() == "precious"
 
 
-def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path):
+def test_a_port_that_is_not_there_yet_is_waited_for_where_that_is_wanted(tmp_path, capfd):
     out = tmp_path / "run.log"
-    assert main(["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "2"]) == 3
+    words = ["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "0.3"]
+    assert main(words) == 1
+    said = capfd.readouterr().err
+    assert "ttyLATER: no such port" in said
+    assert "--wait" in said
+    assert said.count("\n") == 1
+    assert not out.exists()
+    assert main([*words, "--wait"]) == 3
     assert "no such port" in out.read_text()
 
 
@@ -105,7 +112,7 @@ def test_a_page_that_ends_does_not_end_the_recording(tmp_path, monkeypatch, capf
     monkeypatch.setattr(FakeChild, "made", ())
     out = tmp_path / "run.log"
     port = str(tmp_path / "ttyLATER")
-    assert main(["record", "--lidar", port, "--out", str(out), "--duration", "0.3", "--watch", *value]) == 3
+    assert main(["record", "--lidar", port, "--out", str(out), "--duration", "0.3", "--wait", "--watch", *value]) == 3
     output = capfd.readouterr().err
     assert f"http://{address}/" in output
     assert "the page has ended: Address already in use; the recording goes on" in output
@@ -122,7 +129,7 @@ def test_without_processes_the_recording_goes_on(tmp_path, monkeypatch, capfd):
 
     monkeypatch.setattr("uwblite.cli.child.Child", refuse)
     out = tmp_path / "run.log"
-    assert main(["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--duration", "0.3", "--watch"]) == 3
+    assert main(["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--duration", "0.3", "--wait", "--watch"]) == 3
     assert "no page" in capfd.readouterr().err
 
 
@@ -132,7 +139,7 @@ def test_a_recorder_with_its_page_ends_both(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    words = ["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--watch", str(port)]
+    words = ["record", "--lidar", str(tmp_path / "no"), "--wait", "--out", str(out), "--watch", str(port)]
     process = subprocess.Popen([sys.executable, "-m", "uwblite", *words], cwd=ROOT, stderr=subprocess.PIPE)
     try:
         for _ in range(100):
@@ -193,6 +200,13 @@ def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
     output = capfd.readouterr()
     assert "all is well" not in output.err + output.out
     assert "devices /dev/ttyS0" in output.out
+    assert "no USB device is plugged in" in output.err
+
+
+def test_with_a_usb_device_nothing_is_said_to_be_missing(monkeypatch, capfd):
+    monkeypatch.setattr(ports, "plugged_in", lambda: [ports.PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")])
+    assert main(["devices", "--list"]) == 0
+    assert "no USB device" not in capfd.readouterr().err
 
 
 def test_every_kind_of_device_is_listed_with_its_options(capfd):

@@ -1,6 +1,7 @@
 """Optimisations one after another are those of each alone, whatever changes in between; only new patterns are analysed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,3 +46,14 @@ def test_each_is_solved_as_alone_and_what_has_the_same_pattern_is_analysed_once(
 def test_a_graph_without_measurements_is_refused():
     with pytest.raises(SolverError, match="no edges"):
         Optimizer().optimize(replace(GRAPH, edges=()), SolverConfig())
+
+
+def test_pairs_of_more_poses_than_the_root_of_what_32_bits_hold_are_told_apart():
+    """A pair is sorted as one number, low * count + high, which is 3.6e9 here."""
+    many = 60_000
+    low, high = np.array([0, 59_998, 40_000, 59_998]), np.array([1, 59_999, 50_000, 59_999])
+    touched = [[(low, False), (high, False)]]
+    pairs, (which,) = NormalEquations._pairs(SimpleNamespace(_values=many), touched, many)
+    assert pairs[many:].tolist() == [[0, 1], [40_000, 50_000], [59_998, 59_999]]
+    assert pairs[which].tolist() == np.stack([low, high], axis=1).tolist()
+    assert pairs.dtype == which.dtype == np.intp

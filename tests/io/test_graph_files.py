@@ -31,8 +31,8 @@ def roots(rng, count, size):
 
 
 def relative(rng, poses, count):
-    i = rng.integers(0, len(poses) - 1, count)
-    j = i + rng.integers(1, len(poses) - i)
+    i = rng.integers(0, len(poses) - 1, count, dtype=np.intp)
+    j = i + rng.integers(1, len(poses) - i, dtype=np.intp)
     noise = 0.05 * rng.normal(size=(count, 3))
     return i, j, se2.compose(se2.between(poses[i], poses[j]), noise)
 
@@ -45,7 +45,7 @@ def plain_graph(seed=0, poses=9, anchors=3):
     i, j, T = relative(rng, X, 14)
     steps = np.arange(poses - 1)
     chain = RelativePoseEdges(steps, steps + 1, se2.between(X[:-1], X[1:]), roots(rng, poses - 1, 3))
-    pose, anchor = rng.integers(0, poses, 20), rng.integers(0, anchors, 20)
+    pose, anchor = rng.integers(0, poses, 20, dtype=np.intp), rng.integers(0, anchors, 20, dtype=np.intp)
     apart = np.hypot(*(X[pose, :2] - A[anchor]).T) + 0.1 * rng.normal(size=20)
     none, flat = np.full((20, 6), -1), np.zeros((20, 2))
     sigma, zero = rng.uniform(0.1, 0.3, 20), np.zeros(20)
@@ -78,7 +78,7 @@ def calibrated_graph(seed=0):
     )
     twist = rng.normal(size=(2, 8, 3))
     scans = ScanEdges(i, j, T, roots(rng, 8, 3), twist[0], twist[1], np.array([1, -1, 2, 3]), 0.01)
-    pose, anchor = rng.integers(0, len(X), 20), rng.integers(0, len(A), 20)
+    pose, anchor = rng.integers(0, len(X), 20, dtype=np.intp), rng.integers(0, len(A), 20, dtype=np.intp)
     cal = np.full((20, 6), -1)
     cal[:, 1] = 4
     arm, turn, velocity = rng.normal(size=(20, 2)), rng.normal(size=20), rng.normal(size=(20, 2))

@@ -125,8 +125,9 @@ def test_what_scan_edges_fix_is_counted_step_by_step(seed):
     rng = np.random.default_rng(seed)
     truth, wheels = chain()
     size = 80
-    i, j = rng.integers(0, KEYFRAMES, (2, size))
-    j = np.where(rng.random(size) < 0.8, np.clip(i + rng.integers(-NEAR - 1, NEAR + 2, size), 0, KEYFRAMES - 1), j)
+    i, j = rng.integers(0, KEYFRAMES, (2, size), dtype=np.intp)
+    near = rng.random(size) < 0.8
+    j = np.where(near, np.clip(i + rng.integers(-NEAR - 1, NEAR + 2, size, dtype=np.intp), 0, KEYFRAMES - 1), j)
     i, j = i[i != j], j[i != j]
     size = len(i)
     wide = rng.random((size, 3)) < 0.35

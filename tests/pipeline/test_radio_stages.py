@@ -78,7 +78,7 @@ def test_ranges_keep_a_path_that_scans_hardly_see():
     angle = np.arange(240) * 0.03
     truth = np.column_stack([15.0 * np.sin(angle), 15.0 - 15.0 * np.cos(angle), angle])
     anchors = np.array([[-20.0, -5.0], [22.0, -3.0], [20.0, 36.0], [-18.0, 33.0]])
-    pose, anchor = np.repeat(np.arange(240), 2), rng.integers(0, 4, 480)
+    pose, anchor = np.repeat(np.arange(240), 2), rng.integers(0, 4, 480, dtype=np.intp)
     exact = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
     ranges = plain_ranges(pose, anchor, exact + 0.1 * rng.standard_normal(480), 0.12)
     steps = se2.between(truth[:-1], truth[1:]) + np.array([0.0, 0.0, 0.004])

@@ -78,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
         raise DeviceError("no serial device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
     _compare_networks(reports)
     _report(reports, args.json)
+    if not args.ports and not any(":" in port_report.details["usb"].split(" ")[0] for port_report in reports):
+        note("no USB device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
     if any(level != "info" for port_report in reports for level, _ in port_report.findings):
         return 3
     return 0 if args.list or any(port_report.found for port_report in reports) else 1

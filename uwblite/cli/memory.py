@@ -1,5 +1,6 @@
 """How much memory this process may have, compared beforehand with what a map needs."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import NamedTuple
@@ -8,6 +9,8 @@ _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
 _LIBRARIES = 300_000_000
 """Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
 matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own."""
+_ADDRESSES = 1 << 31
+"""Bytes that a process of a 32-bit system has at least."""
 _NO_LIMIT = 1 << 60
 """Bytes from which a cgroup of version 1 has no limit: it says the largest multiple of a page in 63 bits."""
 
@@ -50,6 +53,8 @@ def _needed(megabytes: float, limit: Limit) -> float:
 def limits() -> list[Limit]:
     """Return the limits that this system sets; what cannot be read sets none."""
     found = [Limit("this computer's memory", total)] if (total := _total()) else []
+    if sys.maxsize < _ADDRESSES:
+        found.append(Limit("what a 32-bit system can address", _ADDRESSES, of_addresses=True))
     if addresses := address_space():
         found.append(Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True))
     return found + [Limit("the limit of this control group", size) for size in _group_limits() if size < _NO_LIMIT]

@@ -52,6 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
     gyro = "its heading takes the place of the wheels': line:PORT?columns=t,turn_rate"
     devices.add_argument("--gyro", metavar="NAME:PORT", action="append", help=gyro)
+    text = "begin although a port does not exist yet; a device that is lost in mid-run is waited for in any case"
+    devices.add_argument("--wait", action="store_true", help=text)
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
     output.add_argument("--append", action="store_true", help="go on with a log that broke off")
@@ -88,6 +90,8 @@ def run(args: argparse.Namespace) -> int:
     from ..drivers.link import Mounting
     from ..drivers.log_file import LogFile, last_state
     from ..drivers.recorder import Recorder
+    from ..drivers.transport import absent_port
+    from ..errors import DeviceError
 
     if not any(getattr(args, sensor) for sensor in MOST):
         note("uwblite: error: name at least one of --uwb, --lidar, --gyro, --odometry; `uwblite devices` lists what is there")
@@ -106,6 +110,9 @@ def run(args: argparse.Namespace) -> int:
             remark += f"; this computer's clock is {last - time.monotonic() - offset:.0f} s behind the log and was moved"
             offset = last + 1.0 - time.monotonic()
     links = device_links(args, pose)
+    absent = next(filter(None, (absent_port(link.url) for link in links)), "")
+    if absent and not args.wait:
+        raise DeviceError(f"{absent}; --wait waits until it is there")
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
     lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
     mounting = Mounting(lasers[0], tuple(mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))

@@ -250,14 +250,21 @@ class SerialPort:
             self._serial.close()
 
 
+def absent_port(url: str) -> str:
+    """Say that a port does not exist on this computer and what does; "" where it exists, or is none of this computer."""
+    if "://" in url or Path(url).exists():
+        return ""
+    seen = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else ""
+    return f"{url}: no such port" + (f"; in {BY_ID} there are: {seen}" if seen else "; nothing is plugged in")
+
+
 def _explain(url: str, error: Exception) -> str:
     """Say how to mend a port that does not open."""
     path, text = Path(url), str(error)
+    if absent := absent_port(url):
+        return absent
     if "://" in url:
         return f"{url}: cannot open ({text})"
-    if not path.exists():
-        seen = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else ""
-        return f"{url}: no such port" + (f"; in {BY_ID} there are: {seen}" if seen else "; nothing is plugged in")
     if "Permission" in text or getattr(error, "errno", None) == 13:
         return f"{url}: no permission; run `sudo usermod -aG dialout $USER`, log out and in again"
     if "lock" in text or getattr(error, "errno", None) in (11, 16):

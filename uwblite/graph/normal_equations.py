@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..arrays import Floats, Ints
+from ..arrays import WIDE, Floats, Ints
 from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization, kernel_weights, linearize
 from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
@@ -108,14 +108,14 @@ class NormalEquations:
     def _pairs(self, touched: list[list[_Touched]], nodes: int) -> tuple[Ints, list[Ints]]:
         """Return the pairs (b, 2) of nodes that share an edge, every node with itself first; and each edge's pair."""
         m, valued = self._values, np.zeros((nodes - self._values + 1, nodes + 1), dtype=bool)
-        keys = [np.array([m * m])]
+        keys = [np.array([m * m], dtype=WIDE)]
         for low, high, by_value in _meetings(touched):
             if by_value:
                 valued[np.where(low >= 0, high - m, -1), low] = True
             else:
-                keys.append(np.where((low >= 0) & (low < high), low * m + high, m * m))
+                keys.append(np.where((low >= 0) & (low < high), low.astype(WIDE, copy=False) * m + high, m * m))
         unique, which = np.unique(np.concatenate(keys), return_inverse=True)
-        apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
+        apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1).astype(np.intp, copy=False)
         # Every range and step depends on several calibration values: a table finds these pairs faster than sorting.
         valued[-1] = valued[:, -1] = valued[np.arange(nodes - m), np.arange(m, nodes)] = False
         value, other = np.nonzero(valued)

@@ -141,12 +141,12 @@ def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, c
     near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.intp)])
     joined = (recording[near_i] == recording[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
-    pairs = near_i * k + near_j
+    pairs = near_i.astype(WIDE) * k + near_j
     if config.partners:
         i, j = _best_views(surface_cells(clouds, poses), path, recording, config)
-        pairs = np.concatenate([np.minimum(i, j) * k + np.maximum(i, j), pairs])
-    pairs = np.unique(pairs)
-    return pairs // k, pairs % k
+        pairs = np.concatenate([np.minimum(i, j).astype(WIDE) * k + np.maximum(i, j), pairs])
+    first, second = np.divmod(np.unique(pairs), k)
+    return first.astype(np.intp), second.astype(np.intp)
 
 
 def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
