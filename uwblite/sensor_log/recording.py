@@ -76,7 +76,7 @@ class SensorLog:
         require_type(self.mounting, "mounting", SensorMounting)
         require_finite(self.odometry.poses, "odometry.poses", MOST_METRES)
         if len(self.odometry.stamps) == 0:
-            raise DataError("there is no odometry, which every map begins with; a log has it as ODOM, or as robot poses in ROBOTLASER1")
+            raise DataError("there is no odometry, which a map begins with; a log has it as ODOM or in ROBOTLASER1")
         if self.gyro is not None:
             require_finite(self.gyro.heading, "gyro.heading", MOST_SECONDS)
         if self.ranges is not None:
