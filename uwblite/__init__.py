@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """uwblite: maps from wheel odometry, UWB ranges to unknown anchors and a short-range 2D lidar.
 
 Units are SI and radians throughout; a unit stands in a name only where it is not SI. Frames follow REP-103 and

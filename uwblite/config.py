@@ -77,7 +77,7 @@ def override(config: Settings, assignments: Iterable[str]) -> Settings:
     for text in assignments:
         name, equals, value = text.partition("=")
         if not equals or not name.strip():
-            raise ConfigError(f"--set {text}: write it as table.name=value, e.g. --set icp.max_iterations=30")
+            raise ConfigError(f"{text!r} sets nothing: write a setting as table.name=value, such as grid.resolution=0.1")
         nested: Any = _parse_value(value.strip())
         for part in reversed(name.strip().split(".")):
             nested = {part: nested}
@@ -143,10 +143,10 @@ def _unknown(where: tuple[str, ...], cls: type, root: type) -> str:
     name = ".".join(where)
     if where[-1] in cls.__annotations__:
         return f"{name!r} is no setting any more: it is now a constant of {cls.__name__}, {getattr(cls, where[-1])!r}"
-    return f"unknown setting {name!r}{_did_you_mean(where, root)}"
+    return f"unknown setting {name!r}{_did_you_mean(where, cls, root)}"
 
 
-def _did_you_mean(where: tuple[str, ...], root: type) -> str:
+def _did_you_mean(where: tuple[str, ...], cls: type, root: type) -> str:
     known = [name for name, _ in leaves(root)]
     known += sorted({name.rpartition(".")[0] for name in known} - {""})
     wanted = ".".join(where)
@@ -155,7 +155,8 @@ def _did_you_mean(where: tuple[str, ...], root: type) -> str:
     if not near:
         by_end = {name.rpartition(".")[2]: name for name in reversed(known)}
         near = [by_end[end] for end in get_close_matches(where[-1], by_end, n=1, cutoff=0.7)]
-    return f"; did you mean {near[0]!r}?" if near else "; `uwblite config` lists all settings"
+    there = ", ".join(".".join((*where[:-1], f.name)) for f in dataclasses.fields(cls))
+    return f"; did you mean {near[0]!r}?" if near else f"; there are {there}"
 
 
 def _convert(value: Any, hint: Any, where: tuple[str, ...]) -> Any:

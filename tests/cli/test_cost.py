@@ -42,13 +42,13 @@ def test_check_expects_what_its_own_trial_map_took(log, monkeypatch, slow):
     """The work itself, the whole of it: no part that happens to be easy is taken for the rest."""
     log, clock = of_length(log, 20.0), [0.0]
 
-    def build_map(part):
+    def build_map(part, config):
         clock[0] += slow
         return SimpleNamespace(anchors=(), calibration=(), doubts=())
 
     monkeypatch.setattr("uwblite.mapping.build_map", build_map)
     monkeypatch.setattr(check.time, "perf_counter", lambda: clock[0])
-    _, seconds = check.examined(log)
+    _, seconds = check.examined(log, check.screened(log), clock[0])
     assert seconds == pytest.approx(cost.SECONDS_AT_LEAST + slow)
     assert check.expected_cost(log, seconds)["seconds"] == pytest.approx(seconds, abs=0.05)
     assert clock[0] == slow

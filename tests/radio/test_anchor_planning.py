@@ -62,7 +62,8 @@ def test_the_first_place_is_the_best_of_all_and_more_never_harm():
     rng = np.random.default_rng(0)
     for other in cells[rng.choice(len(cells), 150, replace=False)]:
         place = low + cell * (other[::-1] + 0.5)
-        beside = np.abs(place - grid.geometry.origin).min() < 0.5 or np.abs(place - grid.geometry.corner).min() < 0.5
+        edge = np.minimum(place - grid.geometry.origin, grid.geometry.corner - place).min() - 0.2
+        beside = 0.5 <= edge < 0.75
         if not beside or np.linalg.norm(anchors - place, axis=1).min() < 1.0:
             continue
         points = np.floor((one.points - low) / cell).astype(int)[:, ::-1]
@@ -91,16 +92,28 @@ def test_line_of_sight_ends_at_walls_and_passes_doors():
     assert _line_of_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
 
 
-def test_places_beside_walls_are_those_of_a_loop():
+def test_places_half_a_metre_from_walls_are_those_of_a_loop():
+    """The distance is that of the middle of a cell to the nearest edge of a blocked one, to half a cell."""
     rng = np.random.default_rng(3)
-    blocked = rng.random((8, 9)) < 0.2
-    free = ~blocked & (rng.random((8, 9)) < 0.7)
+    blocked = rng.random((14, 15)) < 0.04
+    free = ~blocked & (rng.random((14, 15)) < 0.7)
     expected = []
     for row, col in np.argwhere(free):
-        around = [(row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)]
-        if any(0 <= r < 8 and 0 <= c < 9 and blocked[r, c] for r, c in around):
+        away = 0.2 * np.hypot(*(np.argwhere(blocked) - [row, col]).T).min() - 0.1
+        if 0.5 <= away < 0.5 + 0.2 * np.sqrt(2.0):
             expected.append([row, col])
-    assert _wall_cells(blocked, free).tolist() == expected
+    assert len(expected) > 10
+    assert _wall_cells(blocked, free, 0.2).tolist() == expected
+
+
+def test_places_keep_half_a_metre_from_walls_where_there_is_room():
+    grid = hall(wall_at=50, door=range(28, 32))
+    plan = plan_anchors(grid, np.zeros((0, 2)), 4)
+    walls = grid.occupied_points()
+    for place in plan.places:
+        assert np.hypot(*(walls - place).T).min() - 0.1 >= 0.5 - 1e-9
+    narrow = plan_anchors(hall(6, 40), np.zeros((0, 2)), 2)
+    assert len(narrow.places) == 2
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -10,7 +10,8 @@ from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.report.canvas import Canvas
-from uwblite.report.palette import ACCEPTED, ANCHOR, PATH, PATHS, START
+from uwblite.report.error_map import draw_errors
+from uwblite.report.palette import ACCEPTED, ANCHOR, PATH, PATHS, PROPOSED, START
 from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
 from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
 
@@ -231,3 +232,32 @@ def test_shading_is_done_in_strips_and_takes_little_more_than_its_colours():
     for value in np.unique(log_odds):
         cell = OccupancyGrid(GridGeometry(0.05, np.zeros(2), 1, 1), np.full((1, 1), value))
         assert (colours[log_odds == value] == shaded(cell)[0, 0]).all()
+
+
+def test_names_of_anchors_do_not_cover_walls():
+    """An anchor beside the right wall of a room has its name on the left, where the floor is."""
+    grid = room()
+    corner = grid.geometry.corner
+    inside = np.array([corner[0] - 1.2 * grid.geometry.resolution, grid.geometry.origin[1] + 1.0])
+    log_odds = np.full_like(grid.log_odds, -4.0)
+    log_odds[:, -1] = 4.0
+    walled = OccupancyGrid(grid.geometry, log_odds)
+    plain, named = (draw_map(walled, np.zeros((0, 2)), anchors=[PictureAnchor(name, inside)]) for name in ("", "5C0B"))
+    written = np.any(plain != named, axis=2)
+    assert written.any()
+    assert not np.any(written & np.all(plain == WALL, axis=2))
+
+
+def test_proposed_anchors_have_a_colour_and_an_entry_of_their_own():
+    image = draw_map(room(), PATH_IN_ROOM, anchors=[PictureAnchor("new1", np.array([0.0, 1.0]), proposed=True)])
+    assert np.any(np.all(image == PROPOSED, axis=2))
+    assert not np.any(np.all(image == ANCHOR, axis=2))
+
+
+def test_the_picture_of_errors_says_what_it_shows():
+    grid = room()
+    points = grid.geometry.centre_of(np.array([5]), np.array([5]))
+    one, other = (draw_errors(grid, points, np.array([0.3]), [], title) for title in ("Expected error", "Another"))
+    changed = np.flatnonzero(np.any(one != other, axis=(1, 2)))
+    assert len(changed)
+    assert changed.max() < 40

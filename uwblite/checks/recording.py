@@ -44,6 +44,7 @@ def diagnose(
     calibration: tuple[CalibrationEstimate, ...] = (),
     doubts: tuple[MapFinding, ...] | None = None,
     refused: str = "",
+    repaired: SensorLog | None = None,
 ) -> Diagnosis:
     """Examine a recording.
 
@@ -52,10 +53,11 @@ def diagnose(
     anchors, calibration, doubts : of a map made for the check, where there is one: it shows the wheels' scale, the delay of
         the radio and the bias of each anchor, and whether the sensors agree. doubts: None where no map was made.
     refused : why no map could be made; empty where it was, or was not tried.
+    repaired : the recording screened, where that has been done.
     """
     found = Findings()
     _check_notes(log, found)
-    _check_screening(log, doubts, found)
+    _check_screening(repaired or log, doubts, found)
     odometry = check_odometry(log.odometry, found)
     figures: dict[str, Any] = {"odometry": odometry}
     if log.ranges is None or len(log.ranges.stamps) == 0:

@@ -40,14 +40,34 @@ def run(args: argparse.Namespace) -> int:
     from .options import apply_mounting, bag_choices
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
-    diagnosis, seconds = examined(log) if args.map else (diagnose(log), model_seconds(log))
-    cost = expected_cost(log, seconds)
+    began = time.perf_counter()
+    repaired = screened(log)
+    if args.map:
+        diagnosis, seconds = examined(log, repaired, began)
+    else:
+        diagnosis, seconds = diagnose(log, repaired=repaired), model_seconds(log)
+    cost = expected_cost(repaired or log, seconds)
     console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost, mapped=args.map))
     return 3 if diagnosis.serious else 0
 
 
-def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
+def screened(log: "SensorLog") -> "SensorLog | None":
+    """Return the recording as a map repairs it; None where a map refuses it."""
+    from ..errors import DataError
+    from ..screening.screen import screen
+
+    try:
+        return screen(log)
+    except DataError:
+        return None
+
+
+def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "tuple[Diagnosis, float]":
     """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this finds serious.
+
+    Parameters
+    ----------
+    repaired : the recording screened, see `screened`. began : time at which that began, s.
 
     Returns
     -------
@@ -55,16 +75,18 @@ def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
     """
     from ..checks.recording import diagnose
     from ..errors import UwbliteError
-    from ..mapping import build_map
+    from ..mapping import MappingConfig, build_map
+    from ..pipeline.scan_selection import thinned
     from .cost import SECONDS_AT_LEAST
 
-    began = time.perf_counter()
+    config = MappingConfig()
     try:
-        made = build_map(log)
+        made = build_map(log if repaired is None else thinned(repaired, config.keyframes, config.grid), config)
     except UwbliteError as error:
-        return diagnose(log, refused=str(error)), SECONDS_AT_LEAST
+        return diagnose(log, refused=str(error), repaired=repaired), SECONDS_AT_LEAST
     seconds = SECONDS_AT_LEAST + time.perf_counter() - began
-    return diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts), seconds
+    found = diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts, repaired=repaired)
+    return found, seconds
 
 
 def expected_cost(log: "SensorLog", seconds: float) -> dict[str, float]:

@@ -18,7 +18,7 @@ examples:
   uwblite plan-anchors --map map/ --count 3 --from-nothing  as if there were no anchors yet
 
 The error at a place is that of a position from one range to each anchor within reach: 0.1 m of noise in line of sight, 0.5 m
-through walls. Anchors are put on walls; where that cannot be done, the picture shows what is nearly as good.
+through walls. Anchors are put half a metre from walls; where that cannot be done, the picture shows what is nearly as good.
 """
 
 
@@ -97,6 +97,10 @@ def _picture(result: "StoredResult", plan: "AnchorPlan", from_nothing: bool) -> 
 
     assert result.grid is not None
     there = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
-    new = [PictureAnchor(f"new{k}", place) for k, place in enumerate(plan.places, 1)]
-    shown = [(plan.errors[0], there, "today"), (plan.errors[-1], [*there, *new], f"with {len(new)} more")]
+    new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]
+    about = "Expected error of a position"
+    shown = [
+        (plan.errors[0], there, f"{about}, {len(there)} anchors"),
+        (plan.errors[-1], [*there, *new], f"{about}, {len(new)} more"),
+    ]
     return side_by_side([draw_errors(result.grid, plan.points, *panel) for panel in shown])

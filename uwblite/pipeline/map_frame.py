@@ -33,7 +33,7 @@ def wall_direction(normals: Floats) -> float:
     """
     normals = normals[np.hypot(normals[:, 0], normals[:, 1]) > 0.5]
     if not len(normals):
-        raise DataError("no walls were seen to align the map with; choose another --align")
+        raise DataError("no walls were seen to align the map with: set align to odometry or first-pose")
     angle = np.arctan2(normals[:, 1], normals[:, 0])
     bins = np.bincount(((angle % (np.pi / 2)) / (np.pi / 2) * _BINS).astype(np.intp) % _BINS, minlength=_BINS)
     smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
@@ -95,7 +95,7 @@ def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
     if how == "anchors":
         indices = np.flatnonzero(placed)
         if len(indices) < 2:
-            raise DataError("two placed anchors are needed to align the map with; choose another --align")
+            raise DataError("two placed anchors are needed to align the map with: set align to odometry or first-pose")
         first, last = graph.anchors[indices[0]], graph.anchors[indices[-1]]
         return se2.inverse(np.array([*first, np.arctan2(*(last - first)[::-1])]))
     raise ConfigError(f"unknown alignment {how!r}; choose one of {', '.join(ALIGNMENTS)}")

@@ -13,6 +13,7 @@ lowers it further (V. V. Fedorov, Theory of Optimal Experiments, 1972).
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
@@ -28,6 +29,8 @@ _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
 """Cells at which the error is evaluated, and places offered to anchors: the time goes with their product."""
 _APART = 1.0
 """m; least distance between anchors."""
+_FROM_WALLS = 0.5
+"""m; nearer to metal and corners, reflections disturb the antenna (docs/driving.md)."""
 _SWEEPS = 10
 """Most rounds of exchanges; two or three are usually enough."""
 
@@ -49,7 +52,7 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
 
     Parameters
     ----------
-    grid : the map; anchors are put on walls next to free space, or into the free space where there are no walls.
+    grid : the map; anchors are put into free space half a metre from walls, or anywhere in it where there is no such place.
     anchors : (a, 2) today's anchors, m.
     count : how many more.
     reach : m up to which a radio reaches.
@@ -59,7 +62,7 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
     ConfigError : the map has no free space, or too few places for so many anchors.
     """
     blocked, free, low, cell = _coarse(grid)
-    points, candidates = _places(free, _MOST_POINTS), _wall_cells(blocked, free)
+    points, candidates = _places(free, _MOST_POINTS), _wall_cells(blocked, free, cell)
     if len(points) == 0:
         raise ConfigError("the map has no free space to plan anchors for")
     candidates = candidates if len(candidates) >= count else _places(free, _MOST_CANDIDATES)
@@ -150,14 +153,10 @@ def _places(cells: Bools, most: int) -> Ints:
     return found[:: max(-(-len(found) // most), 1)]
 
 
-def _wall_cells(blocked: Bools, free: Bools) -> Ints:
-    """Return the free cells beside blocked ones (n, 2), thinned evenly: an anchor on a wall stands on one side of it."""
-    beside = np.zeros_like(free)
-    beside[1:] |= blocked[:-1]
-    beside[:-1] |= blocked[1:]
-    beside[:, 1:] |= blocked[:, :-1]
-    beside[:, :-1] |= blocked[:, 1:]
-    return _places(free & beside, _MOST_CANDIDATES)
+def _wall_cells(blocked: Bools, free: Bools, cell: float) -> Ints:
+    """Return the free cells (n, 2) of the first row that keeps away from blocked ones, thinned evenly."""
+    away = cell * (np.asarray(distance_transform_edt(~blocked)) - 0.5) if blocked.any() else np.full(blocked.shape, np.inf)
+    return _places(free & (away >= _FROM_WALLS) & (away < _FROM_WALLS + np.sqrt(2.0) * cell), _MOST_CANDIDATES)
 
 
 def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:

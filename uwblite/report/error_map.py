@@ -38,8 +38,8 @@ def draw_errors(
     rows, cols = np.nonzero(grid.states() == FREE)
     nearest = cKDTree(points).query(grid.geometry.centre_of(rows, cols))[1]
     colours[rows, cols] = _COLOURS[np.searchsorted(_STEPS, errors[nearest])]
-    image = draw_map(grid, np.zeros((0, 2)), anchors=anchors, caption=title, size=size, colours=colours)
-    return np.concatenate([image, _legend(image.shape[1])], axis=0)
+    image = draw_map(grid, np.zeros((0, 2)), anchors=anchors, size=size, colours=colours)
+    return np.concatenate([_strip(image.shape[1], title), image, _legend(image.shape[1])], axis=0)
 
 
 def side_by_side(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -49,15 +49,24 @@ def side_by_side(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return np.concatenate([np.pad(i, f, constant_values=FLOOR[0]) for i, f in zip(images, fill, strict=True)], axis=1)
 
 
+def _strip(width: int, text: str) -> NDArray[np.uint8]:
+    """Return a strip with a line of text; smaller where it is too long."""
+    image = np.full((40, width, 3), FLOOR[0], dtype=np.uint8)
+    scale = 2 if 12 * len(text) <= width - 24 else 1
+    Canvas(image).text(12, 10 if scale == 2 else 14, text, INK, scale)
+    return image
+
+
 def _legend(width: int) -> NDArray[np.uint8]:
-    """Return a strip with the colours and their bounds."""
-    image = np.empty((40, width, 3), dtype=np.uint8)
-    image[:] = FLOOR
+    """Return a strip with the colours, their bounds, and what they are bounds of."""
+    image = _strip(width, "")
     canvas = Canvas(image)
-    labels = [f"to {_STEPS[0]:g} m", *(f"to {bound:g}" for bound in _STEPS[1:]), "more"]
+    labels = ["m, up to", *(f"{bound:g}" for bound in _STEPS), "more"]
     each = max((width - 24) // len(labels), 1)
-    for k, (label, colour) in enumerate(zip(labels, _COLOURS.tolist(), strict=True)):
+    for k, label in enumerate(labels):
         left = 12 + k * each
-        canvas.polygon(np.array([[left, 8], [left + 18, 8], [left + 18, 26], [left, 26]], dtype=float), tuple(colour))
-        canvas.text(left + 24, 10, label, INK)
+        if k:
+            square = np.array([[left, 8], [left + 18, 8], [left + 18, 26], [left, 26]], dtype=float)
+            canvas.polygon(square, tuple(_COLOURS[k - 1].tolist()))
+        canvas.text(left + (24 if k else 0), 10, label, INK)
     return image

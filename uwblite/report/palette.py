@@ -8,6 +8,8 @@ PATHS: tuple[Colour, ...] = (PATH, (124, 58, 180), (0, 128, 140), (92, 64, 51))
 ACCEPTED: Colour = (234, 120, 20)
 REJECTED: Colour = (138, 147, 160)
 ANCHOR: Colour = (208, 28, 60)
+PROPOSED: Colour = (110, 40, 160)
+"""Anchors that do not stand there yet."""
 START: Colour = (22, 150, 80)
 DOUBTED: Colour = (250, 190, 20)
 """Stretches of a path that are not to be trusted."""

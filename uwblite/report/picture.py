@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
-from .palette import ACCEPTED, ANCHOR, DOUBTED, PATHS, START
+from .palette import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START
 from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
 
 Image = NDArray[np.uint8]
@@ -37,6 +37,8 @@ class PictureAnchor:
     """(2,) m, map frame."""
     covariance: Floats | None = None
     """(2, 2) m^2; drawn as an ellipse of two standard deviations."""
+    proposed: bool = False
+    """It does not stand there yet."""
 
 
 def draw_map(
@@ -75,7 +77,7 @@ def draw_map(
     low = np.floor(low / resolution) * resolution
     width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
     tracks = _recordings(path)
-    keys = _legend(len(tracks), bool(placed), any(a.covariance is not None for a in placed), closures)
+    keys = _legend(len(tracks), placed, closures)
     keys += [Key("not to be trusted", DOUBTED, "line")] if doubted else []
     image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
@@ -100,12 +102,15 @@ def draw_map(
     return image
 
 
-def _legend(recordings: int, anchors: bool, ellipses: bool, closures: Floats | None) -> list[Key]:
+def _legend(recordings: int, anchors: Sequence[PictureAnchor], closures: Floats | None) -> list[Key]:
     """Return the entries for what is on the picture."""
     names = ["path"] if recordings == 1 else [f"recording {k}" for k in range(1, min(recordings, len(PATHS)) + 1)]
     keys = [Key(name, colour, "line") for name, colour in zip(names, PATHS, strict=False)] if recordings else []
     keys += [Key("start", START, "disc"), Key("end", PATHS[0], "ring")] if recordings else []
-    keys += [Key("anchor, 2 sigma" if ellipses else "anchor", ANCHOR, "triangle")] if anchors else []
+    if there := [a for a in anchors if not a.proposed]:
+        ellipses = any(a.covariance is not None for a in there)
+        keys.append(Key("anchor, 2 sigma" if ellipses else "anchor", ANCHOR, "triangle"))
+    keys += [Key("proposed", PROPOSED, "triangle")] if any(a.proposed for a in anchors) else []
     keys += [Key("loop closure", ACCEPTED, "line")] if closures is not None and len(closures) else []
     return keys
 
@@ -207,20 +212,37 @@ def _draw_track(canvas: Canvas, track: Floats, colour: Colour) -> None:
 
 def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:
     """Draw an anchor's ellipse of two standard deviations, its place and its name."""
+    colour = PROPOSED if anchor.proposed else ANCHOR
     turn = np.linspace(0.0, 2.0 * math.pi, 73)
     if anchor.covariance is not None and np.isfinite(anchor.covariance).all():
         variance, axes = np.linalg.eigh(anchor.covariance)
         ellipse = (axes * (2.0 * np.sqrt(np.maximum(variance, 0.0)))) @ np.stack([np.cos(turn), np.sin(turn)])
         outline = pixel(anchor.position + ellipse.T)
-        canvas.polygon(outline[:-1], ANCHOR, 0.15)
-        canvas.polyline(outline, 1.5, ANCHOR, 0.9)
+        canvas.polygon(outline[:-1], colour, 0.15)
+        canvas.polyline(outline, 1.5, colour, 0.9)
     x, y = pixel(anchor.position).tolist()
     corners = np.array([[0.0, -1.1], [0.95, 0.6], [-0.95, 0.6]])
     canvas.polygon(np.array([x, y]) + 12.5 * corners, FLOOR)
-    canvas.polygon(np.array([x, y]) + 9.0 * corners, ANCHOR)
-    height, width = canvas.image.shape[:2]
+    canvas.polygon(np.array([x, y]) + 9.0 * corners, colour)
     name = anchor.id if len(anchor.id) <= 16 else anchor.id[:14] + ".."
-    wide = 12 * len(name)
-    # Where there is no room to the right of the mark the name stands to the left of it.
-    left = x + 14.0 if x + 14.0 + wide <= width - 4.0 else x - 14.0 - wide
-    canvas.text(max(left, 4.0), min(max(y - 9.0, 4.0), height - 22.0), name, ANCHOR, 2, FLOOR)
+    canvas.text(*_room_for(canvas.image, x, y, 12 * len(name), 14), name, colour, 2, FLOOR)
+
+
+def _room_for(image: Image, x: float, y: float, wide: int, high: int) -> tuple[float, float]:
+    """Return the upper left corner for a name beside a mark, pixels: to the right of it, else to the left, below or above,
+    wherever it covers the fewest dark pixels."""
+    height, width = image.shape[:2]
+    beside = ((x + 14.0, y - 9.0), (x - 14.0 - wide, y - 9.0), (x - wide / 2, y + 12.0), (x - wide / 2, y - 16.0 - high))
+
+    def covered(corner: tuple[float, float]) -> tuple[bool, int]:
+        left, top = round(corner[0]), round(corner[1])
+        inside = left >= 4 and top >= 4 and left + wide <= width - 4 and top + high <= height - 4
+        below = image[max(top, 0) : max(top + high, 0), max(left, 0) : max(left + wide, 0)]
+        return not inside, int(np.sum(below.max(axis=2, initial=0) < _DARK))
+
+    left, top = min(beside, key=covered)
+    return min(max(left, 4.0), max(width - 4.0 - wide, 4.0)), min(max(top, 4.0), height - 8.0 - high)
+
+
+_DARK = 80
+"""Brightest channel of a wall, about."""

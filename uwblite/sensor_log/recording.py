@@ -76,7 +76,7 @@ class SensorLog:
         require_type(self.mounting, "mounting", SensorMounting)
         require_finite(self.odometry.poses, "odometry.poses", MOST_METRES)
         if len(self.odometry.stamps) == 0:
-            raise DataError("the log has no odometry; uwblite needs ODOM messages (or ROBOTLASER1 with robot poses)")
+            raise DataError("there is no odometry, which a map begins with; a log has it as ODOM or in ROBOTLASER1")
         if self.gyro is not None:
             require_finite(self.gyro.heading, "gyro.heading", MOST_SECONDS)
         if self.ranges is not None:

@@ -29,6 +29,7 @@ image{image-rendering:pixelated}svg{display:block;width:100%;background:#cdcdcd;
 .key.disc{width:.7rem;height:.7rem;border:0;border-radius:50%;background:currentColor}
 .key.ring{width:.7rem;height:.7rem;border:2px solid;border-radius:50%}
 .key.anchors{width:0;border:.4rem solid transparent;border-top:0;border-bottom:.7rem solid}
+.key.arrow{width:0;border:.4rem solid transparent;border-right:0;border-left:.8rem solid}
 .row{display:flex;flex-wrap:wrap;gap:.5rem;align-items:center}.faint{color:var(--faint)}
 @media (prefers-color-scheme:dark){svg{background:#2a2a2a}.anchor text,.bar text{stroke:#000}
 image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}

@@ -40,7 +40,7 @@ function show() {
   svg.append(...drawn(map.paths));
   for (const a of placed) svg.append(...(a.covariance ? [ellipse(a)] : []), anchorMark(a.id, a.place, shown.size));
   svg.append(shown.bar, shape("g", {id: "robot"}));
-  at("legend").replaceChildren(...(map.paths.length ? [key("path", "path")] : []), key("start", "robot", "disc"),
+  at("legend").replaceChildren(...(map.paths.length ? [key("path", "path")] : []), key("start", "robot", "arrow"),
     ...(placed.length ? [key("anchor", "anchor, 2σ", "anchors")] : []));
   at("facts").textContent = map.accepted + " of " + map.candidates + " loop closures accepted";
   at("notes").replaceChildren(...map.doubts.map(t => el("li", {}, "Doubt: " + t)), ...map.warnings.map(t => el("li", {}, t)));

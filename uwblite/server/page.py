@@ -8,7 +8,7 @@ _STYLE = """
 header{display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center}#say{color:var(--faint);flex:1 1 12rem}
 svg{max-height:62vh;touch-action:none}.closure{stroke:var(--accepted);stroke-width:1.6;cursor:pointer}
 .closure.no{stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--start);stroke-width:3}
-.closure.reject{stroke:var(--anchor);stroke-width:3;stroke-dasharray:2 4}
+.closure.reject{stroke:var(--ink);stroke-width:3;stroke-dasharray:2 4}
 .hit{stroke:transparent;stroke-width:12;cursor:pointer}line.chosen{stroke-width:5}
 circle.chosen{stroke:var(--ink);stroke-width:2}.closure,.hit,circle{vector-effect:non-scaling-stroke}
 .hideno .no{display:none}.anchor{cursor:pointer}.anchor.pinned{fill:var(--start)}
@@ -67,7 +67,7 @@ function card(result, number) {
   for (const text of result.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
   node.append(svg, el("div", {class: "row faint"}, ...paths, key("start", "start", "disc"), key("path", "end", "ring"),
     ...(result.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
-    el("label", {}, rejected, " ", key("rejected", "rejected")), key("start", "forced, pinned"), key("anchor",
+    el("label", {}, rejected, " ", key("rejected", "rejected")), key("start", "forced, pinned"), key("ink",
       "rejected by you")));
   node.append(detail, el("div", {class: "row"},
     el("button", {class: "main map", onclick: () => ask("/map", {result: number}), ...(busy ? {disabled: ""} : {})},
