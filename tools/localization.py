@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How a live localisation starts, tracks and recovers in maps of other recordings; writes docs/lab/localization.md.
 
-    python tools/localization.py                          hall, lab and warehouse: half an hour
+    python tools/localization.py                          hall, lab, corridor and warehouse: half an hour
     python tools/localization.py --only lab --starts 10   a part of it
     python tools/localization.py --keep grounds            maps and recordings are kept there and used again
     python tools/localization.py --print                  nothing written
@@ -36,7 +36,7 @@ from uwblite.localization import Localizer, LocalizerState, Scanner
 from uwblite.localization.known_map import KnownMap
 from uwblite.localization.walls import walls_of
 
-WORLDS = ("hall", "lab", "warehouse")
+WORLDS = ("hall", "lab", "corridor", "warehouse")
 MOST_WAY = 10.0
 """m of driving in which a start should be found."""
 WRONG = (0.5, 0.3)
@@ -47,6 +47,8 @@ WRONG_SECONDS = 40.0
 """s of each drive in a map that is not the building's."""
 ELSEWHERE = {"hall": "lab", "lab": "hall", "warehouse": "lab", "corridor": "lab"}
 """The other building."""
+OTHER_TAG = 0.12
+"""m, standard deviation of the delays of another tag."""
 AFTER = 3.0
 """s for which a start, or a robot that was carried away, is watched after it was found."""
 RECOVERED, WATCHED = 10.0, 40.0
@@ -251,6 +253,14 @@ def with_moved_anchor(on: Bench) -> Bench:
     return replace(on, known=replace(on.known, anchors=replace(on.known.anchors, positions=places)))
 
 
+def with_other_tag(on: Bench) -> Bench:
+    """Return the bench with ranges of a tag whose delays differ from those of the map's, by a constant for each anchor."""
+    ranges = on.trial.log.ranges
+    late = OTHER_TAG * np.random.default_rng(0).standard_normal(len(ranges.anchor_ids))
+    log = replace(on.trial.log, ranges=replace(ranges, ranges=ranges.ranges + late[ranges.anchor]))
+    return replace(on, trial=replace(on.trial, log=log))
+
+
 def scaled(on: Bench, grid: OccupancyGrid, factor: float) -> Bench:
     """Return the bench with a map in another unit."""
     g = grid.geometry
@@ -314,6 +324,7 @@ def track_rows(on: Bench, seconds: float) -> list[list[object]]:
     """Return the rows of tracking with all sensors, without some, and with an anchor moved."""
     rows = [(name, track(on, seconds, *used)) for name, used in KINDS.items()]
     rows.insert(1, ("one anchor moved by 2.2 m", track(with_moved_anchor(on), seconds)))
+    rows.append(("without lidar, another tag", track(with_other_tag(on), seconds, *KINDS["without lidar"])))
     return [[name, t.rms, t.worst, f"{t.lost:.1%}", *map(_short, (t.nees, 100.0 * t.inside, t.per_scan, t.work))]
             for name, t in rows]  # fmt: skip
 

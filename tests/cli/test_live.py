@@ -233,6 +233,17 @@ def test_a_log_that_no_longer_grows_makes_the_pose_old_and_then_lost(room, capsy
     assert err.count("warning: no data for") == 1
 
 
+def test_a_map_that_was_doubted_is_used_with_that_word(room, capsys):
+    folder, log, _ = room
+    report = folder / "report.json"
+    report.write_text(json.dumps({"doubts": [{"kind": "drift", "text": "the ranges disagree", "figures": {}}]}))
+    try:
+        assert main(["localize", str(log), "--live", "--map", str(folder), "--idle", "0.1"]) == 0
+    finally:
+        report.unlink()
+    assert "warning: the map is doubted: the ranges disagree" in capsys.readouterr().err
+
+
 def test_the_page_shows_the_map_and_the_robot_on_it(room, capsys, monkeypatch):
     """What is published is what a browser would get."""
     from uwblite.server.feed import Feed

@@ -84,6 +84,8 @@ class Drive:
     noise: float = 0.01
     stamp: float = 100.0
     odom: np.ndarray = None
+    laser_turn: float = 0.0
+    """rad, by which the laser is mounted otherwise than stated."""
 
     def __post_init__(self):
         self.rng = np.random.default_rng(3)
@@ -108,7 +110,7 @@ class Drive:
             if (len(poses) - 1 - k) % every == 0:
                 state = self.localizer.add_odometry(self.stamp, *self.odom)
             if scans and self.walls:
-                readings = cast(pose, self.walls) + self.rng.normal(0, self.noise, 181)
+                readings = cast(pose + np.array([0.0, 0.0, self.laser_turn]), self.walls) + self.rng.normal(0, self.noise, 181)
                 state = self.localizer.add_scan(self.stamp, readings, SCANNER)
             if ranges and k % 5 == 0:
                 names = sorted(self.anchors)

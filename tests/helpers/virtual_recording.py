@@ -121,8 +121,8 @@ def live_devices(devices, seconds, *, begin=None):
             begin(clock.now)
         return made
 
-    def run(self, *, duration, stopping):
-        real(self, duration=seconds, stopping=stopping)
+    def run(self, *, duration, stopping, on_status=None):
+        real(self, duration=seconds, stopping=stopping, on_status=on_status)
 
     with (
         mock.patch.object(module, "Recorder", recorder),

@@ -70,6 +70,18 @@ def test_a_step_that_uses_a_scan_leaves_the_search_to_the_others(monkeypatch):
     assert not any("advance" in step and "use_scan" in step for step in steps)
 
 
+def test_a_laser_that_another_robot_carries_turned_is_learnt_while_driving():
+    poses = path(ROUND)
+    drive = robot(known())
+    drive.laser_turn = 0.03
+    states = drive.along(poses)
+    off = np.array([se2.wrap_angle(s.pose[2] - p[2]) for s, p in zip(states, poses, strict=True) if not s.lost])
+    sigma = np.sqrt([s.covariance[2, 2] for s in states if not s.lost])
+    assert np.median(np.abs(off[-40:])) < 0.012
+    assert np.all(np.abs(off) < 4.0 * sigma)
+    assert np.median(sigma[-40:]) < 0.012
+
+
 def test_the_work_of_every_step_is_bounded_also_where_many_measurements_are_due_at_once():
     """Two units of a search and a decision; or scans that are compared with as many places as there can be."""
     poses, drive, work = path(ROUND)[:60], robot(known()), []

@@ -1,10 +1,12 @@
 """The likelihood of ranges at a pose: the factors' gradient, and moments that hold the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import ndtr
 
 from uwblite import se2
-from uwblite.localization import range_likelihood
+from uwblite.localization import hypotheses, range_likelihood
 from uwblite.localization.window import Ranges
 
 
@@ -56,3 +58,30 @@ def test_likelihoods_in_single_precision_are_those_in_double_to_a_hundredth():
     terms = 0.7 * np.exp(-0.5 * z**2) + 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z) + 0.02
     expected = range_likelihood._INDEPENDENT * np.log(terms).sum(axis=1)
     np.testing.assert_allclose(range_likelihood.range_likelihood(poses, ranges), expected, atol=0.01)
+
+
+def test_a_common_error_moves_the_pose_as_its_effect_says():
+    """With exact ranges all weights are equal: a small error of all ranges to one anchor moves the best pose linearly."""
+    pose, ranges = some_ranges(2)
+    true = np.hypot(*(pose[:2] + se2.rotate(pose[2], ranges.tags) - ranges.places).T)
+    exact = replace(ranges, values=true, sigma=np.full(12, 0.02))
+    effect = range_likelihood.bias_effect(pose[None], exact, 4)[0]
+    np.testing.assert_array_equal(effect[:, 3], 0.0)
+    for anchor in range(3):
+        shifted = replace(exact, values=true + 1e-4 * (exact.anchor == anchor))
+        found = range_likelihood.refined_by_ranges(pose[None], shifted)[0] - pose
+        np.testing.assert_allclose(found, 1e-4 * effect[:, anchor], atol=2e-6)
+
+
+def test_poses_by_ranges_are_as_unsure_as_their_common_errors_and_correlated_with_them():
+    biases = np.array([0.1, 0.2, 0.3])
+    bank = hypotheses.started(np.zeros((2, 3)), np.tile(0.01 * np.eye(3), (2, 1, 1)), biases)
+    effect = np.random.default_rng(1).normal(size=(1, 3, 3))
+    found = hypotheses.placed(bank, np.array([1]), np.ones((1, 3)), 0.04 * np.eye(3)[None], effect)
+    np.testing.assert_array_equal(found.poses, [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(found.covariance[0], bank.covariance[0])
+    # The estimate is the truth plus effect times bias: the error that is left has the opposite sign.
+    shared = effect[0] * biases**2
+    np.testing.assert_allclose(found.pose_covariances[1], 0.04 * np.eye(3) + shared @ effect[0].T)
+    np.testing.assert_allclose(found.covariance[1, :3, -3:], -shared)
+    assert np.linalg.eigvalsh(found.covariance[1]).min() > 0

@@ -5,7 +5,7 @@ from helpers.hypotheses import a_bank, numeric
 
 from uwblite import se2
 from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN
-from uwblite.localization.range_update import RangeFacts, ranged
+from uwblite.localization.range_update import RangeFacts, ranged, repeated
 from uwblite.radio.range_errors import RangeErrors
 from uwblite.radio.range_noise import RangeNoise
 
@@ -46,3 +46,15 @@ def test_a_range_that_is_metres_late_moves_nothing():
     np.testing.assert_allclose(anywhere - likelihood, np.log(40.0), atol=1e-6)
     assert weight[0] < 1e-3
     np.testing.assert_array_equal(found.mean, bank.mean)
+
+
+def test_repeated_ranges_count_as_the_mean_of_their_correlated_errors_varies():
+    """White noise and multipath over 200 lengths: the variance of the mean is that of so many independent ranges."""
+    noise, every, count = RangeNoise(0.06, 0.1, 0.8), 0.05, 3200
+    sigma = float(np.hypot(noise.white, noise.slow))
+    fact = RangeFacts(0, np.zeros(2), 1.0, 0.0, sigma, 0.0, RangeErrors(np.zeros((0, 2)), np.zeros(0), noise))
+    away = every * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    variance = noise.white**2 / count + noise.slow**2 * np.exp(-away / noise.length).mean()
+    np.testing.assert_allclose(repeated(fact, every) * sigma**2 / count, variance, rtol=0.02)
+    assert repeated(fact, np.inf) == 1.0
+    assert repeated(fact, 0.0) > 50.0

@@ -58,3 +58,27 @@ def test_ends_in_unknown_space_count_for_nothing_in_the_fit():
     assert half.known[0] < whole.known[0]
     assert half.log_likelihood[0] < whole.log_likelihood[0] - 0.2
     np.testing.assert_allclose(half.fit, whole.fit, atol=0.1)
+
+
+def test_a_thin_wall_has_a_line_on_either_side_and_a_lone_post_is_a_surface_without_one():
+    thick = tuple((1.0, 2.0 + d, 7.0, 2.0 + d) for d in (0.0, 0.05, 0.1, 0.15))
+    walls = walls_of(grid_of((*ODD[:4], *thick, (4.02, 4.02, 4.03, 4.03))))
+    x = np.linspace(1.5, 6.5, 40)
+    for y, up in ((1.98, -1.0), (2.2, 1.0)):
+        near = walls.nearest_at(x, np.full(40, y))
+        np.testing.assert_allclose(walls.normals[near], np.tile([0.0, up], (40, 1)), atol=0.05)
+        assert walls.one_sided[near].all()
+    assert walls.distances(np.array([4.1]), np.array([4.0]))[0] < 0.12
+    post = walls.nearest_at(np.array([4.02]), np.array([4.02]))[0]
+    assert not walls.normals[post].any()
+
+
+def test_the_nearest_points_are_those_of_a_search_of_all():
+    walls, rng = walls_of(grid_of(ODD)), np.random.default_rng(7)
+    places = rng.uniform([-0.5, -0.5], [8.5, 6.5], (400, 2))
+    found = walls.distances(*places.T)
+    true = np.hypot(*(places[:, None] - walls.points).transpose(2, 0, 1)).min(axis=1)
+    near = true < 0.35
+    # The table tells the nearest point of a cell's centre.
+    np.testing.assert_allclose(found[near], true[near], atol=0.05 * np.sqrt(2.0))
+    assert np.isinf(found[true > 0.6]).all()

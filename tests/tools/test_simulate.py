@@ -106,6 +106,18 @@ def test_oblique_walls_answer_less():
     assert shares[0] >= shares[1] > shares[2]
 
 
+def test_a_weak_lidar_loses_returns_by_distance_and_paint():
+    model, n = laser.LaserModel(weak=0.2, blind=0.0), 20_000
+    for distance in (1.4, 5.0):
+        true, shares = np.full((1, n), distance), []
+        for painted in (False, True):
+            surface, dark = np.full((1, n), int(painted)), np.array([False, True])
+            output, _ = laser.disturb(true, np.ones((1, n)), surface, model, np.zeros(2), np.random.default_rng(6), dark)
+            shares.append(np.mean((output < 20) | (output == 5600)))
+        expected = 0.2 * np.square(distance / model.max_range) * np.array([1.0, 4.0])
+        np.testing.assert_allclose(shares, expected, atol=0.02)
+
+
 def test_odometry_without_faults_is_the_motion(room):
     motion = drive.Motion(room.stamps, room.truth)
     output = wheels.odometry(motion, room.stamps, EXACT_WHEELS, [], np.random.default_rng(0))

@@ -50,6 +50,7 @@ def run_live(args: argparse.Namespace) -> int:
             raise UsageError(f"--{name} belongs to a recording that has ended; --live writes lines to stdout")
     result = read_result(args.map)
     known = from_result(result)
+    tell_doubts(result)
     _tell_map(known)
     tracker = Tracker(known, args)
     with _shown(result, tracker, args.serve):
@@ -183,6 +184,14 @@ def line_of(state: "LocalizerState") -> str:
 
 _MOST_ALTERNATIVES = 8
 """In a line."""
+
+
+def tell_doubts(result: "StoredResult") -> None:
+    """Say where a map was doubted when it was made: poses in it are no better."""
+    doubts = result.report.get("doubts")
+    for doubt in doubts if isinstance(doubts, list) else []:
+        text = doubt.get("text") if isinstance(doubt, dict) else doubt
+        console.note(f"uwblite: warning: the map is doubted: {text}")
 
 
 def _tell_map(known: "KnownMap") -> None:

@@ -5,7 +5,7 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from .live import add_live_arguments, run_live
+from .live import add_live_arguments, run_live, tell_doubts
 from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, place
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_existing(args.force, *files.values())
     config = effective_config(args)
     earlier = read_result(args.map)
+    tell_doubts(earlier)
     known = from_result(earlier)
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
