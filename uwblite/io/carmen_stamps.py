@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
 from ..screening.clocks import stand_still
 from .carmen_messages import CONFIRMED
@@ -81,22 +82,29 @@ def judged(
     again = np.zeros(len(rows), dtype=bool)
     again[1:] = own[1:] & ~own[:-1] & np.all(rows[1:, 1:] == rows[:-1, 1:], axis=1)
     made = stand_still(rows[~again, 0], _travelled(rows[~again]))
-    before, after = _neighbours(lines, lines[own & ~again], rows[own & ~again, 0])
+    # The laser may have another clock, but where all of the odometry repeats it there is no other order.
+    others = own & ~again if (own & ~again).any() else ~own
+    before, after = _neighbours(lines, lines[others], rows[others, 0])
     unset = again & (made | ((before <= after) & ((rows[:, 0] < before) | (rows[:, 0] > after))))
     corrected = int(unset.sum()) > max(len(laser) // 2, _IN_A_ROW)
-    used = ~own if corrected else own if made else own & ~unset
+    used = ~own | ~unset if corrected else own if made else own & ~unset
     if corrected:
         warnings.append(
             f"this log was corrected, as by GMapping: {int(unset.sum())} ODOM messages repeat the pose of the laser message"
             " before them with a stamp that was never set. The poses of the laser messages are the odometry; the other ODOM"
-            " messages, whose poses leap at each of them, are left out"
+            " messages, whose poses leap at each of them, show where the robot stands alone"
         )
     elif unset.any() and not made:
         warnings.append(
             f"{int(unset.sum())} ODOM messages repeat the pose of the laser message before them with a stamp never set;"
             " they are left out"
         )
-    rows, lines = rows[used].copy(), lines[used]
+    rows, lines, own = rows[used].copy(), lines[used], own[used]
+    if corrected:
+        # What moves between two laser messages is the wheels', uncorrected; a robot that stands keeps its place meanwhile.
+        stands = np.append(False, np.all(np.diff(rows[:, 1:], axis=0) == 0.0, axis=1))
+        rows[:, 1:], kept = _without_leaps(rows[:, 1:], own), ~own | (stands & (not made))
+        rows, lines = rows[kept], lines[kept]
     if made:
         still = int(np.sum((np.diff(rows[:, 0]) <= 0.0) & (np.diff(_travelled(rows)) > 0.0)))
         warnings.append(
@@ -108,6 +116,33 @@ def judged(
     else:
         rows[:, 0] = _placed(lines, rows[:, 0], false_stamps(rows[:, 0]), "odometry", warnings)
     return rows, LineClock(lines, rows[:, 0], _travelled(rows), made, made or corrected)
+
+
+def _without_leaps(poses: Floats, own: Bools) -> Floats:
+    """Return the poses (n, 3) of a corrected log without leaps.
+
+    Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
+    X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
+
+    Parameters
+    ----------
+    own : (n,) which poses are the odometry's, not those of a laser message.
+    """
+    laser, number = np.flatnonzero(~own), np.arange(len(own))
+    following = np.searchsorted(laser, number)
+    before, between = own & (following == 0), own & (following > 0) & (following < len(laser))
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    i = number[between]
+    start, goal = laser[following[i] - 1], laser[following[i]]
+    length = way[goal - 1] - way[start]
+    share = (i - start) / (goal - 1 - start)
+    np.divide(way[i] - way[start], length, out=share, where=length > 0.0)
+    change = se2.log(se2.between(poses[goal - 1], poses[goal]))
+    found = poses.copy()
+    found[i] = se2.compose(poses[i], se2.exp(share[:, None] * change))
+    if before.any():
+        found[before] = se2.compose(se2.compose(poses[laser[0]], se2.inverse(poses[laser[0] - 1])), poses[before])
+    return found
 
 
 def _travelled(rows: Floats) -> Floats:
