@@ -279,7 +279,6 @@ def cases() -> dict[str, Case]:
     found |= {
         "check": _verb("x.log", log, "check", "{}/x.log"),
         "check corrected log": _verb("x.log", CORRECTED, "check", "{}/x.log"),
-        "optimize isam": _verb("x.g2o", ISAM, "optimize", "{}/x.g2o", "--out", "{}/out.g2o", *shared, cost=10),
         "map": _verb("x.log", log, "map", "{}/x.log", "--out", "{}/out", *shared, cost=100),
         "map of tables": _verb(
             "tables/odometry.csv", b"", "map", "{}/../tables", "--out", "{}/out", *shared, cost=100, prepare=_tables
