@@ -15,6 +15,7 @@ from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
 from uwblite.pipeline import scan_selection
 from uwblite.pipeline.scan_selection import prepared, thinned
+from uwblite.sensor_log import Odometry, SensorLog
 
 FRAMES, GRID = KeyframeConfig(), GridConfig()
 
@@ -72,3 +73,12 @@ def test_nothing_to_leave_out(change):
         log = log.without(lidar=True)
     grid = GRID if change == "no scans" else replace(GRID, move_distance=0.0)
     assert thinned(log, FRAMES, grid) is log
+
+
+def test_no_offset_of_the_lidars_clock_where_the_format_excludes_one():
+    """All recordings must exclude it: the settings are those of all."""
+    log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))))
+    bound = replace(log, notes=replace(log.notes, one_clock=True))
+    config = MappingConfig()
+    assert scan_selection.with_one_clock(config, [bound, bound]).calibration.laser_delay == 0.0
+    assert scan_selection.with_one_clock(config, [bound, log]) is config

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwblite.cli import main
+from uwblite.cli.formats import format_of, read_graph, read_recording
 from uwblite.config import merge, parse_toml
 from uwblite.drivers.devices import DEVICES
 from uwblite.errors import UwbliteError
@@ -22,6 +23,7 @@ from uwblite.io.constraints_file import parse_constraints, read_anchors
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
 from uwblite.io.csv_table import read_csv
 from uwblite.io.g2o import read_g2o
+from uwblite.io.librsf import read_librsf
 from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
@@ -33,7 +35,7 @@ from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
 from uwblite.server.live import watch_status
 
-from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, RELATIONS, TABLE, TORO, TUM
+from .small_files import ANCHORS, CORRECTED, G2O, ISAM, KNOWN, LIBRSF, LOG, MAPPING, PYFG, RELATIONS, TABLE, TORO, TUM
 from .wires_and_pages import DEVICE_OPTIONS, RESULT, ask, listen, open_named, result_of, show, wire
 
 Read = Callable[[Path], object]
@@ -91,6 +93,9 @@ def _grid() -> OccupancyGrid:
 def _map_folder(folder: Path) -> None:
     write_map(folder, _grid())
     write_map(folder, _grid(), name="map_scale", mode="scale")
+    text = (folder / "map.yaml").read_text()
+    (folder / "map_raw.yaml").write_text(text.replace("trinary", "raw").replace("free_thresh: 0.196", "free_thresh: 0.25"))
+    (folder / "map_turned.yaml").write_text(text.replace(", 0]", ", 0.6]").replace("free_thresh: 0.196", "free_thresh: 0.25"))
     for yaml in folder.glob("*.yaml"):
         yaml.write_text("# a map\n" + yaml.read_text() + "# width: 60, height: 40, drawn on Monday\n" * 8)
     (folder / "anchors.csv").write_bytes(ANCHORS)
@@ -113,6 +118,13 @@ def _followed(path: Path) -> object:
     while tail.poll():
         pass
     return json.dumps(watch_status(tail, None, 0.0, ""), allow_nan=False)
+
+
+def _told(path: Path) -> object:
+    """Read a file of any content as what it is told to be."""
+    if format_of(str(path)) in ("g2o", "pyfg", "isam"):
+        return read_graph(str(path))
+    return read_recording(str(path))
 
 
 def _file(name: str, data: bytes, read: Read, cost: int = 1) -> Case:
@@ -184,8 +196,28 @@ def _bags() -> Iterator[tuple[str, Case]]:
             yield f"{storage} {part}", Case(name, reader(storage), lambda folder, s=storage: whole(folder, s), 4)  # type: ignore[misc]
     yield "ros1 bag", Case("one.bag", lambda path: read_bag(path), _ros1, 4)
 
+    def alone(folder: Path) -> None:
+        whole(folder, "mcap")
+        data = next((folder / "bag").glob("*.mcap")).read_bytes()
+        (folder / "cut.mcap").write_bytes(data[: int(0.7 * len(data))])
+        (folder / "bag" / "metadata.yaml").unlink()
 
-def _ros1(folder: Path) -> None:
+    yield "mcap cut off", Case("cut.mcap", lambda path: read_bag(path), alone, 4)
+    yield "parts without metadata", Case("bag/messages", reader("mcap"), alone, 4)
+    yield "ros1 bag that is active", Case("run.bag.active", lambda path: read_bag(path), _active, 4)
+
+
+def _active(folder: Path) -> None:
+    """Make a bag whose header names no index, cut off in its last block."""
+    _ros1(folder, "nav_msgs/msg/Odometry")
+    data = bytearray((folder / "one.bag").read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    index = int.from_bytes(data[place : place + 8], "little")
+    data[place : place + 8] = bytes(8)
+    (folder / "run.bag.active").write_bytes(data[: index - 40])
+
+
+def _ros1(folder: Path, kind: str = "sensor_msgs/msg/Range") -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -193,10 +225,16 @@ def _ros1(folder: Path) -> None:
     t = store.types
     header = t["std_msgs/msg/Header"](seq=0, stamp=t["builtin_interfaces/msg/Time"](5, 0), frame_id="5C0B")
     message = t["sensor_msgs/msg/Range"](header, 0, 0.1, 0.1, 9.0, 3.0)
+    if kind == "nav_msgs/msg/Odometry":
+        point, turn, zero = t["geometry_msgs/msg/Point"], t["geometry_msgs/msg/Quaternion"], np.zeros(36)
+        pose = t["geometry_msgs/msg/Pose"](point(1.0, 2.0, 0.0), turn(0.0, 0.0, 0.0, 1.0))
+        still = t["geometry_msgs/msg/Twist"](*(t["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0) for _ in range(2)))
+        with_covariance = [t[f"geometry_msgs/msg/{n}WithCovariance"](v, zero) for n, v in (("Pose", pose), ("Twist", still))]
+        message = t[kind](header, "base_link", *with_covariance)
     with Writer(folder / "one.bag") as writer:
-        radio = writer.add_connection("/uwb/a/distance", "sensor_msgs/msg/Range", typestore=store)
+        topic = writer.add_connection("/uwb/a/distance", kind, typestore=store)
         for k in range(5):
-            writer.write(radio, k * 10**9, store.serialize_ros1(message, "sensor_msgs/msg/Range"))
+            writer.write(topic, k * 10**9, store.serialize_ros1(message, kind))
 
 
 def _tables(folder: Path) -> None:
@@ -219,6 +257,9 @@ def cases() -> dict[str, Case]:
         "constraints": _file("x.toml", KNOWN * 3, _text(parse_constraints)),
         "mapping": _file("x.toml", MAPPING * 3, _text(parse_mappings)),
         "log tail": _file("x.log", _log(20), _followed),
+        "librsf": _file("x.txt", LIBRSF, read_librsf),
+        "corrected log": _file("x.log", CORRECTED, read_log),
+        "told by content": _file("x.txt", LIBRSF + CORRECTED[:900] + ISAM + TORO, _told),
     }
     for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
         found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
@@ -230,11 +271,14 @@ def cases() -> dict[str, Case]:
     found["requests"] = Case("requests", ask, result_of(_log()), 20)
     for name in ("map.yaml", "map.pgm", "map_scale.yaml", "map_scale.png"):
         found[name] = Case(name, lambda path: read_map(path.with_suffix(".yaml")), _map_folder)
+    for name in ("map_raw.yaml", "map_turned.yaml"):
+        found[name] = Case(name, read_map, _map_folder)
     found["png"] = Case("map_scale.png", lambda path: decode_png(path.read_bytes(), str(path)), _map_folder)
     found |= dict(_bags())
     log, shared = _log(), ("-q", "--force")
     found |= {
         "check": _verb("x.log", log, "check", "{}/x.log"),
+        "check corrected log": _verb("x.log", CORRECTED, "check", "{}/x.log"),
         "map": _verb("x.log", log, "map", "{}/x.log", "--out", "{}/out", *shared, cost=100),
         "map of tables": _verb(
             "tables/odometry.csv", b"", "map", "{}/../tables", "--out", "{}/out", *shared, cost=100, prepare=_tables

@@ -241,6 +241,7 @@ class LogReader:
             skipped=dict(sorted(self.skipped.items())),
             warnings=tuple(warnings),
             set_back=self.set_back,
+            one_clock=clock.of_scans,
         )
         mounting = self.params.mounting(T_base_laser, self.tags)
         return SensorLog(odometry, ranges, scans, mounting, notes, gyro=gyro)
@@ -258,10 +259,9 @@ class LogReader:
                 )
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
             laser, laser_lines = laser[:0], laser_lines[:0]
-        clock = judged(rows, lines, laser, laser_lines, warnings)
-        stamps, rows = clock.stamps[~clock.twice], rows[~clock.twice]
-        order = time_order(stamps, "odometry", warnings, self.set_back)
-        return Odometry(stamps[order], rows[order, 1:]), clock
+        rows, clock = judged(rows, lines, laser, laser_lines, warnings)
+        order = time_order(rows[:, 0], "odometry", warnings, self.set_back)
+        return Odometry(rows[order, 0], rows[order, 1:]), clock
 
     def _finish_gyro(self, clock: LineClock, warnings: list[str]) -> Gyro | None:
         if not self.gyro:

@@ -1,7 +1,8 @@
 """Stamps of a CARMEN log judged by the order of its lines: false ones, and those that stand still while the robot drives.
 
 A recorder writes messages as they come, so lines tell which was first even where stamps do not: stamps written with six
-digits, or GMapping's corrected logs, which repeat each laser message as an ODOM whose stamp was never set.
+digits, or GMapping's corrected logs, which repeat each laser message as an ODOM whose stamp was never set. Between two of
+their scans the ODOM messages are the wheels', and at each scan they leap to the corrected pose.
 """
 
 from bisect import bisect_right
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
 from ..screening.clocks import stand_still
 from .carmen_messages import CONFIRMED
@@ -33,10 +35,10 @@ class LineClock:
     """(n,) s."""
     travelled: Floats
     """(n,) m, distance driven until then."""
-    twice: Bools
-    """(n,) readings that are there twice: the odometry repeats a laser message that repeats the odometry before it."""
     made: bool
     """Whether the stamps are made up, and no stamp of the log counts."""
+    of_scans: bool
+    """Whether odometry and scans cannot be of different clocks: they share messages, or their stamps are made up."""
 
     def sound(self, lines: Ints, stamps: Floats, what: str, warnings: list[str]) -> Floats:
         """Return stamps (m,), s, of other messages in the order of their lines (m,), those that cannot be placed by lines."""
@@ -54,65 +56,105 @@ class LineClock:
         return _placed(lines, stamps, false_stamps(stamps), what, warnings)
 
 
-AS_WRITTEN = LineClock(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), False)
+AS_WRITTEN = LineClock(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), False, False)
 """Without odometry every stamp stays."""
 
 
-def judged(odometry: Floats, odometry_lines: Ints, laser: Floats, laser_lines: Ints, warnings: list[str]) -> LineClock:
-    """Judge the stamps of the odometry.
+def judged(
+    odometry: Floats, odometry_lines: Ints, laser: Floats, laser_lines: Ints, warnings: list[str]
+) -> tuple[Floats, LineClock]:
+    """Judge the stamps of the odometry by the lines of all messages that bear its pose.
 
     Parameters
     ----------
     odometry : (n, 4) s, m, m, rad: stamp and pose, in the order of lines.
     laser : (m, 4) the same of laser messages, where they give the odometry's pose.
+
+    Returns
+    -------
+    The odometry to be used (k, 4), stamps sound, in the order of lines, and its time by line.
     """
     if len(odometry) == 0:
-        return AS_WRITTEN
+        return odometry, AS_WRITTEN
     rows, lines = np.concatenate([odometry, laser]), np.concatenate([odometry_lines, laser_lines])
     order = np.argsort(lines, kind="stable")
     rows, lines, own = rows[order], lines[order], order < len(odometry)
     again = np.zeros(len(rows), dtype=bool)
     again[1:] = own[1:] & ~own[:-1] & np.all(rows[1:, 1:] == rows[:-1, 1:], axis=1)
-    steps = np.diff(rows[:, 1:], axis=0, prepend=rows[:1, 1:])
-    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(np.angle(np.exp(1j * steps[:, 2])))
-    travelled, twice = np.cumsum(way), np.zeros(len(rows), dtype=bool)
-    twice[2:] = again[2:] & own[:-2] & np.all(rows[2:, 1:] == rows[:-2, 1:], axis=1)
-    if stand_still(rows[~again, 0], travelled[~again]):
-        still = int(np.sum((np.diff(rows[~again, 0]) <= 0.0) & (np.diff(travelled[~again]) > 0.0)))
+    made = stand_still(rows[~again, 0], _travelled(rows[~again]))
+    # The laser may have another clock, but where all of the odometry repeats it there is no other order.
+    others = own & ~again if (own & ~again).any() else ~own
+    before, after = _neighbours(lines, lines[others], rows[others, 0])
+    unset = again & (made | ((before <= after) & ((rows[:, 0] < before) | (rows[:, 0] > after))))
+    corrected = int(unset.sum()) > max(len(laser) // 2, _IN_A_ROW)
+    used = ~own | ~unset if corrected else own if made else own & ~unset
+    if corrected:
         warnings.append(
-            f"the stamps of this log cannot be used: {still} of {len(rows)} messages have the stamp of the one before while the"
-            f" robot drives on. The messages are taken in the order of the lines, as of a robot at {_SPEED:g} m/s; speeds,"
-            " durations and delays say nothing"
+            f"this log was corrected, as by GMapping: {int(unset.sum())} ODOM messages repeat the pose of the laser message"
+            " before them with a stamp that was never set. The poses of the laser messages are the odometry; the other ODOM"
+            " messages, whose poses leap at each of them, show where the robot stands alone"
         )
-        time = np.maximum.reduce([way / _SPEED, turn / _TURN_RATE, np.full(len(rows), _PERIOD)])
-        # A laser message and the odometry beside it with the same pose are of one moment.
-        moment = again | (~own & (way == 0.0) & (turn == 0.0))
-        made = np.cumsum(np.where(moment, 0.0, time))
-        return LineClock(lines[own], made[own], travelled[own], twice[own], True)
-    lent = np.concatenate([[np.nan], rows[:-1, 0]])[own]
-    stamps = _placed_odometry(lines[own], rows[own, 0], again[own], lent, warnings)
-    return LineClock(lines[own], stamps, travelled[own], twice[own] & (stamps == lent), False)
+    elif unset.any() and not made:
+        warnings.append(
+            f"{int(unset.sum())} ODOM messages repeat the pose of the laser message before them with a stamp never set;"
+            " they are left out"
+        )
+    rows, lines, own = rows[used].copy(), lines[used], own[used]
+    if corrected:
+        # What moves between two laser messages is the wheels', uncorrected; a robot that stands keeps its place meanwhile.
+        stands = np.append(False, np.all(np.diff(rows[:, 1:], axis=0) == 0.0, axis=1))
+        rows[:, 1:], kept = _without_leaps(rows[:, 1:], own), ~own | (stands & (not made))
+        rows, lines = rows[kept], lines[kept]
+    if made:
+        still = int(np.sum((np.diff(rows[:, 0]) <= 0.0) & (np.diff(_travelled(rows)) > 0.0)))
+        warnings.append(
+            f"the stamps of this log cannot be used: {still} of {len(rows)} have that of the message before while the robot"
+            f" drives on. The messages are taken in the order of the lines, as of a robot at {_SPEED:g} m/s; speeds, durations"
+            " and delays say nothing"
+        )
+        rows[:, 0] = _made_up(rows)
+    else:
+        rows[:, 0] = _placed(lines, rows[:, 0], false_stamps(rows[:, 0]), "odometry", warnings)
+    return rows, LineClock(lines, rows[:, 0], _travelled(rows), made, made or corrected)
 
 
-def _placed_odometry(lines: Ints, stamps: Floats, again: Bools, lent: Floats, warnings: list[str]) -> Floats:
-    """Return the stamps (n,), s, with false ones replaced.
+def _without_leaps(poses: Floats, own: Bools) -> Floats:
+    """Return the poses (n, 3) of a corrected log without leaps.
+
+    Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
+    X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
 
     Parameters
     ----------
-    again : (n,) which messages repeat the pose of the laser message before them. lent : (n,) s, stamps of these.
+    own : (n,) which poses are the odometry's, not those of a laser message.
     """
-    others = np.flatnonzero(~again)
-    if len(others) < len(stamps):
-        before, after = _neighbours(lines, lines[others], stamps[others])
-        unordered = again & ((stamps < before) | (stamps > after))
-        fits = unordered & (lent >= before) & (lent <= after)
-        if fits.any():
-            warnings.append(
-                f"{int(fits.sum())} ODOM messages repeat the pose of the laser message before them with a stamp that no clock"
-                " gives, as in logs that GMapping corrected: they take its stamp"
-            )
-        stamps = np.where(fits, lent, stamps)
-    return _placed(lines, stamps, false_stamps(stamps), "ODOM", warnings)
+    laser, number = np.flatnonzero(~own), np.arange(len(own))
+    following = np.searchsorted(laser, number)
+    before, between = own & (following == 0), own & (following > 0) & (following < len(laser))
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    i = number[between]
+    start, goal = laser[following[i] - 1], laser[following[i]]
+    length = way[goal - 1] - way[start]
+    share = (i - start) / (goal - 1 - start)
+    np.divide(way[i] - way[start], length, out=share, where=length > 0.0)
+    change = se2.log(se2.between(poses[goal - 1], poses[goal]))
+    found = poses.copy()
+    found[i] = se2.compose(poses[i], se2.exp(share[:, None] * change))
+    if before.any():
+        found[before] = se2.compose(se2.compose(poses[laser[0]], se2.inverse(poses[laser[0] - 1])), poses[before])
+    return found
+
+
+def _travelled(rows: Floats) -> Floats:
+    """Return the distance driven until each reading (n, 4), m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(rows[:, 1:3], axis=0).T))])
+
+
+def _made_up(rows: Floats) -> Floats:
+    """Return stamps (n,), s, for readings (n, 4) of a robot at usual speeds."""
+    steps = np.diff(rows[:, 1:], axis=0)
+    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(np.angle(np.exp(1j * steps[:, 2])))
+    return np.concatenate([[0.0], np.cumsum(np.maximum.reduce([way / _SPEED, turn / _TURN_RATE, np.full(len(way), _PERIOD)]))])
 
 
 def _neighbours(lines: Ints, other_lines: Ints, other_stamps: Floats) -> tuple[Floats, Floats]:

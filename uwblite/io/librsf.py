@@ -83,8 +83,9 @@ def _anchor(word: bytes, path: str, line: int) -> str:
 def _integrated(rows: Floats) -> Odometry:
     """Return the odometry of speeds (n, 4) s, m/s, m/s, rad/s: each holds until the next."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    steps = se2.exp(rows[:-1, 1:] * np.diff(rows[:, 0])[:, None])
-    return Odometry(rows[:, 0].copy(), se2.chain(np.zeros(3), steps))
+    with np.errstate(over="ignore", invalid="ignore"):  # a recording refuses what is beyond all measures
+        steps = se2.exp(rows[:-1, 1:] * np.diff(rows[:, 0])[:, None])
+        return Odometry(rows[:, 0].copy(), se2.chain(np.zeros(3), steps))
 
 
 def _ranges(rows: Floats, names: list[str]) -> UwbRanges | None:

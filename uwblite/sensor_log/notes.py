@@ -29,6 +29,8 @@ class LogNotes:
     """Topics of a bag that may hold ranges and were not read."""
     set_back: dict[str, float] = field(default_factory=dict)
     """By how much a sensor's clock was set back at most, s, in the order in which its messages were written."""
+    one_clock: bool = False
+    """Whether odometry and scans cannot be of different clocks: they share messages, or their stamps are made up."""
     scans_left_out: int = 0
     """Scans that were recorded and are not among `scans`, because no map looks at them."""
 
