@@ -143,10 +143,9 @@ class PlaceModel:
 
     def _misfits(self, best: Explanation) -> bool:
         """Return whether the ranges fit one place worse than usual errors would: then it may be higher, too."""
-        errors = np.linspace(-self.width, self.width, _GRID)
-        usual = self.usual.log_density(errors)
+        density = self.usual.log_density(np.linspace(-self.width, self.width, _GRID))
         likely = self._likely(self.track.level(best.height), best.found[0], slice(None))
-        return float(self.worth(best.place) @ likely) < float(np.average(usual, weights=np.exp(usual)) * self.worth(best.place).sum())
+        return float(np.average(likely, weights=self.alone)) < float(np.average(density, weights=np.exp(density)))
 
     def _stop(self, best: Explanation, own: Ints) -> list[Explanation]:
         """Return the explanation with a place at which the radio stood on the way (rows), where that is better."""
@@ -155,8 +154,8 @@ class PlaceModel:
         return self._better(best, place, [*best.found, *self.likeliest(best.height, [own])], self.worth(place))
 
     def _divisions(self, best: Explanation, other: Explanation, own: Ints) -> Iterator[Explanation]:
-        """Yield an interval (rows) of one place divided between two, where neither what is explained so far is better, at this or
-        another height, nor a blocked line of sight."""
+        """Yield an interval (rows) divided between two places, where neither one place, at this or another height, nor a blocked
+        line of sight is better."""
         part = self._best_split(own, best)
         if part is None:
             return
@@ -168,10 +167,9 @@ class PlaceModel:
             found[here] = places[0]
         shares = self.worth(place)
         moved = self._numbered(place, found, best.height, shares)
-        if all(moved.evidence > self.with_places(each, shares).evidence for each in {id(e): e for e in (best, other)}.values()):
-            blocked = (self._blocked(best, rows, places, shares) for rows in (own[:left], own[moment:]))
-            if moved.evidence > max(blocked):
-                yield moved
+        rivals = (self.with_places(each, shares).evidence for each in (best, other)[: 1 if other is best else 2])
+        if moved.evidence > max(rivals) and moved.evidence > self._blocked(best, own, moment, places, shares):
+            yield moved
 
     def returned(self, best: Explanation) -> Explanation | None:
         """Return the explanation with a stretch of an interval at another known place; None where none is better."""
@@ -261,15 +259,22 @@ class PlaceModel:
                 break
         return (*split[1], split[2]) if split[2] else None
 
-    def _blocked(self, best: Explanation, part: Ints, places: Sequence[AnchorHypothesis], shares: Floats) -> float:
-        """Return the evidence of one place instead of two, whose errors have another distribution in a part of its interval."""
-        if not len(part):
-            return -np.inf
-        here, apart = int(best.place[part[0]]), np.zeros(len(best.place), dtype=bool)
-        apart[part] = True
-        prior = np.log(MovePolicy.blocked / self.count[part[0]])
-        starts = [[*best.found[:here], start, *best.found[here + 1 :]] for start in (best.found[here], *places)]
-        return prior + max(self.explanation(best.place, start, best.height, shares, apart).evidence for start in starts)
+    def _blocked(self, best: Explanation, own: Ints, split: int, places: Sequence[AnchorHypothesis], shares: Floats) -> float:
+        """Return the evidence of one place instead of two in an interval (rows) whose ranges are delayed before or after a time."""
+        here, level = int(best.place[own[0]]), self.track.level(best.height)
+        tried = []
+        for start in (best.found[here], *places):
+            error = level[own] - np.hypot(*(start.position - self.track.path[own]).T)
+            first, last = (self.usual.log_density(error - np.median(part)) for part in (error[:split], error[split:]))
+            # The delay may begin at another time than the move that explains the same ranges.
+            time = int(np.argmax(np.cumsum(shares[own] * (first - last)))) + 1
+            for part in (own[:time], own[time:]):
+                if 0 < len(part) < len(own):
+                    apart = np.zeros(len(best.place), dtype=bool)
+                    apart[part] = True
+                    found = [*best.found[:here], start, *best.found[here + 1 :]]
+                    tried.append(self.explanation(best.place, found, best.height, shares, apart).evidence)
+        return max(tried, default=-np.inf) + float(np.log(MovePolicy.blocked / self.count[own[0]]))
 
     def with_places(self, each: Explanation, shares: Floats) -> Explanation:
         """Return an explanation with its places at their likeliest."""
