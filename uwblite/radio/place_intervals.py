@@ -154,8 +154,8 @@ class PlaceModel:
         return self._better(best, place, [*best.found, *self.likeliest(best.height, [own])], self.worth(place))
 
     def _divisions(self, best: Explanation, other: Explanation, own: Ints) -> Iterator[Explanation]:
-        """Yield an interval (rows) divided between two places, where neither one place, at this or another height, nor a blocked
-        line of sight is better."""
+        """Yield an interval (rows) divided between two places, where neither one place, at this or another height, is better,
+        nor a blocked line of sight."""
         part = self._best_split(own, best)
         if part is None:
             return
@@ -260,7 +260,7 @@ class PlaceModel:
         return (*split[1], split[2]) if split[2] else None
 
     def _blocked(self, best: Explanation, own: Ints, split: int, places: Sequence[AnchorHypothesis], shares: Floats) -> float:
-        """Return the evidence of one place instead of two in an interval (rows) whose ranges are delayed before or after a time."""
+        """Return the evidence of one place instead of two in an interval (rows) with delays before or after a time."""
         here, level = int(best.place[own[0]]), self.track.level(best.height)
         tried = []
         for start in (best.found[here], *places):
