@@ -37,3 +37,13 @@ def test_what_the_screening_found_is_taken_over(count, where):
     stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])
     assert [(n.kind, n.text) for n in stages.warnings] == [("jump", where + "it jumps")]
     assert [(n.kind, n.text) for n in stages.doubts] == [("gap", where + "it is silent")]
+
+
+def test_passes_count_how_often_stages_ran():
+    """Each recording is bootstrapped once; clouds were made twice: five stages of four."""
+    stages = Stages(None, None)
+    for recording in (1, 2):
+        stages.end("bootstrap", recording=recording)
+    for name in ("clouds", "map", "clouds"):
+        stages.end(name)
+    assert stages.passes == 1.25

@@ -63,7 +63,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     shape = shape_error(graph.poses[covariance.chosen], covariance.among)
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, shape, task)
     anchors = _distrusted(anchors, stages.doubts)
-    stages.end("summary")
+    stages.end("summary", passes=round(stages.passes, 3))
     stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
         stamps=np.concatenate(stamps),

@@ -75,6 +75,11 @@ class Stages:
         self._since = now
         self.report(stage, 1, 1)
 
+    @property
+    def passes(self) -> float:
+        """How often a stage ran, on the mean over all stages and recordings."""
+        return len(self.done) / max(len({(stage.name, stage.figures.get("recording")) for stage in self.done}), 1)
+
     def reporter(self, stage: str) -> Callable[[int, int], None]:
         """Return a callback (done, total) for one stage."""
         return lambda done, total: self.report(stage, done, total)

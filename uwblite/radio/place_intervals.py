@@ -109,6 +109,7 @@ class PlaceModel:
         self.area = float(np.prod(np.ptp(track.path, axis=0) + 2.0 * reach))
         self.usual = RangeMixture(0.0, max(2.0 * track.sigma, 0.1), 0.2, 0.5, 0.05, self.width)
         self.count = np.bincount(track.recording)[track.recording]
+        self.alone = self.worth(np.zeros(len(track.ranges), dtype=np.int64))
 
     def one_place(self) -> Explanation:
         """Return the explanation by one place, at the likeliest height."""
@@ -129,9 +130,22 @@ class PlaceModel:
 
     def divided(self, best: Explanation) -> Explanation | None:
         """Return the explanation with a place more, or another height, of greatest evidence; None where none is better."""
-        parts = (self._divisions(best, own) for own in intervals_of(best.place))
+        starts = [best]
+        if len(best.found) == 1 and self._misfits(best):
+            heights = (height for height in self.track.heights if height != best.height)
+            shares = self.worth(best.place)
+            starts += [self.explanation(best.place, self.likeliest(h, [slice(None)]), h, shares) for h in heights]
+        top = max(starts, key=_evidence)
+        parts = (self._divisions(start, top, own) for start in starts for own in intervals_of(best.place))
         stops = (self._stop(best, own) for own in _ways(best.place) if len(own) >= self.config.min_ranges)
-        return max((e for each in (*parts, *stops) for e in each), key=_evidence, default=None)
+        better = [each for some in (*parts, *stops) for each in some]
+        return max(better, key=_evidence) if better else top if top is not best else None
+
+    def _misfits(self, best: Explanation) -> bool:
+        """Return whether the ranges fit one place worse than usual errors would: then it may be higher, too."""
+        density = self.usual.log_density(np.linspace(-self.width, self.width, _GRID))
+        likely = self._likely(self.track.level(best.height), best.found[0], slice(None))
+        return float(np.average(likely, weights=self.alone)) < float(np.average(density, weights=np.exp(density)))
 
     def _stop(self, best: Explanation, own: Ints) -> list[Explanation]:
         """Return the explanation with a place at which the radio stood on the way (rows), where that is better."""
@@ -139,8 +153,9 @@ class PlaceModel:
         place[own] = len(best.found)
         return self._better(best, place, [*best.found, *self.likeliest(best.height, [own])], self.worth(place))
 
-    def _divisions(self, best: Explanation, own: Ints) -> Iterator[Explanation]:
-        """Yield an interval (rows) of one place divided between two, or what explains its ranges better than that."""
+    def _divisions(self, best: Explanation, other: Explanation, own: Ints) -> Iterator[Explanation]:
+        """Yield an interval (rows) divided between two places, where neither one place, at this or another height, is better,
+        nor a blocked line of sight."""
         part = self._best_split(own, best)
         if part is None:
             return
@@ -152,18 +167,9 @@ class PlaceModel:
             found[here] = places[0]
         shares = self.worth(place)
         moved = self._numbered(place, found, best.height, shares)
-        before = self.with_places(best, shares).evidence
-        if moved.evidence <= before:
-            return
-        blocked = (self._blocked(best, rows, places, shares) for rows in (own[:left], own[moment:]))
-        if moved.evidence <= max(blocked):
-            return
-        heights = self.track.heights if len(best.found) == 1 and best.height == self.track.heights[0] else ()
-        for height in heights[1:]:
-            higher = self.explanation(best.place, self.likeliest(height, [slice(None)]), height, shares)
-            again = self.likeliest(height, [own[:left], own[moment:]])
-            yield from (e for e in (higher, self._numbered(place, again, height, shares)) if e.evidence > before)
-        yield moved
+        rivals = (self.with_places(each, shares).evidence for each in (best, other)[: 1 if other is best else 2])
+        if moved.evidence > max(rivals) and moved.evidence > self._blocked(best, own, moment, places, shares):
+            yield moved
 
     def returned(self, best: Explanation) -> Explanation | None:
         """Return the explanation with a stretch of an interval at another known place; None where none is better."""
@@ -211,9 +217,15 @@ class PlaceModel:
         level = self.track.level(height)
         stretches = [(self.track.path[part], level[part]) for part in parts]
         each = zip(parts, trilaterate_each(stretches, self.config), strict=True)
-        return [
-            max(some[:_MOST], key=lambda h: float(self._likely(level, h, part).sum()), default=_NOWHERE) for part, some in each
-        ]
+
+        def likelihood(place: AnchorHypothesis, part: slice | Bools | Ints) -> float:
+            return float(self.alone[part] @ self._likely(level, place, part)) + self._bias_prior(place)
+
+        return [max(some[:_MOST], key=lambda place: likelihood(place, part), default=_NOWHERE) for part, some in each]
+
+    def _bias_prior(self, place: AnchorHypothesis) -> float:
+        """Return the logarithm of the prior of a place's constant error, but for a constant."""
+        return -0.5 * (place.bias / self.config.bias_sigma) ** 2
 
     def _likely(self, level: Floats, place: AnchorHypothesis, rows: slice | Bools | Ints) -> Floats:
         """Return the logarithm of the likelihood of each range at a place, at usual errors."""
@@ -238,7 +250,8 @@ class PlaceModel:
             splits = []
             for places in zip(found[::2], found[1::2], strict=True):
                 one, other = (shares * self._likely(level, place, own) for place in places)
-                splits.append((*_times(one, other, -np.log(self.width) * shares, least), list(places)))
+                likely, times = _times(one, other, -np.log(self.width) * shares, least)
+                splits.append((likely + sum(map(self._bias_prior, places)), times, list(places)))
             splits.sort(key=lambda each: -each[0])
             split = max([split, *splits[:1]], key=lambda each: each[0])
             waiting = {at for _, at, _ in splits[:_LIKELY]}
@@ -246,15 +259,22 @@ class PlaceModel:
                 break
         return (*split[1], split[2]) if split[2] else None
 
-    def _blocked(self, best: Explanation, part: Ints, places: Sequence[AnchorHypothesis], shares: Floats) -> float:
-        """Return the evidence of one place instead of two, whose errors have another distribution in a part of its interval."""
-        if not len(part):
-            return -np.inf
-        here, apart = int(best.place[part[0]]), np.zeros(len(best.place), dtype=bool)
-        apart[part] = True
-        prior = np.log(MovePolicy.blocked / self.count[part[0]])
-        starts = [[*best.found[:here], start, *best.found[here + 1 :]] for start in (best.found[here], *places)]
-        return prior + max(self.explanation(best.place, start, best.height, shares, apart).evidence for start in starts)
+    def _blocked(self, best: Explanation, own: Ints, split: int, places: Sequence[AnchorHypothesis], shares: Floats) -> float:
+        """Return the evidence of one place instead of two in an interval (rows) with delays before or after a time."""
+        here, level = int(best.place[own[0]]), self.track.level(best.height)
+        tried = []
+        for start in (best.found[here], *places):
+            error = level[own] - np.hypot(*(start.position - self.track.path[own]).T)
+            first, last = (self.usual.log_density(error - np.median(part)) for part in (error[:split], error[split:]))
+            # The delay may begin at another time than the move that explains the same ranges.
+            time = int(np.argmax(np.cumsum(shares[own] * (first - last)))) + 1
+            for part in (own[:time], own[time:]):
+                if 0 < len(part) < len(own):
+                    apart = np.zeros(len(best.place), dtype=bool)
+                    apart[part] = True
+                    found = [*best.found[:here], start, *best.found[here + 1 :]]
+                    tried.append(self.explanation(best.place, found, best.height, shares, apart).evidence)
+        return max(tried, default=-np.inf) + float(np.log(MovePolicy.blocked / self.count[own[0]]))
 
     def with_places(self, each: Explanation, shares: Floats) -> Explanation:
         """Return an explanation with its places at their likeliest."""
@@ -338,6 +358,8 @@ _LIKELY, _MOST = 2, 3
 """Divisions from which the search is continued, and places by a part of the ranges that are compared."""
 _STILL, _FARTHEST, _NEAREST = 1e-3, 1.0, 1e-6
 """m; a step that ends the descent of a place, the longest one, and the least distance."""
+_GRID = 4001
+"""Errors at which a density is summed."""
 _LEAST_SIGMA = 0.03
 """m; no radio measures more finely."""
 
