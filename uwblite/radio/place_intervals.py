@@ -109,7 +109,7 @@ class PlaceModel:
         self.area = float(np.prod(np.ptp(track.path, axis=0) + 2.0 * reach))
         self.usual = RangeMixture(0.0, max(2.0 * track.sigma, 0.1), 0.2, 0.5, 0.05, self.width)
         self.count = np.bincount(track.recording)[track.recording]
-        self.alone = self.worth(np.zeros(len(track.ranges), dtype=np.int64))
+        self.alone = self.worth(np.zeros(len(track.ranges), dtype=np.intp))
 
     def one_place(self) -> Explanation:
         """Return the explanation by one place, at the likeliest height."""
