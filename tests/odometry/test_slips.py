@@ -1,8 +1,10 @@
 """Slips: probabilities of sequences by brute force, and steps that slipped give way to what was measured."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from helpers.laser_walks import chained
 from scipy.linalg import expm
 
@@ -58,9 +60,13 @@ def test_the_covariance_is_that_of_drawn_steps():
     np.testing.assert_allclose(covariance_of(wheels, Graph(np.zeros((2, 3))))[0], np.cov(ends.T), rtol=0.05, atol=2e-6)
 
 
-def test_wheels_count_at_most_all_of_their_motion_too_much():
-    wheels = chained(np.array([[0.0, 0.0, 0.0], [0.3, 0.4, -0.2]]), NOISE)
-    np.testing.assert_allclose(slip_sigma(wheels), [[0.5 + SPEED, 0.5 + SPEED, 0.2 + TURN_RATE]])
+@pytest.mark.parametrize(("duration", "lasts"), [(0.01, 0.01), (600.0, LASTS)])
+def test_wheels_count_at_most_all_of_their_motion_too_much(duration, lasts):
+    """And miss what a push moves the robot while they slip, which they do for seconds and not for minutes."""
+    wheels = replace(chained(np.array([[0.0, 0.0, 0.0], [0.3, 0.4, -0.2]]), NOISE), duration=np.array([duration]))
+    np.testing.assert_allclose(
+        slip_sigma(wheels), [[0.5 + SPEED * lasts, 0.5 + SPEED * lasts, 0.2 + TURN_RATE * lasts]], rtol=1e-3
+    )
 
 
 def test_wheels_that_stand_still_while_they_slip_do_not_hold_a_measured_step():

@@ -59,7 +59,9 @@ class RegistrationConfig:
     worth: ClassVar[float] = 0.02
     """Posterior odds of a slip below which it is not searched for."""
     good_share: ClassVar[float] = 0.75
-    """Share of matching points from which on no further place is searched for."""
+    """Share of matching points from which on matching begins at no further places."""
+    least_share: ClassVar[float] = 0.5
+    """The same of an exhaustive search."""
     places: ClassVar[int] = 4
     """Best places of an exhaustive search from which matching descends."""
     scored: ClassVar[int] = 120
@@ -183,12 +185,11 @@ class Registration:
         sound = self._descend(i, points, prior.mean, prior.mean, prior.covariance)
         log_odds = np.where(sound.factors.asked > 0, self._most_odds(sound, prior), 0.0)
         rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
-        starts = [*(share * prior.mean[rows] for share in (1.0, 0.5, 0.0)), other[rows]]
-        slipped = self._from_best(i, points, prior, rows, starts)
-        poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < c.good_share)
-        if len(poor):
+        slipped = self._from_best(i, points, prior, rows, [other[rows]])
+        for least, further in ((c.good_share, self._shares), (c.least_share, self._searched)):
+            poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
             lost = rows[poor]
-            found = self._from_best(i, points, prior, lost, self._search(i[lost], j[lost], prior.rows(lost)))
+            found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
         log_odds[rows] = slipped.evidence - sound.evidence[rows]
         return Placement(sound, rows, slipped, log_odds)
@@ -228,7 +229,12 @@ class Registration:
         after = np.asarray(np.linalg.inv(hessian + information), dtype=np.float64)
         return Placed(pose, factors, after, evidence, lost)
 
-    def _search(self, i: Ints, j: Ints, prior: Prior) -> list[Floats]:
+    @staticmethod
+    def _shares(i: Ints, j: Ints, prior: Prior) -> list[Floats]:
+        """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
+        return [share * prior.mean for share in (1.0, 0.5, 0.0)]
+
+    def _searched(self, i: Ints, j: Ints, prior: Prior) -> list[Floats]:
         """Return poses (e, 3) from which matching may begin, by exhaustive search of two standard deviations."""
         c, within = RegistrationConfig, 2.0 * np.sqrt(np.einsum("eii->ei", prior.slipped))
         starts = np.tile(prior.mean, (c.places, 1, 1))

@@ -24,8 +24,10 @@ people walk. They count at most all of their motion too much."""
 def slip_sigma(wheels: OdometryEdges) -> Floats:
     """Return the standard deviation (e, 3) of steps of the odometry over which the wheels slip, m, m, rad."""
     way, turned = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]), np.abs(wheels.motion[:, 2])
-    place = way + SPEED * wheels.duration
-    return np.stack([place, place, turned + TURN_RATE * wheels.duration], axis=1)
+    # A slip does not last as long as a pause.
+    lasts = -LASTS * np.expm1(-wheels.duration / LASTS)
+    place = way + SPEED * lasts
+    return np.stack([place, place, turned + TURN_RATE * lasts], axis=1)
 
 
 def covariance_of(wheels: OdometryEdges, graph: Graph) -> Floats:

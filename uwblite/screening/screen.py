@@ -144,8 +144,8 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
 def _as_between_others(odometry: Odometry) -> Bools:
     """Return over which steps (n-1,) the robot moved no farther than over most others.
 
-    A log thinned by motion holds a reading each so many centimetres, and none while the robot stands: the wheels counted all the
-    same, and the reading after a pause has the noise of the way that it shows.
+    A log thinned by motion holds a reading each so many centimetres, and none while the robot stands: the wheels counted all
+    the same, and the reading after a pause has the noise of the way that it shows.
     """
     motion = np.abs(odometry.steps)
     way, moved = np.hypot(motion[:, 0], motion[:, 1]), np.diff(odometry.stamps) > 0.0
