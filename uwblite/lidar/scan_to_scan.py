@@ -106,8 +106,6 @@ def follow(
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
     certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
-    # Slips bend what ranges and wheels alone say of the calibration: it is taken from the steps.
-    graph = optimize(graph.with_edges(wheels, certain), solver)[0]
     noise = reestimate_wheel_noise(wheels, certain, graph)
     registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma)
     sound = covariance_of(noise, graph)
