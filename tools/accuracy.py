@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 import oracle
+from simulation.laser import NARROW, SPINNING
 from simulation.radio import RadioModel
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings, simulate
@@ -81,6 +82,14 @@ ROWS = {
     ),
     "arena": Row("arena, 70 x 45 m, nearly empty, 0.4 m/s", Settings(world="arena", speed=0.4), 0.10, 0.10),
     "tunnel": Row("tunnel, 110 m, smooth, anchors on a line, 0.4 m/s", Settings(world="tunnel", speed=0.4), 0.20, 0.20),
+    "spin": Row(
+        "hall, 4 slips of seconds at 0.6 m/s, people, turning lidar",
+        Settings(world="hall", slips=4, spin=0.6, people=4, laser=SPINNING), 0.05, 0.10,
+    ),
+    "narrow": Row(
+        "lab, 4 slips of seconds at 0.6 m/s, lidar of 120 deg and 4 m",
+        Settings(world="lab", slips=4, spin=0.6, laser=NARROW), 0.10, 0.20,
+    ),
     "radio off": Row("hall, no UWB", Settings(world="hall"), 0.10, 0.15, ("use_uwb=false",)),
 }
 

@@ -1,7 +1,6 @@
 """Tracking: steps between neighbouring clouds are measured, slips are found by a search, blind steps left to the wheels."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +9,10 @@ from helpers.planted import box
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
+from uwblite.graph.solver import SolverConfig
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.scan_to_scan import _LEAST_SHARE, Steps, TrackingConfig, _searched, descend, follow, reattached
+from uwblite.lidar.scan_to_scan import TrackingConfig, descend, follow, reattached
+from uwblite.odometry.slips import EVERY, LASTS
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -25,7 +26,7 @@ def odometry_steps(truth, clouds, stated):
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig())
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), SolverConfig())
     return result.steps, result.wheels, result.searched
 
 
@@ -56,11 +57,12 @@ def test_slips_are_found_by_a_search(walk):
     rng = np.random.default_rng(2)
     stated = exact + rng.uniform(-1, 1, exact.shape) * [0.3, 0.3, 0.35]
     steps, wheels, searches = odometry_steps(truth, clouds, stated)
-    error = np.abs(se2.between(exact[steps.i], steps.T_i_j))
-    good = (np.hypot(error[:, 0], error[:, 1]) < 0.03) & (error[:, 2] < 0.02)
+    # Along a bare wall no match says where the next cloud lies; the information states it.
+    error = np.einsum("eij,ej->ei", steps.sqrt_information, se2.between(exact[steps.i], steps.T_i_j))
+    good = np.abs(error).max(axis=1) < 4.0
     assert searches > 0
     assert len(steps) > 0.8 * len(exact)
-    assert good.mean() > 0.9
+    assert good.mean() > 0.95
     before = chained(truth, NOISE).sqrt_information
     assert np.all(np.einsum("eii->ei", wheels.sqrt_information) < np.einsum("eii->ei", before))
 
@@ -71,7 +73,9 @@ def test_blind_steps_are_left_to_the_wheels():
     steps, wheels, searches = odometry_steps(truth, clouds, se2.between(truth[:-1], truth[1:]))
     assert len(steps) == 0
     assert searches == 0
-    np.testing.assert_array_equal(wheels.sqrt_information, chained(truth, NOISE).sqrt_information)
+    # Wheels slip in a share of the time, and nothing says that they did not.
+    before, after = (np.einsum("eii->ei", w.sqrt_information) for w in (chained(truth, NOISE), wheels))
+    assert np.all((after <= before) & (after**2 >= before**2 * (1.0 - 2.0 * LASTS / EVERY)))
 
 
 def test_a_corridor_is_not_measured_along():
@@ -81,27 +85,6 @@ def test_a_corridor_is_not_measured_along():
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     assert len(steps) > 20
     assert np.median(information[:, 0, 0]) < 0.02 * np.median(information[:, 1, 1])
-
-
-def test_a_step_measured_elsewhere_or_by_few_points_is_contradicted():
-    guess = np.zeros((4, 3))
-    pose = np.array([[0.01, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.2], [0.3, 0.0, 0.0]])
-    steps = Steps(np.array([0, 1, 2, 4]), guess, pose, np.full(4, 0.9), np.array([True, True, True, False]))
-    assert steps.contradicted(TrackingConfig()).tolist() == [1, 2]
-    few = Steps(steps.i, guess, guess, np.array([0.9, 0.5, 0.9, 0.5]), steps.enough)
-    assert few.contradicted(TrackingConfig()).tolist() == [1]
-
-
-def test_steps_taken_over_stand_among_new_ones_in_order():
-    def steps(i, value):
-        i = np.array(i)
-        pose = np.full((len(i), 3), value) + i[:, None]
-        return Steps(i, pose, pose, np.full(len(i), value), np.ones(len(i), dtype=bool))
-
-    both = steps([0, 1, 2], 0.5).with_others(np.array([0, 4]), np.array([0, 2]), steps([1, 2, 3], 0.25))
-    assert both.i.tolist() == [0, 1, 2, 3, 4]
-    assert both.share.tolist() == [0.5, 0.25, 0.25, 0.25, 0.5]
-    np.testing.assert_array_equal(both.pose[:, 0], [0.5, 1.25, 2.25, 3.25, 2.5])
 
 
 def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
@@ -146,36 +129,3 @@ def test_keyframes_without_neighbours_on_both_sides_stay(walk):
     found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE, TrackingConfig())
     assert len(laid) == 0
     np.testing.assert_array_equal(found, truth)
-
-
-def test_searches_begin_behind_the_last_step_that_nothing_measured(monkeypatch, walk):
-    """Step 3 is blind; 2, 4, 5, 7 and 8 are doubtful. 4 leaves free space free and is not searched for, 7 matches too little to
-    be asked. 5 ends clear and 7 lost: behind that a new sub-map begins, too."""
-    _, clouds, _ = walk
-    count = len(clouds)
-    enough, doubtful = np.ones(count - 1, dtype=bool), np.isin(np.arange(count - 1), [2, 4, 5, 7, 8])
-    enough[3] = False
-    share = np.full(count - 1, _LEAST_SHARE)
-    share[7] -= 0.01
-    steps = Steps(np.arange(count - 1), np.full((count - 1, 3), 0.2), np.full((count - 1, 3), 0.1), share, enough)
-    calls = []
-
-    class Search:
-        def __init__(self, *options):
-            assert options == (clouds, TrackingConfig().distance, TrackingConfig().angle)
-
-        def through(self, k, poses):
-            np.testing.assert_array_equal(poses, [[0.1] * 3])
-            return np.array([{2: 0.05, 4: 0.03, 5: 0.8, 8: 0.05}[k]])
-
-        def find(self, k, first, chain, guesses):
-            calls.append((k, first, float(chain[5, 0])))
-            np.testing.assert_array_equal(guesses, [[0.2] * 3, [0.1] * 3, [0.0, 0.0, 0.2]])
-            return SimpleNamespace(clear=k == 5, contradicts=False, pose=np.full(3, 0.7))
-
-    monkeypatch.setattr("uwblite.lidar.scan_to_scan.StepSearch", Search)
-    pose, lost, searched = _searched(clouds, steps.i, steps, doubtful, TrackingConfig())
-    assert searched == len(calls)
-    assert calls == [(2, 0, 0.1), (5, 4, 0.1), (7, 4, 0.7), (8, 8, 0.7)]
-    assert np.flatnonzero(lost).tolist() == [7]
-    np.testing.assert_array_equal(pose, np.where(np.arange(count - 1)[:, None] == 5, 0.7, 0.1) * np.ones(3))

@@ -8,7 +8,6 @@ import pytest
 from helpers.planted_graphs import loop
 
 from uwblite.graph.graph import Calibration, UnknownKey
-from uwblite.lidar.scan_to_scan import Steps
 from uwblite.pipeline import lidar_stages
 from uwblite.pipeline.estimate import Estimate, ScanClouds
 from uwblite.pipeline.lidar_stages import check_map_consistency
@@ -54,30 +53,6 @@ def test_a_clock_is_late_beyond_a_tolerance_and_three_standard_deviations(monkey
     graph = replace(loop()[0], calibration=calibration)
     estimate = Estimate(graph, graph.edges[0], None, (), scans=ScanClouds(None, None, made))
     assert lidar_stages._late(estimate) == pytest.approx(late)
-
-
-def test_steps_between_keyframes_that_stay_neighbours_are_not_measured_again(monkeypatch):
-    """Of five keyframes the step from 1 to 2 is contradicted and cut at two scans: 0, 1, new, new, 2, 3, 4."""
-    former = np.array([0, 1, -1, -1, 2, 3, 4])
-    measured = np.arange(4.0)[:, None] * [1.0, 0.0, 0.0]
-    share = np.array([0.9, 0.1, 0.9, 0.9])
-    steps = Steps(np.arange(4), measured, measured, share, np.ones(4, dtype=bool))
-    others = Steps(np.array([1, 2, 3]), np.full((3, 3), 9.0), np.full((3, 3), 9.0), np.ones(3), np.ones(3, dtype=bool))
-    asked = []
-    monkeypatch.setattr(lidar_stages, "denser", lambda *_: SimpleNamespace(stamps=np.arange(7.0)))
-    monkeypatch.setattr(lidar_stages.scan_clouds, "remake", lambda scans, *_: (scans, former))
-    cut = SimpleNamespace(i=np.arange(6))
-    monkeypatch.setattr(lidar_stages, "with_keyframes", lambda estimate, *_: replace(estimate, odometry=cut))
-    monkeypatch.setattr(lidar_stages, "_steps", lambda estimate, rows, task: asked.append(rows.tolist()) or others)
-    before = SimpleNamespace(stamps=np.arange(5.0))
-    task = SimpleNamespace(recordings=before, config=MappingConfig(), stages=Stages(None, None))
-    estimate = Estimate(None, None, None, (), scans=ScanClouds(None, None, 0.0))
-    estimate, place = lidar_stages._with_keyframes_where_contradicted(estimate, steps, task)
-    found = lidar_stages._with_new_steps(estimate, steps, place, task)
-    assert asked == [[1, 2, 3]]
-    assert found.i.tolist() == [0, 1, 2, 3, 4, 5]
-    assert found.pose[:, 0].tolist() == [0.0, 9.0, 9.0, 9.0, 2.0, 3.0]
-    assert task.stages.done[0].figures == {"steps": 1, "keyframes": 7}
 
 
 @pytest.mark.parametrize(("moved", "done"), [

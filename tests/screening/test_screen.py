@@ -468,3 +468,18 @@ def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it(monkeypatch
         assert [r.text.split("t = ")[1].split(" s")[0] for r in remarks] == said
         assert all(r.severity == "doubt" and "rests on ranges alone" in r.text for r in remarks)
         assert len(breaks.stamps) == (4 if pairs else 9)
+
+
+def test_a_log_thinned_by_motion_has_no_gap_where_the_robot_stands(sound):
+    """A reading each 0.2 m or 0.25 rad, and none for a minute half-way: the wheels counted all the same."""
+    odometry, kept = sound.odometry, [0]
+    for k in range(1, len(odometry.stamps)):
+        step = se2.between(odometry.poses[kept[-1]], odometry.poses[k])
+        if np.hypot(*step[:2]) > 0.2 or abs(step[2]) > 0.25:
+            kept.append(k)
+    half = len(kept) // 2
+    pause = 60.0 * (odometry.stamps > odometry.stamps[kept[half]])
+    thinned = Odometry((odometry.stamps + pause)[kept], odometry.poses[kept])
+    later = 60.0 * (sound.scans.stamps > odometry.stamps[kept[half]])
+    done = screen(replace(sound, odometry=thinned, scans=replace(sound.scans, stamps=sound.scans.stamps + later), ranges=None))
+    assert "odometry-gap" not in kinds(done)

@@ -46,6 +46,16 @@ class LaserModel:
         return (self.first_step + np.arange(self.beams)) * self.increment
 
 
+SPINNING = LaserModel(
+    beams=450, first_step=-225, increment=2.0 * np.pi / 450.0, time_increment=0.0, max_range=8.0, surface_sd=0.008
+)
+"""A turn of 0.8 deg rays, as of an LD06, without stamps of single rays."""
+NARROW = LaserModel(
+    beams=160, first_step=-80, increment=np.deg2rad(0.75), time_increment=0.0, max_range=4.0
+)
+"""120 deg and 4 m."""
+
+
 def cast(
     origins: Floats, angles: Floats, walls: Floats, columns: Floats, reach: float
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:

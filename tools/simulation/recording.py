@@ -45,6 +45,8 @@ class Settings:
     odometry_scale: float = 1.0
     """All odometry errors times this."""
     slips: int = 0
+    spin: float = 0.0
+    """m/s that the wheels count beyond the robot's motion where they slip for seconds; 0 = they slip for a moment."""
     scan_rate: float = 10.0
     """At most 10 Hz; less keeps every n-th sweep of the scanner."""
     uwb_rate: float = 0.5
@@ -137,7 +139,7 @@ def simulate(settings: Settings) -> Recording:
     stamps = np.round(np.arange(int(seconds * settings.odometry_rate) + 1) / settings.odometry_rate, 6)
     size = settings.odometry_scale * (1.0 if settings.rooms is None else settings.rooms.wheels)
     faults = wheels.draw_errors(_lasting(settings.robot, 1, _rng(settings, 1)), size)
-    slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
+    slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips, settings.spin)
     stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3), _floor(settings, motion, stamps))
     crowd = people(settings, plan, seconds)
     scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)

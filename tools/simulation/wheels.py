@@ -44,10 +44,25 @@ def draw_errors(rng: np.random.Generator, scale: float) -> WheelErrors:
     )
 
 
-def draw_slips(motion: Motion, rng: np.random.Generator, count: int) -> list[dict[str, float]]:
-    """Draw wheel slips while driving: over `seconds` the wheels count way and turn that the robot did not make."""
+def draw_slips(motion: Motion, rng: np.random.Generator, count: int, spin: float = 0.0) -> list[dict[str, float]]:
+    """Draw wheel slips while driving: over `seconds` the wheels count way and turn that the robot did not make.
+
+    Parameters
+    ----------
+    spin : m/s that wheels count beyond the robot's own motion where they spin for seconds; 0 = they slip for a moment.
+    """
     speed = np.hypot(*np.gradient(motion.poses[:, :2], motion.stamps, axis=0).T)
     moving = motion.stamps[speed > 0.8 * speed.max()]
+    if spin > 0.0:
+        return [
+            {
+                "start": round(float(start), 2),
+                "seconds": (seconds := round(float(rng.uniform(2.0, 6.0)), 2)),
+                "heading": round(float(seconds * rng.uniform(0.1, 0.4) * rng.choice([-1.0, 1.0])), 3),
+                "distance": round(float(seconds * spin * rng.uniform(0.7, 1.0)), 3),
+            }
+            for start in np.sort(rng.choice(moving, size=count, replace=False))
+        ]
     return [
         {
             "start": round(float(start), 2),

@@ -1,10 +1,12 @@
 """Registration: where a cloud lies in another one, given a prior that may be wrong altogether.
 
-The prior of a relative pose is a mixture: a Gaussian about what the odometry counts, and with the probability of a slip a wide
-one about the same place (see ``Slip``). Matching descends from places throughout the prior, and each part of the mixture is
-compared by its evidence, the marginal likelihood of the source's surfaces in the target by Laplace:
+The prior of a relative pose is a mixture of two Gaussians about one place: a narrow one, where the odometry holds, and a wide
+one, where the wheels slipped (see ``Prior``). Matching descends from places throughout the prior, and both parts of the mixture
+are compared by their evidence, the marginal likelihood of the source's surfaces in the target by Laplace:
 
-    log E = log N(T; mean, C) + sum over objects log((1 - m) exp(-chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|.
+    log E = log N(T; mean, C) + sum over objects log((1 - m) exp(g - chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|,
+
+where g is what a match gains over a point in unknown space, at most as much as an object that moves loses.
 
 The surfaces of a cloud are cut into objects, runs of neighbouring points. An object moves by itself with probability m, which
 falls with its length: people, trolleys and animals are short, walls are not. It counts as one thing however many rays meet
@@ -20,10 +22,19 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
-from .cloud_rasters import CloudRasters
+from .cloud_rasters import CloudRasters, rasterize
 from .clouds import Clouds
 from .free_space import free_space
-from .scan_matching import Correspondences, PairFactors, PairPoints, condensed, correspondences, nondegenerate_step
+from .raster_search import Window, best_poses
+from .scan_matching import (
+    Correspondences,
+    PairFactors,
+    PairPoints,
+    condensed,
+    correspondences,
+    nondegenerate_step,
+    pair_points,
+)
 from .visibility import in_free_space
 
 
@@ -45,9 +56,43 @@ class RegistrationConfig:
     """Probability that an object moves by itself."""
     long: ClassVar[float] = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
+    worth: ClassVar[float] = 0.02
+    """Posterior odds of a slip below which it is not searched for."""
+    good_share: ClassVar[float] = 0.75
+    """Share of matching points from which on matching begins at no further places."""
+    least_share: ClassVar[float] = 0.5
+    """The same of an exhaustive search."""
+    places: ClassVar[int] = 4
+    """Best places of an exhaustive search from which matching descends."""
+    scored: ClassVar[int] = 120
+    """Points that such a search looks up."""
+    cell: ClassVar[float] = 0.1
+    """Step of such a search in x and y, m."""
+    linear: ClassVar[float] = 0.1
+    """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
     iterations: ClassVar[int] = 20
     shrink: ClassVar[float] = 0.8
     """Gate of an iteration as a share of the one before."""
+    cooling: ClassVar[float] = 0.6
+    """Covariance of the prior that residuals may still have in an iteration, as a share of the one before."""
+    cold: ClassVar[float] = 0.05
+    """Share of the prior's covariance from which on descent may end."""
+    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
+    """Longest step of one iteration, m and rad."""
+    converged: ClassVar[float] = 1e-3
+    """Steps below this end the descent, m or rad."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior(Table):
+    """What is known of e relative poses before their clouds are compared."""
+
+    mean: Floats
+    """(e, 3) T_i_j."""
+    covariance: Floats
+    """(e, 3, 3) of x, y, heading, where the odometry holds."""
+    slipped: Floats
+    """(e, 3, 3) where the wheels slipped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,15 +103,20 @@ class Placed(Table):
     """(e, 3) T_i_j."""
     factors: PairFactors
     """Of the matches there, objects that move left out."""
+    covariance: Floats
+    """(e, 3, 3) of the pose by matches and prior."""
     evidence: Floats
     """(e,) log marginal likelihood."""
     evidence_lost: Floats
     """(e,) by how much the log likelihood is below that of surfaces that all agree at the prior's mean."""
-    share: Floats
-    """(e,) share of the points in view that match, 0..1."""
+
+    @property
+    def share(self) -> Floats:
+        """(e,) share of the points looked up that match, 0..1."""
+        return self.factors.matched / np.maximum(self.factors.asked, 1)
 
     def measured(self, variance: float) -> tuple[Floats, Floats]:
-        """Return what the matches measure by themselves, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
+        """Return what the matches alone measure, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
 
         A direction whose own optimum lies beyond what holds for linear surfaces was not measured: the prior placed it.
 
@@ -76,23 +126,41 @@ class Placed(Table):
         """
         step, root = nondegenerate_step(self.factors)
         along = np.einsum("eij,ej->ei", root, step)
-        root = np.where((np.abs(along) <= _LINEAR * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
+        root = np.where((np.abs(along) <= RegistrationConfig.linear * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
         z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=1e-9), root, step)
         z[:, 2] = se2.wrap_angle(z[:, 2])
         return z, np.asarray(root @ se2.rotation(z[:, 2]) / np.sqrt(variance))
 
-    def replaced(self, rows: Ints, others: "Placed", better: Bools) -> "Placed":
-        """Return these pairs, some rows (r,) of them replaced by others where these are better (r,)."""
-        which = np.arange(len(self.pose))
-        which[rows[better]] = len(self.pose) + np.flatnonzero(better)
-        return concatenated([self, others]).rows(which)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """The modes of e pairs."""
+
+    sound: Placed
+    """Where the odometry holds."""
+    searched: Ints
+    """(s,) pairs that may lie elsewhere."""
+    slipped: Placed
+    """Of these, where the wheels slipped."""
+    log_odds: Floats
+    """(e,) log of the evidence for a slip by that against it; 0 where the clouds say nothing."""
+
+    def chosen(self, probability: Floats) -> Placed:
+        """Return the likelier mode of each pair, slips having a probability (e,)."""
+        return _replaced(self.sound, self.searched, self.slipped, probability[self.searched] > 0.5)
 
 
-def best_of(placed: Sequence[Placed]) -> Placed:
+def _replaced(placed: Placed, rows: Ints, others: Placed, better: Bools) -> Placed:
+    """Return pairs of which some rows (r,) are replaced by others where these are better (r,)."""
+    which = np.arange(len(placed.pose))
+    which[rows[better]] = len(which) + np.flatnonzero(better)
+    return concatenated([placed, others]).rows(which)
+
+
+def _best(placed: Sequence[Placed]) -> Placed:
     """Return of several placements of the same pairs those with the largest evidence."""
     best = np.argmax([p.evidence for p in placed], axis=0)
-    count = len(best)
-    return concatenated(list(placed)).rows(best * count + np.arange(count))
+    return concatenated(list(placed)).rows(best * len(best) + np.arange(len(best)))
 
 
 class Registration:
@@ -106,7 +174,32 @@ class Registration:
         self._object, length = objects(clouds, RegistrationConfig.gap)
         self._most = -np.log(RegistrationConfig.moves) * np.maximum(length / RegistrationConfig.long, 1.0)
 
-    def descend(self, i: Ints, points: PairPoints, start: Floats, mean: Floats, covariance: Floats) -> Placed:
+    def register(self, i: Ints, j: Ints, points: PairPoints, prior: Prior, other: Floats) -> Placement:
+        """Place sources j (e,) in targets i (e,).
+
+        Parameters
+        ----------
+        points : of the sources, see pair_points. other : (e, 3) further poses to start from.
+        """
+        c = RegistrationConfig
+        sound = self._descend(i, points, prior.mean, prior.mean, prior.covariance)
+        log_odds = np.where(sound.factors.asked > 0, self._most_odds(sound, prior), 0.0)
+        rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
+        slipped = self._from_best(i, points, prior, rows, [other[rows]])
+        for least, further in ((c.good_share, self._shares), (c.least_share, self._searched)):
+            poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
+            lost = rows[poor]
+            found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
+            slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
+        log_odds[rows] = slipped.evidence - sound.evidence[rows]
+        return Placement(sound, rows, slipped, log_odds)
+
+    def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
+        """Place some pairs (r,) whose wheels slipped, from the best of several starts (r, 3)."""
+        some, own = PairPoints(points.row[rows]), prior.rows(rows)
+        return _best([self._descend(i[rows], some, start, own.mean, own.slipped) for start in starts])
+
+    def _descend(self, i: Ints, points: PairPoints, start: Floats, mean: Floats, covariance: Floats) -> Placed:
         """Place sources in targets i (e,) under Gaussian priors, each from its start (e, 3).
 
         Parameters
@@ -114,33 +207,50 @@ class Registration:
         mean, covariance : (e, 3) and (e, 3, 3) of x, y, heading of T_i_j. points : of the sources, see pair_points.
         """
         c = RegistrationConfig
-        information = np.linalg.inv(covariance)
+        information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         pose, variance = start.copy(), self.sigma**2
-        gate, temper = c.first_gate, 1.0
+        gate, temper, left = c.first_gate, 1.0, np.arange(len(i))
         for _ in range(c.iterations):
-            factors, _ = self._match(i, points, pose, gate, covariance * temper)
-            step = self._step(factors, information, pose, mean)
-            pose += step
-            pose[:, 2] = se2.wrap_angle(pose[:, 2])
-            if gate <= c.gate and temper < 0.01 and np.abs(step).max(initial=0.0) < _CONVERGED:
-                break
-            gate, temper = max(gate * c.shrink, c.gate), temper * _COOLING
+            factors, _ = self._match(i[left], PairPoints(points.row[left]), pose[left], gate, covariance[left] * temper)
+            step = self._step(factors, information[left], pose[left], mean[left])
+            pose[left] += step
+            if gate <= c.gate and temper < c.cold:
+                left = left[np.abs(step).max(axis=1) >= c.converged]
+            gate, temper = max(gate * c.shrink, c.gate), temper * c.cooling
+        pose[:, 2] = se2.wrap_angle(pose[:, 2])
         factors, judged = self._match(i, points, pose, c.gate, np.zeros_like(covariance))
-        likelihood, top, share = (np.concatenate([getattr(part, n) for part in judged]) for n in ("likelihood", "most", "share"))
+        likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
         hessian = factors.hessian / (variance * c.correlation)
         off = _difference(pose, mean)
         distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
         prior = -distance - 0.5 * np.linalg.slogdet(covariance)[1]
         volume = -0.5 * np.linalg.slogdet(hessian + information)[1]
-        return Placed(pose, factors, likelihood + prior + volume, distance + top - likelihood, share)
+        evidence, lost = likelihood + prior + volume, distance + most - likelihood
+        after = np.asarray(np.linalg.inv(hessian + information), dtype=np.float64)
+        return Placed(pose, factors, after, evidence, lost)
 
-    def most_odds(self, placed: Placed, one: Floats, other: Floats) -> Floats:
-        """Return by how much the evidence of pairs (e,) would rise at most under another covariance (e, 3, 3) of their priors.
+    @staticmethod
+    def _shares(i: Ints, j: Ints, prior: Prior) -> list[Floats]:
+        """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
+        return [share * prior.mean for share in (1.0, 0.5, 0.0)]
 
-        It does where everything agrees there, with the information that it has here.
-        """
+    def _searched(self, i: Ints, j: Ints, prior: Prior) -> list[Floats]:
+        """Return poses (e, 3) from which matching may begin, by exhaustive search of two standard deviations."""
+        c, within = RegistrationConfig, 2.0 * np.sqrt(np.einsum("eii->ei", prior.slipped))
+        starts = np.tile(prior.mean, (c.places, 1, 1))
+        for row, (target, source) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
+            pair = self._clouds.chosen(np.array([target, source]))
+            raster = rasterize(pair.chosen(np.array([0])), c.cell, c.first_gate)
+            window = Window(float(within[row, :2].max()), float(within[row, 2]))
+            points = pair_points(pair, np.array([1]), c.scored).of(0)
+            found = best_poses(pair, raster, points, prior.mean[row], window, c.places)
+            starts[: len(found), row] = found
+        return list(starts)
+
+    def _most_odds(self, placed: Placed, prior: Prior) -> Floats:
+        """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
         hessian = placed.factors.hessian / (self.sigma**2 * RegistrationConfig.correlation)
-        here, there = (np.linalg.slogdet(np.eye(3) + covariance @ hessian)[1] for covariance in (one, other))
+        here, there = (np.linalg.slogdet(np.eye(3) + cov @ hessian)[1] for cov in (prior.covariance, prior.slipped))
         return np.asarray(placed.evidence_lost + 0.5 * (here - there))
 
     def _step(self, factors: PairFactors, information: Floats, pose: Floats, mean: Floats) -> Floats:
@@ -149,27 +259,30 @@ class Registration:
         hessian = factors.hessian / scale + information
         gradient = factors.gradient / scale + np.einsum("eij,ej->ei", information, _difference(pose, mean))
         step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
+        far, wide = RegistrationConfig.farthest
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / far, np.abs(step[:, 2]) / wide)
         return np.asarray(step / np.maximum(reach, 1.0)[:, None])
 
-    def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats) -> Bools:
+    def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats, covariance: Floats) -> Bools:
         """Return which points (p,) of all clouds belong to objects of sources j (e,) that moved by themselves.
 
         Parameters
         ----------
-        pose : (e, 3) T_i_j. For the others see descend.
+        pose, covariance : (e, 3) T_i_j and (e, 3, 3). For the others see register.
         """
         moves = np.zeros(len(self._clouds.points), dtype=bool)
         for found in correspondences(self._clouds, self._raster, i, pose, points, RegistrationConfig.gate):
             some = found.pairs
-            judged = self._judge(found, i[some], pose[some], np.zeros((len(pose[some]), 3, 3)))
+            judged = self._judge(found, i[some], pose[some], covariance[some])
             for source, static in zip(j[some].tolist(), judged.static, strict=True):
                 rows = slice(int(self._clouds.offsets[source]), int(self._clouds.offsets[source + 1]))
                 number = np.minimum(self._object[rows], len(static) - 1)
-                moves[rows] = (static[number] < _UNLIKELY) & (self._object[rows] < len(static))
+                moves[rows] |= (static[number] < _UNLIKELY) & (self._object[rows] < len(static))
         return moves
 
-    def _match(self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats) -> tuple[PairFactors, list["_Judged"]]:
+    def _match(
+        self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats
+    ) -> tuple[PairFactors, list["_Judged"]]:
         """Return factors of the objects that do not move, and how each pair agrees, at poses (e, 3)."""
         parts, judged = [], []
         for found in correspondences(self._clouds, self._raster, i, pose, points, gate):
@@ -206,7 +319,6 @@ class Registration:
             1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
             np.logaddexp(fixed + stays, -most).sum(axis=1),
             np.logaddexp(fixed + np.minimum(gain * asked, most), -most).sum(axis=1),
-            found.good.sum(axis=1) / np.maximum((found.good | through).sum(axis=1), 1),
         )
 
 
@@ -220,15 +332,11 @@ class _Judged:
     """(e,) log likelihood of the source, by that in unknown space."""
     most: Floats
     """(e,) the same where every point agreed."""
-    share: Floats
-    """(e,) share of the points in view that match, 0..1."""
 
 
 _FARTHEST, _WIDEST = 0.3, 0.15
-_LINEAR = 0.1
 _UNLIKELY, _HUGE = 0.5, 50.0
-_CONVERGED = 1e-4
-_COOLING = 0.6
+"""Probability of standing still below which an object moves, and the largest exponent."""
 
 
 def _difference(pose: Floats, mean: Floats) -> Floats:

@@ -1,8 +1,9 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
-Neighbouring clouds are aligned from the odometry's guess, all at once. A pair that then shares few points had a bad guess
-(slip, a fast turn between sparse scans, wheels that count backwards as forwards): its pose is searched for in the local sub-map
-of the keyframes before. Where that finds nothing, or two equally good places, the step is left to the odometry.
+Neighbouring clouds are aligned from the odometry's guess, all at once; that shows the calibration and the noise of the wheels.
+Each step is then registered with what the wheels count as its prior, and with the possibility that they slipped. A slip lasts:
+the evidence of all steps together decides (see slips). Where the wheels slipped, their edges get the uncertainty of that; where
+they did not, no match takes a step far from them.
 """
 
 from dataclasses import dataclass
@@ -14,14 +15,14 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..graph.solver import SolverConfig, optimize
-from ..odometry.slips import EVERY, LASTS, covariance_of, posterior, slip_sigma, with_slips
+from ..graph.solver import SolverConfig
+from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
-from .registration import Placed, Registration, best_of
-from .scan_matching import PairPoints, match, measured, pair_points
+from .registration import Placed, Prior, Registration
+from .scan_matching import match, measured, pair_points
 from .visibility import nearest_by_bearing
 
 
@@ -32,11 +33,7 @@ class TrackingConfig:
     on: bool = True
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     good_share: ClassVar[float] = 0.75
-    """Neighbours that share at least this part of their points need no search."""
-    distance: float = 0.4
-    """Half-width of the search beyond twice the motion by the odometry, m: wheels may count backwards as forwards."""
-    angle: float = 0.45
-    """Half-width of the search in heading beyond half the turn by the odometry, rad."""
+    """Neighbours that share at least this part of their points are certain of their step, wherever the odometry put it."""
     gate: ClassVar[float] = 0.15
     """Farthest match at the end, m."""
     points: ClassVar[int] = 150
@@ -67,40 +64,18 @@ class ScanOdometry:
     """(p,) points of the clouds that belong to objects that moved by themselves."""
 
 
-_ELSEWHERE = 0.12
-"""m or rad; an error that a step of faultless odometry never has."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
     """Steps between neighbouring keyframes after descent from a guess."""
 
     i: Ints
     """(e,) keyframes at which they begin, increasing."""
-    guess: Floats
-    """(e, 3)."""
     pose: Floats
     """(e, 3) where descent ended."""
     share: Floats
     """(e,) share of the points looked up that match there."""
     enough: Bools
     """(e,) whether the clouds have enough points to measure a step."""
-
-    def contradicted(self, config: TrackingConfig) -> Ints:
-        """Return the keyframes (s,) whose step the clouds contradict: few points match, or they fit at another pose."""
-        off = se2.between(self.guess, self.pose)
-        elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
-        return self.i[self.enough & ((self.share < config.good_share) | elsewhere)]
-
-    def with_others(self, i: Ints, rows: Ints, others: "Steps") -> "Steps":
-        """Return some rows (r,) of these steps, now beginning at keyframes i (r,), among others."""
-        begins = np.concatenate([i, others.i])
-        order = np.argsort(begins)
-        columns = [
-            np.concatenate([getattr(self, name)[rows], getattr(others, name)])[order]
-            for name in ("guess", "pose", "share", "enough")
-        ]
-        return Steps(begins[order], *columns)
 
 
 def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float, config: TrackingConfig) -> Steps:
@@ -112,12 +87,12 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
     """
     points = pair_points(clouds, i + 1, config.points)
     aligned = align_pairs(clouds, raster, i, guess, points, gate, min(config.gate, gate))
-    return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
+    return Steps(i, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float, config: TrackingConfig,
-    solver: SolverConfig,
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
+    config: TrackingConfig, solver: SolverConfig,
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
@@ -126,51 +101,51 @@ def follow(
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes. graph : holds their calibration.
     steps : the same steps after descent, see descend. gate : reach of the raster, m.
+    solver : for the calibration of the wheels.
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
     certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
-    # Slips bend what ranges and wheels alone say of the calibration: it is taken from the steps.
-    graph = optimize(graph.with_edges(wheels, certain), solver)[0]
     noise = reestimate_wheel_noise(wheels, certain, graph)
-    points, registration = pair_points(clouds, i + 1, config.points), Registration(clouds, raster, nearest_by_bearing(clouds), sigma)
-    placed, probability, searched = _placed(registration, noise, graph, steps.pose, points)
+    registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma)
+    sound = covariance_of(noise, graph)
+    prior = Prior(noise.corrected(graph), sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
+    found = registration.register(i, i + 1, pair_points(clouds, i + 1, config.points), prior, steps.pose)
+    slips = posterior(found.log_odds, wheels.duration)
+    placed = found.chosen(slips)
     seen = np.flatnonzero(placed.factors.matched >= _FEWEST)
     edges = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
-    miss = _miss(clouds, noise)
+    miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
-        edges, with_slips(noise, probability), float(np.median(miss)) if len(miss) else 0.0, searched, probability,
-        registration.moving(i, i + 1, points, placed.pose),
+        edges, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving
     )
 
 
-def _placed(
-    registration: Registration, wheels: OdometryEdges, graph: Graph, other: Floats, points: PairPoints
-) -> tuple[Placed, Floats, int]:
-    """Place each next cloud where the wheels counted it, or elsewhere if they slipped.
-
-    Parameters
-    ----------
-    other : (e, 3) further poses to start from. points : of the next clouds.
-
-    Returns
-    -------
-    Placements, probabilities of a slip (e,), and how many steps were searched for one.
-    """
-    i, mean, sound = wheels.i, wheels.corrected(graph), covariance_of(wheels, graph)
-    slips = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
-    placed = registration.descend(i, points, mean, mean, sound)
-    log_odds = registration.most_odds(placed, sound, slips)
-    asked = np.flatnonzero(log_odds > np.log(LASTS / EVERY))
-    starts = [mean[asked], 0.5 * mean[asked], 0.0 * mean[asked], other[asked]]
-    some = PairPoints(points.row[asked])
-    elsewhere = best_of([registration.descend(i[asked], some, start, mean[asked], slips[asked]) for start in starts])
-    log_odds[asked] = elsewhere.evidence - placed.evidence[asked]
-    probability = posterior(log_odds, wheels.duration)
-    return placed.replaced(asked, elsewhere, probability[asked] > 0.5), probability, len(asked)
-
-
 _FEWEST = 6
+"""Matches from which on a step is measured: twice its unknowns."""
+
+
+def _moving(
+    registration: Registration, clouds: Clouds, first: Ints, placed: Placed, config: TrackingConfig
+) -> Bools:
+    """Return which points (p,) belong to objects that moved since the keyframe before, or one some steps before.
+
+    What moves slowly shows over several steps only; the uncertainty of a chain of steps grows with their number.
+    """
+    i, j, pose, covariance = first, first + 1, placed.pose, placed.covariance
+    moves = np.zeros(len(clouds.points), dtype=bool)
+    for _ in range(_STEPS_BACK):
+        moves |= registration.moving(i, j, pair_points(clouds, j, config.points), pose, covariance)
+        after = np.flatnonzero(np.isin(j, first))
+        follows = np.searchsorted(first, j[after])
+        turn = se2.rotation(pose[after, 2])
+        covariance = covariance[after] + turn @ placed.covariance[follows] @ np.swapaxes(turn, 1, 2)
+        i, j, pose = i[after], j[after] + 1, se2.compose(pose[after], placed.pose[follows])
+    return moves
+
+
+_STEPS_BACK = 4
+"""Steps over which objects that move are sought: a second or two."""
 
 
 def reattached(
@@ -236,3 +211,4 @@ def _edges(
 
 
 _LEAST_SIGMA = 0.02
+"""Standard deviation of a match that clouds cannot fall below, m: walls are no straighter."""

@@ -24,8 +24,10 @@ people walk. They count at most all of their motion too much."""
 def slip_sigma(wheels: OdometryEdges) -> Floats:
     """Return the standard deviation (e, 3) of steps of the odometry over which the wheels slip, m, m, rad."""
     way, turned = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]), np.abs(wheels.motion[:, 2])
-    place = way + SPEED * wheels.duration
-    return np.stack([place, place, turned + TURN_RATE * wheels.duration], axis=1)
+    # A slip does not last as long as a pause.
+    lasts = -LASTS * np.expm1(-wheels.duration / LASTS)
+    place = way + SPEED * lasts
+    return np.stack([place, place, turned + TURN_RATE * lasts], axis=1)
 
 
 def covariance_of(wheels: OdometryEdges, graph: Graph) -> Floats:
@@ -44,10 +46,12 @@ def posterior(log_odds: Floats, duration: Floats) -> Floats:
     log_odds : (e,) log of the likelihood of what was measured over each step if they slip, by that if they do not; 0 where
         nothing was. duration : (e,) s.
     """
-    starts, ends = -np.expm1(-duration / EVERY), -np.expm1(-duration / LASTS)
+    share = LASTS / (EVERY + LASTS)
+    settled = -np.expm1(-duration * (1.0 / EVERY + 1.0 / LASTS))
+    starts, ends = share * settled, (1.0 - share) * settled
     likelihood = np.exp(np.stack([np.minimum(-log_odds, 0.0), np.minimum(log_odds, 0.0)], axis=1))
     steps = np.stack([np.stack([1.0 - starts, starts], axis=1), np.stack([ends, 1.0 - ends], axis=1)], axis=1)
-    before = np.array([1.0, LASTS / EVERY])
+    before = np.array([1.0 - share, share])
     forward, backward = np.empty((len(log_odds), 2)), np.ones((len(log_odds), 2))
     for k in range(len(log_odds)):
         before = likelihood[k] * (before @ steps[k])

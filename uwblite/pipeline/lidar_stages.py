@@ -44,10 +44,10 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """
     estimate, steps = _descended(make_clouds(estimate, task), task)
     track = _followed(estimate, steps, task)
-    estimate, former = _with_keyframes_where_slipped(replace(estimate, odometry=track.wheels), track.slips, task)
-    if former is not None:
-        steps = _with_new_steps(estimate, steps, former, task)
-        track = _followed(estimate, steps, task)
+    cut = _with_keyframes_where_slipped(replace(estimate, odometry=track.wheels), track.slips, task)
+    if cut is not None:
+        estimate = cut
+        track = _followed(estimate, _steps(estimate, task), task)
     estimate = _match_neighbours(estimate, track, task.following(estimate))
     for _ in range(_RETIMINGS):
         late = _late(estimate)
@@ -91,13 +91,13 @@ def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
     weak, config = _with_inflated_ranges(estimate), task.config
     whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
     estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*whole), rough(config.solver))[0])
-    return estimate, _steps(estimate, np.arange(len(estimate.odometry)), task)
+    return estimate, _steps(estimate, task)
 
 
-def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
-    """Return some steps of the odometry (r,) as the clouds measure them from the estimate's poses."""
-    scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i[rows]
-    config, guess = task.config, se2.between(poses[i], poses[i + 1])
+def _steps(estimate: Estimate, task: Task) -> Steps:
+    """Return the steps of the odometry as the clouds measure them from the estimate's poses."""
+    scans, poses, i, config = estimate.lidar, estimate.graph.poses, estimate.odometry.i, task.config
+    guess = se2.between(poses[i], poses[i + 1])
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
@@ -110,38 +110,28 @@ def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
     )  # fmt: skip
 
 
-def _with_keyframes_where_slipped(estimate: Estimate, slips: Floats, task: Task) -> tuple[Estimate, Ints | None]:
+def _with_keyframes_where_slipped(estimate: Estimate, slips: Floats, task: Task) -> Estimate | None:
     """Cut the steps of the odometry in which it slipped, with a probability (e,), at the scans within them.
 
-    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud.
-
-    Returns
-    -------
-    The estimate, and (k,) the number that each keyframe had before, see scan_clouds.remake; None where nothing changes.
+    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud. None is returned
+    where no scans are within them.
     """
     before = task.recordings
     slipped = estimate.odometry.i[slips > _LIKELY]
     after = denser(before, slipped, _CUTS)
     if len(after.stamps) == len(before.stamps):
-        return estimate, None
-    scans, former = scan_clouds.remake(estimate.lidar, before, after, task.config)
+        return None
+    scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
     task.stages.end("keyframes added", steps=len(slipped), keyframes=len(after.stamps))
-    return replace(with_keyframes(estimate, before, after), scans=scans), former
+    return replace(with_keyframes(estimate, before, after), scans=scans)
 
 
 _LIKELY = 0.5
-
-
-def _with_new_steps(estimate: Estimate, steps: Steps, former: Ints, task: Task) -> Steps:
-    """Return steps measured before keyframes were added, those of changed clouds measured again; former: see remake."""
-    i = estimate.odometry.i
-    kept = (former[i] >= 0) & (former[i + 1] == former[i] + 1)
-    rows = np.searchsorted(steps.i, former[i[kept]])
-    return steps.with_others(i[kept], rows, _steps(estimate, np.flatnonzero(~kept), task))
+"""Probability from which on a step slipped."""
 
 
 _CUTS = 4
-"""Keyframes added within a step that the clouds contradict, at most."""
+"""Keyframes added within a step that slipped, at most."""
 _CLOCK_TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
 _SIGNIFICANT = 3.0

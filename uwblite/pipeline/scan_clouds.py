@@ -22,13 +22,8 @@ def make(recordings: Recordings, config: MappingConfig, delay: float) -> ScanClo
     return _with_raster(clouds.joined(parts), config, delay)
 
 
-def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> tuple[ScanClouds, Ints]:
-    """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over.
-
-    Returns
-    -------
-    The clouds, and (k,) the number that each keyframe with the cloud it had before had then; -1 = it is new.
-    """
+def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
+    """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over."""
     pairs = list(zip(before.each, after.each, strict=True))
     former = np.concatenate([_former(a, b, config, old.delay) for a, b in pairs])
     changed = [np.flatnonzero(former[b.rows] < 0) for b in after.each]
@@ -36,7 +31,7 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     new = _with_raster(clouds.joined(parts), config, old.delay)
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
     both = clouds.joined([old.clouds, new.clouds]).chosen(place)
-    return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay), former
+    return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay)
 
 
 def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:

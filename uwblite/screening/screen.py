@@ -120,7 +120,7 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
         return log, OdometryBreaks.none(), []
     span = np.diff(stamps)
     period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
-    gaps = np.flatnonzero(span > max(_GAP, 20.0 * period))
+    gaps = np.flatnonzero((span > max(_GAP, 20.0 * period)) & ~_as_between_others(log.odometry))
     at, sigma, remarks, silent = [], [], list[Finding](), list[tuple[float, float]]()
     for k in gaps.tolist():
         a, b = float(stamps[k]), float(stamps[k + 1])
@@ -142,6 +142,22 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
         sigma.append(_ANYWHERE if elsewhere else (0.02, 0.02, 0.02) if stood else (0.1, 0.1, 0.1))
     found = OdometryBreaks(np.array(at), np.array(sigma)) if at else OdometryBreaks.none()
     return _without(log, silent), found, remarks
+
+
+def _as_between_others(odometry: Odometry) -> Bools:
+    """Return over which steps (n-1,) the robot moved no farther than over most others.
+
+    A log thinned by motion holds a reading each so many centimetres, and none while the robot stands: the wheels counted all
+    the same, and the reading after a pause has the noise of the way that it shows.
+    """
+    motion = np.abs(odometry.steps)
+    way, moved = np.hypot(motion[:, 0], motion[:, 1]), np.diff(odometry.stamps) > 0.0
+    usual = [float(np.quantile(part[moved], _USUAL)) if moved.any() else 0.0 for part in (way, motion[:, 2])]
+    return np.asarray((way > _STANDS[0]) & (way <= usual[0]) & (motion[:, 2] <= usual[1]))
+
+
+_USUAL = 0.99
+"""Share of steps up to whose largest a step is usual."""
 
 
 def _elsewhere(log: SensorLog, a: float, b: float) -> bool:

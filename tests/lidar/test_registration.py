@@ -1,0 +1,112 @@
+"""Registration: evidence by numerical integration, slips that show, objects that move, clouds that say nothing."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import ROOM, scanned
+
+from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.clouds import joined
+from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, objects
+from uwblite.lidar.scan_matching import PairPoints, pair_points
+from uwblite.lidar.visibility import nearest_by_bearing
+
+SIGMA = 0.02
+SOUND, SLIPPED = np.array([0.01, 0.01, 0.01]), np.array([0.4, 0.4, 0.3])
+
+
+def registered(clouds, mean, sound=SOUND):
+    """Register cloud 1 in cloud 0 where the odometry counts a motion."""
+    registration = Registration(clouds, rasterize(clouds, 0.1, 0.5), nearest_by_bearing(clouds), SIGMA)
+    covariance = np.diag(sound**2)[None]
+    prior = Prior(np.array([mean]), covariance, covariance + np.diag(SLIPPED**2))
+    one, points = np.array([0]), pair_points(clouds, np.array([1]), 150)
+    return registration, points, prior, registration.register(one, one + 1, points, prior, prior.mean)
+
+
+@pytest.fixture(scope="module")
+def room():
+    truth = np.array([[-1.0, 0.5, 0.2], [-0.8, 0.55, 0.3]])
+    return truth, scanned(truth, ROOM, 0.01, 3)
+
+
+@pytest.mark.parametrize(("slip", "sign"), [((0.0, 0.0, 0.0), -1.0), ((0.25, 0.0, 0.2), 1.0), ((-0.2, 0.05, -0.25), 1.0)])
+def test_clouds_tell_a_slip_from_none(room, slip, sign):
+    truth, clouds = room
+    step = se2.between(truth[0], truth[1])
+    *_, found = registered(clouds, step + slip)
+    assert sign * found.log_odds[0] > 3.0
+    (pose,) = found.chosen(np.array([float(sign > 0)])).pose
+    assert np.abs(se2.between(step, pose)).max() < 0.015
+
+
+def test_what_is_measured_leaves_the_prior_out(room):
+    """A prior of a millimetre holds the pose 2 cm beside the truth; the matches still say where they would be."""
+    truth, clouds = room
+    step = se2.between(truth[0], truth[1])
+    *_, found = registered(clouds, step + np.array([0.02, 0.0, 0.0]), np.full(3, 0.001))
+    assert found.sound.pose[0, 0] - step[0] > 0.01
+    z, root = found.sound.measured(SIGMA**2)
+    assert np.abs(se2.between(step, z[0])).max() < 0.01
+    assert np.linalg.matrix_rank(root[0]) == 3
+
+
+def test_the_evidence_is_that_of_numerical_integration(room):
+    """Laplace's approximation, within half a unit of the sum over a grid; the likelihood's constant cancels in neither."""
+    truth, clouds = room
+    registration, points, prior, found = registered(clouds, se2.between(truth[0], truth[1]))
+    mode, spread = found.sound.pose[0], np.sqrt(np.diag(found.sound.covariance[0]))
+    axis = np.linspace(-5.0, 5.0, 13)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    shifts = grid @ np.linalg.cholesky(found.sound.covariance[0]).T
+    many = np.zeros(len(grid), dtype=np.int64)
+    rows = PairPoints(np.repeat(points.row, len(grid), axis=0))
+    _, judged = registration._match(many, rows, mode + shifts, RegistrationConfig.gate, np.zeros((len(grid), 3, 3)))
+    off = mode + shifts - prior.mean
+    information = np.linalg.inv(prior.covariance[0])
+    log = np.concatenate([part.likelihood for part in judged]) - 0.5 * np.einsum("gi,ij,gj->g", off, information, off)
+    log -= 0.5 * np.linalg.slogdet(prior.covariance[0])[1] + 1.5 * np.log(2.0 * np.pi)
+    cell = (axis[1] - axis[0]) ** 3 * np.sqrt(np.linalg.det(found.sound.covariance[0]))
+    assert found.sound.evidence[0] == pytest.approx(np.log(np.sum(np.exp(log - log.max())) * cell) + log.max(), abs=0.7)
+    assert spread.max() < SOUND.max()
+
+
+def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
+    """It fills a third of the view and moves 6 cm a step; the walls behind it stand."""
+    truth = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    thing = np.array([[1.2, -0.9, 1.2, 0.9], [1.2, 0.9, 1.3, 0.9]])
+    walls = np.array([[-3.0, -2.5, 3.5, -2.5], [3.5, -2.5, 3.5, 2.5], [3.5, 2.5, -3.0, 2.5], [-3.0, 2.5, -3.0, -2.5]])
+    before = scanned(truth[:1], np.concatenate([walls, thing]), 0.005, 1)
+    after = scanned(truth[1:], np.concatenate([walls, thing + np.array([0.06, 0.0, 0.06, 0.0])]), 0.005, 2)
+    clouds = joined([before, after])
+    registration, points, _, found = registered(clouds, truth[1])
+    assert found.log_odds[0] < 0.0
+    assert np.abs(se2.between(truth[1], found.sound.pose[0])).max() < 0.01
+    one = np.array([0])
+    moving = registration.moving(one, one + 1, points, found.sound.pose, found.sound.covariance)
+    x = clouds.points[:, 0] + truth[clouds.owner, 0]
+    on_thing = (clouds.owner == 1) & (np.abs(x - 1.26) < 0.05) & (np.abs(clouds.points[:, 1]) < 0.85)
+    assert moving[on_thing].mean() > 0.9
+    assert moving[(clouds.owner == 1) & (x < 1.0)].mean() < 0.1
+    assert not moving[clouds.owner == 0].any()
+
+
+def test_clouds_without_surfaces_leave_the_prior_as_it_is():
+    truth = np.zeros((2, 3))
+    *_, found = registered(scanned(truth, ROOM + 100.0), [0.3, 0.0, 0.1])
+    assert found.log_odds.tolist() == [0.0]
+    np.testing.assert_allclose(found.sound.pose, [[0.3, 0.0, 0.1]])
+    np.testing.assert_allclose(found.sound.covariance[0], np.diag(SOUND**2), rtol=1e-9)
+    assert not found.sound.measured(SIGMA**2)[1].any()
+
+
+def test_objects_end_at_gaps_and_at_the_end_of_a_cloud(room):
+    _, clouds = room
+    number, length = objects(clouds, 0.4)
+    for k in range(2):
+        rows = slice(clouds.offsets[k], clouds.offsets[k + 1])
+        away = np.hypot(*np.diff(clouds.points[rows].astype(float), axis=0).T)
+        np.testing.assert_array_equal(number[rows], np.concatenate([[0], np.cumsum(away > 0.4)]))
+        for n in np.unique(number[rows]):
+            own = np.flatnonzero(number[rows] == n)
+            np.testing.assert_allclose(length[rows][own], away[own[:-1]].sum())
