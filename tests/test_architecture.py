@@ -20,6 +20,7 @@ FLOORS = (
     ("errors", "arrays"),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
+    ("problem",),
     ("constraints", "odometry", "grid"),
     ("map_result", "radio", "navigation"),
     ("lidar", "report"),
