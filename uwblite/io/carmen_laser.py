@@ -140,6 +140,10 @@ class LaserMessages:
         """Return (k, 4) stamp and pose of the robot of every message that gives them."""
         return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]]
 
+    def poses_are_the_robots(self, T_base_laser: Floats | None) -> bool:
+        """Return whether the messages are FLASER, whose poses of laser and robot are the same."""
+        return self._kind == b"FLASER" and T_base_laser is not None and not T_base_laser.any()
+
     def finish(
         self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float] | None = None
     ) -> tuple[LaserScans | None, Floats | None]:
