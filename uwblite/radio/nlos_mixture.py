@@ -25,6 +25,8 @@ _CLEAN = 15.0
 """Prior number of ranges in the core: a few ranges alone determine neither tail nor gross errors."""
 _NARROWED, _PARTS = 5, 32
 """Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
+_NEVER = 1e-300
+"""Density, 1/m, that is added where all parts underflow."""
 _WIDEST = 2.0
 """Least width of the distribution of gross errors, m."""
 
@@ -46,11 +48,15 @@ class RangeMixture:
     width: float
     """Width of the distribution of gross errors, m."""
 
+    def density(self, errors: Floats) -> Floats:
+        """Return the probability density (m,) of each error, 1/m."""
+        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
+        return (1.0 - self.tail - self.wild) * normal + self.tail * late + self.wild / self.width + _NEVER
+
     def core(self, errors: Floats) -> Floats:
         """Return the probability (m,) of each error to be of the core."""
-        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
-        core = (1.0 - self.tail - self.wild) * normal
-        return core / (core + self.tail * late + self.wild / self.width + 1e-300)
+        normal, _ = _densities(errors - self.centre, self.sigma, self.detour)
+        return (1.0 - self.tail - self.wild) * normal / self.density(errors)
 
     def mode(self) -> float:
         """Return the likeliest error, m."""
@@ -73,7 +79,7 @@ class RangeMixture:
         normal, late = _densities(off, self.sigma, self.detour)
         core = (1.0 - self.tail - self.wild) * normal
         slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
-        return slope / (core + self.tail * late + self.wild / self.width + 1e-300)
+        return slope / self.density(off + self.centre)
 
 
 def fit(errors: Floats, least_sigma: float) -> RangeMixture:

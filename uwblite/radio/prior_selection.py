@@ -27,7 +27,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from ..graph.calibration import HEIGHT, CalibrationConfig
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
 from ..graph.graph import Edges, Graph
 from ..graph.joint_covariance import calibration_covariance
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
@@ -63,6 +63,27 @@ def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     sigma = prior_sigma(graph)
     sigma[scales], sigma[heights] = config.odometry_scale, _HIGH**2
     return with_prior_sigma(graph, sigma)
+
+
+def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:
+    """Return the graph with the priors of a radio whose antenna delays and unit are right, or narrower ones that it has."""
+    sigma = prior_sigma(graph)
+    for kind, widths in _widths(config):
+        own = graph.calibration.of_kinds(kind)
+        sigma[own] = np.minimum(sigma[own], widths[0])
+    return with_prior_sigma(graph, sigma)
+
+
+def is_uncalibrated(graph: Graph, config: CalibrationConfig) -> bool:
+    """Return whether priors of biases or of the scale are wider than the next that is tried after a calibrated radio's."""
+    sigma = prior_sigma(graph)
+    return any(np.any(sigma[graph.calibration.of_kinds(kind)] > max(widths[:2])) for kind, widths in _widths(config))
+
+
+def _widths(config: CalibrationConfig) -> tuple[tuple[str, list[float]], ...]:
+    """Return the widths tried of each kind of error of a radio, from those of a calibrated one on."""
+    biases = _between(config.range_bias_sound, config.range_bias)
+    return (BIAS, biases), (RANGE_SCALE, _between(config.range_scale_sound, config.range_scale))
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
@@ -155,7 +176,7 @@ def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats)
     return np.asarray(np.linalg.solve(precision + np.diag(after**-2.0 - before**-2.0), precision @ mean))
 
 
-def _between(low: float, high: float) -> Sequence[float]:
+def _between(low: float, high: float) -> list[float]:
     return [high] if not 0.0 < low < high else np.geomspace(low, high, _STEPS).tolist()
 
 
