@@ -21,6 +21,7 @@ FLOORS = (
     ("validation", "field_docs"),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
+    ("problem",),
     ("constraints", "odometry", "grid"),
     ("map_result", "radio", "navigation"),
     ("lidar", "report"),

@@ -74,7 +74,7 @@ def build_map(
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
     logs = [scan_selection.prepared(log, config) for log in logs]
-    config = scan_selection.with_one_clock(odometry_units.with_units_checked(config, logs), logs)
+    config = odometry_units.with_given_mounting_and_clock(odometry_units.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)

@@ -198,6 +198,47 @@ def test_flaser_of_a_corrected_log_reports_nothing_of_the_mounting(tmp_path):
     assert "do not fit together" in log.notes.warnings[0]
 
 
+def queued(other=0.0, apart=0.1):
+    """Return a log of 120 rounds of ODOM, ODOM, FLASER that arrive six rounds at a time, and the poses in its FLASER.
+
+    Parameters
+    ----------
+    other : m, place of the poses in FLASER beside those of ODOM. apart : s between rounds.
+    """
+    lines, poses = [], []
+    for k in range(120):
+        t = 6 * apart * (k // 6) + 0.003 * (k % 6)
+        lines += [f"ODOM {0.1 * k + x:.3f} 0 0 0 0 0 {t + x / 50:.6f} robot {t + x / 50:.6f}\n" for x in (0.03, 0.08)]
+        poses.append((0.1 * k + 0.1, other, 0.01 * k))
+        pose = " ".join(f"{v:.3f}" for v in poses[-1])
+        lines.append(f"FLASER 3 1 2 3 {pose} {pose} {t + 0.002:.6f} robot {t + 0.002:.6f}\n")
+    return "".join(lines), np.array(poses)
+
+
+def test_poses_that_came_with_scans_replace_odometry_whose_stamps_are_those_of_receipt(tmp_path):
+    text, poses = queued()
+    log = read(tmp_path, text)
+    np.testing.assert_allclose(log.odometry.poses, poses)
+    np.testing.assert_array_equal(log.odometry.stamps, log.scans.stamps)
+    assert "times of receipt in bursts" in log.notes.warnings[0]
+
+
+def test_poses_of_another_frame_replace_nothing(tmp_path):
+    assert len(read(tmp_path, queued(other=3.0)[0]).odometry.stamps) == 240
+
+
+def test_a_log_whose_scans_have_the_robots_poses_is_one_of_its_laser(tmp_path):
+    """By FLASER, or by the parameter with which it is written again; not where the two differ."""
+    log = read(tmp_path, queued()[0])
+    assert log.mounting.laser_is_base
+    write_log(tmp_path / "again.log", log)
+    again = read_log(tmp_path / "again.log")
+    assert again.mounting.laser_is_base
+    np.testing.assert_allclose(again.odometry.poses, log.odometry.poses)
+    assert not read(tmp_path, odometry() + "FLASER 3 1 2 3 0.2 0 0 0 0 0 1 robot 1\n").mounting.laser_is_base
+    assert not read(tmp_path, odometry() + robotlaser(READINGS, 0.7)).mounting.laser_is_base
+
+
 def test_the_richest_laser_message_wins(tmp_path):
     raw = "RAWLASER1 0 -1 2 1 8 0.01 0 3 1 2 3 0 0.5 robot 1\n"
     front = "FLASER 3 1 2 3 0 0 0 0 0 0 0.6 robot 1\n"

@@ -42,17 +42,16 @@ def test_clouds_are_made_and_their_points_counted(monkeypatch):
     assert made.graph.fixed_calibration.tolist() == [False, True]
 
 
-@pytest.mark.parametrize(("clock", "made", "sigma", "late"), [
-    (0.0139, 0.01, 0.0001, 0.0), (0.0141, 0.01, 0.001, 0.0041), (-0.02, 0.0, 0.006, -0.02), (-0.02, 0.0, 0.007, 0.0),
-])  # fmt: skip
-def test_a_clock_is_late_beyond_a_tolerance_and_three_standard_deviations(monkeypatch, clock, made, sigma, late):
-    """Of 4 ms, against the offset with which the clouds were made."""
-    calibration = Calibration((UnknownKey("laser_x"), UnknownKey("laser_delay")), np.array([9.0, clock]))
-    covariances = SimpleNamespace(calibration=np.array([0.0, sigma]))
-    monkeypatch.setattr(lidar_stages, "marginals", lambda graph: SimpleNamespace(covariances=covariances))
-    graph = replace(loop()[0], calibration=calibration)
-    estimate = Estimate(graph, graph.edges[0], None, (), scans=ScanClouds(None, None, made))
-    assert lidar_stages._late(estimate) == pytest.approx(late)
+@pytest.mark.parametrize("placed", ["elsewhere", "given"])
+def test_wheels_may_turn_about_another_point_where_the_place_of_the_laser_is_given(monkeypatch, placed):
+    """Both explain the same residuals."""
+    monkeypatch.setattr(lidar_stages.scan_clouds, "make", lambda *_: ScanClouds(SimpleNamespace(points=()), None, 0.0))
+    keys = ("sideways_per_turn", *(("laser_x",) if placed == "elsewhere" else ()))
+    graph = replace(loop()[0], calibration=Calibration(tuple(map(UnknownKey, keys)), np.zeros(len(keys))))
+    graph = replace(graph, fixed_calibration=np.ones(len(keys), dtype=bool))
+    task = SimpleNamespace(recordings=None, config=None, stages=Stages(None, None))
+    made = lidar_stages.make_clouds(Estimate(graph, graph.edges[0], None, ()), task)
+    assert made.graph.fixed_calibration.tolist() == ([True, False] if placed == "elsewhere" else [False])
 
 
 @pytest.mark.parametrize(("moved", "done"), [

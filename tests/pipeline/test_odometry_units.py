@@ -10,7 +10,7 @@ from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, UnknownKey
 from uwblite.pipeline.estimate import OtherHeights
 from uwblite.pipeline.mapping_config import MappingConfig
-from uwblite.pipeline.odometry_units import odometry_unit_factors, with_units_checked
+from uwblite.pipeline.odometry_units import odometry_unit_factors, with_given_mounting_and_clock, with_units_checked
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import Recordings
 
@@ -86,3 +86,25 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
     assert replace(found, calibration=config.calibration) == config
     if not checked:
         assert found is config
+
+
+@pytest.mark.parametrize(("late", "radio", "lidar"), [
+    ([()], 0.1, 0.1), ([("scans",)], 0.1, 0.0), ([("odometry",)], 0.0, 0.0), ([(), ("odometry", "scans")], 0.0, 0.0),
+])  # fmt: skip
+def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
+    mounting = SimpleNamespace(laser_is_base=False)
+    logs = [SimpleNamespace(screening=SimpleNamespace(in_bursts=s), mounting=mounting, scans=0) for s in late]
+    config = MappingConfig()
+    found = with_given_mounting_and_clock(config, logs)
+    expected = replace(config.calibration, range_delay=radio, laser_delay=lidar)
+    assert found == replace(config, calibration=expected)
+
+
+@pytest.mark.parametrize(("is_base", "fixed"), [([True], True), ([True, False], False), ([True, None], True), ([None], False)])
+def test_a_laser_whose_poses_the_log_gives_is_where_it_is_said_to_be(is_base, fixed):
+    """None: a recording without lidar."""
+    logs = [
+        SimpleNamespace(screening=None, mounting=SimpleNamespace(laser_is_base=bool(b)), scans=None if b is None else 0)
+        for b in is_base
+    ]
+    assert with_given_mounting_and_clock(MappingConfig(), logs).calibration.laser_offset == (0.0 if fixed else 0.1)

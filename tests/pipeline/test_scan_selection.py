@@ -14,6 +14,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
 from uwblite.pipeline import scan_selection
+from uwblite.pipeline.odometry_units import with_given_mounting_and_clock
 from uwblite.pipeline.scan_selection import prepared, thinned
 from uwblite.sensor_log import Odometry, SensorLog
 
@@ -80,5 +81,5 @@ def test_no_offset_of_the_lidars_clock_where_the_format_excludes_one():
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))))
     bound = replace(log, notes=replace(log.notes, one_clock=True))
     config = MappingConfig()
-    assert scan_selection.with_one_clock(config, [bound, bound]).calibration.laser_delay == 0.0
-    assert scan_selection.with_one_clock(config, [bound, log]) is config
+    assert with_given_mounting_and_clock(config, [bound, bound]).calibration.laser_delay == 0.0
+    assert with_given_mounting_and_clock(config, [bound, log]) == config

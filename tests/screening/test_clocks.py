@@ -35,6 +35,17 @@ def test_only_a_moving_robot_needs_times():
             clocks.refuse_without_stamps(SensorLog(odometry))
 
 
+def test_stamps_of_receipt_are_named_with_their_sensors():
+    queue, steady = 0.6 * (np.arange(200) // 6) + 0.001 * (np.arange(200) % 6), 0.1 * np.arange(200)
+    cases = (queue, queue, ("odometry", "scans")), (queue, steady, ("odometry",)), (steady, queue, ("scans",))
+    for odometry, lidar, named in (*cases, (steady, steady, ())):
+        sensors, remarks = clocks.in_bursts(SensorLog(moving(odometry), None, scans(lidar)))
+        assert sensors == named
+        assert [(r.kind, r.doubt) for r in remarks] == [("stamps-of-receipt", False)] * bool(named)
+        assert all(" and ".join(named) in r.text for r in remarks)
+    assert clocks.in_bursts(SensorLog(moving(queue)))[0] == ("odometry",)
+
+
 def even(period, count, uneven=0.0):
     return period * np.arange(count) + uneven * (np.arange(count) == 5)
 

@@ -151,7 +151,7 @@ def mounted(mounting: "SensorMounting", args: argparse.Namespace) -> "SensorMoun
     import numpy as np
 
     if args.laser_pose is not None:
-        mounting = dataclasses.replace(mounting, T_base_laser=np.array(args.laser_pose))
+        mounting = dataclasses.replace(mounting, T_base_laser=np.array(args.laser_pose), laser_is_base=False)
     if args.laser_flipped:
         mounting = dataclasses.replace(mounting, laser_flipped=True)
     if args.tag is not None:

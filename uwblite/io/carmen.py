@@ -24,8 +24,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import ConfigError, FormatError
-from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
+from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
 from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
@@ -243,7 +244,7 @@ class LogReader:
             set_back=self.set_back,
             one_clock=clock.of_scans,
         )
-        mounting = self.params.mounting(T_base_laser, self.tags)
+        mounting = self.params.mounting(T_base_laser, self.tags, self.laser.poses_are_the_robots(T_base_laser))
         return SensorLog(odometry, ranges, scans, mounting, notes, gyro=gyro)
 
     def _finish_odometry(self, warnings: list[str]) -> tuple[Odometry, LineClock]:
@@ -260,8 +261,29 @@ class LogReader:
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
             laser, laser_lines = laser[:0], laser_lines[:0]
         rows, clock = judged(rows, lines, laser, laser_lines, warnings)
+        if not clock.of_scans and len(tied := self._tied(rows)):
+            rows = tied
+            warnings.append(
+                "the stamps of the ODOM messages are times of receipt in bursts: the robot poses of the laser messages, which "
+                "are those of their scans, serve as odometry"
+            )
         order = time_order(rows[:, 0], "odometry", warnings, self.set_back)
         return Odometry(rows[order, 0], rows[order, 1:]), clock
+
+    def _tied(self, rows: Floats) -> Floats:
+        """Return stamp and robot pose (k, 4) of the laser messages where those of ODOM messages (n, 4) have stamps in bursts.
+
+        What drove between two scans is then known by the poses that came with them, whatever the stamps say. A corrected log
+        gives poses of another frame: these are farther from the odometry than from each other.
+        """
+        odometry = _sorted_odometry(rows)
+        if not odometry_in_bursts(odometry):
+            return np.zeros((0, 4))
+        tied, _ = self.laser.robot_poses()
+        tied = tied[np.argsort(tied[:, 0], kind="stable")]
+        off, step = tied[:, 1:3] - odometry.at(tied[:, 0])[:, :2], np.diff(tied[:, 1:3], axis=0)
+        one_frame = len(step) > 0 and np.median(np.hypot(*off.T)) <= np.median(np.hypot(*step.T))
+        return tied if one_frame else np.zeros((0, 4))
 
     def _finish_gyro(self, clock: LineClock, warnings: list[str]) -> Gyro | None:
         if not self.gyro:
@@ -290,3 +312,9 @@ class LogReader:
             warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")
         anchor = rank[rows[:, 1].astype(np.intp)]
         return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)
+
+
+def _sorted_odometry(rows: Floats) -> Odometry:
+    """Return the odometry of rows (n, 4) of stamp and pose."""
+    order = np.argsort(rows[:, 0], kind="stable")
+    return Odometry(rows[order, 0], rows[order, 1:])

@@ -141,6 +141,10 @@ class LaserMessages:
         """Return stamp and pose of the robot (k, 4) of every message that gives them, and its line (k,)."""
         return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]], np.array(self._pose_lines, dtype=np.intp)
 
+    def poses_are_the_robots(self, T_base_laser: Floats | None) -> bool:
+        """Return whether the messages are FLASER, whose poses of laser and robot are the same."""
+        return self._kind == b"FLASER" and T_base_laser is not None and not T_base_laser.any()
+
     def finish(
         self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float], clock: LineClock
     ) -> tuple[LaserScans | None, Floats | None]:

@@ -15,6 +15,8 @@ _NUMBERS = frozenset((
     "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset", "robot_front_laser_max", "laser_front_laser_max_range",
     "laser_front_laser_resolution", "laser_time_increment", "laser_range_min",
 ))  # fmt: skip
+LASER_IS_BASE = "laser_is_base"
+"""Parameter of uwblite's own: the poses of the log are those of the laser, see SensorMounting."""
 _TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
 _FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
 _OF_LASER = ("laser_time_increment", "laser_range_min", "laser_flipped")
@@ -35,7 +37,7 @@ class Params:
         self._names = {} if laser == 1 else dict.fromkeys(_OF_LASER, "")
         self._names |= {name.replace("laser", f"laser{laser}", 1): name for name in _OF_LASER}
         self._numbers: dict[str, float] = {}
-        self._flipped = False
+        self._flipped = self._laser_is_base = False
 
     def take(self, tokens: list[bytes]) -> None:
         """Take one line `PARAM name value ...`; names that mean nothing here are ignored."""
@@ -47,6 +49,8 @@ class Params:
             if tokens[2].lower() not in _TRUE:
                 raise BrokenLine(f"PARAM {name} must be on or off")
             self._flipped = _TRUE[tokens[2].lower()]
+        elif name == LASER_IS_BASE:
+            self._laser_is_base = _TRUE.get(tokens[2].lower(), False)
         elif name in _NUMBERS or _FURTHER_TAG.fullmatch(name) or name.startswith(_ANCHOR_HEIGHT):
             if name.startswith(_ANCHOR_HEIGHT) and (fault := fault_of_id(name.removeprefix(_ANCHOR_HEIGHT))):
                 raise BrokenLine(f"PARAM {_ANCHOR_HEIGHT}*: the anchor's id {fault}")
@@ -64,13 +68,14 @@ class Params:
         """Return whether the place of a further tag, 2 to 9, was given."""
         return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
 
-    def mounting(self, T_base_laser: Floats | None, tags: int = 1) -> SensorMounting:
+    def mounting(self, T_base_laser: Floats | None, tags: int = 1, laser_is_base: bool = False) -> SensorMounting:
         """Return the mounting; where the laser messages give no pose of the laser, CARMEN's robot_frontlaser_* count.
 
         Parameters
         ----------
         T_base_laser : (3,) by the laser messages, None = not given.
         tags : how many tags the robot has.
+        laser_is_base : the laser messages give the laser and the robot one pose, see SensorMounting.
         """
         given = self._numbers
         if T_base_laser is None:
@@ -78,6 +83,7 @@ class Params:
             T_base_laser = np.array([given.get(name, 0.0) for name in offsets])
         return SensorMounting(
             T_base_laser=T_base_laser,
+            laser_is_base=laser_is_base or self._laser_is_base,
             laser_flipped=self._flipped,
             tag_position=self._tag("uwb_"),
             more_tags=np.array([self._tag(f"uwb{k}_") for k in range(2, tags + 1)]).reshape(-1, 3),

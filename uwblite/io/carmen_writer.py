@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..sensor_log import LaserScans, SensorLog
+from .carmen_params import LASER_IS_BASE
 from .decimal_text import encode_fixed_point
 from .files import replacing
 
@@ -61,6 +62,8 @@ def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
             yield f"uwb_anchor_height_{anchor}", f"{height:.6f}"
     if log.scans is not None:
         yield "laser_flipped", "on" if mounting.laser_flipped else "off"
+        if mounting.laser_is_base:
+            yield LASER_IS_BASE, "on"
         yield "laser_time_increment", f"{log.scans.time_increment:.9g}"
         yield "laser_range_min", f"{log.scans.range_min:.6g}"
 

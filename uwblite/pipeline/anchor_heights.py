@@ -16,6 +16,7 @@ from ..graph.calibration import HEIGHT, RADIO, optimize_with_heights, with_free
 from ..graph.graph import Graph
 from ..graph.optimizer import Optimizer
 from ..graph.solver import SolverConfig
+from ..problem.evidence import laplace_marginal_likelihood
 from ..radio import prior_selection
 from .estimate import Estimate, OtherHeights, Task
 from .mapping_config import MappingConfig
@@ -70,7 +71,7 @@ def _with_high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Opt
     high, _ = optimize_with_heights(start.with_edges(*edges), compared(config.solver), optimizer)
     # Heights that were put back to 0 count as known no better than the others.
     graphs = estimate.graph.with_edges(*edges), high
-    likely = [prior_selection.laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in graphs]
+    likely = [laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in graphs]
     return start, high, likely[1] - likely[0]
 
 

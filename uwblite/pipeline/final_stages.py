@@ -48,7 +48,9 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     estimate = _with_range_errors(estimate, task)
     # Data for matching takes most of the memory; walls are needed once more where the map's axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
-    return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
+    # The clock with which clouds were made is uncertain as well.
+    graph = with_free(estimate.problem, "laser_delay")
+    return replace(estimate, graph=graph, scans=scans, steps=None, joint=None)
 
 
 def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Covariances]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..graph.calibration import LASER, RADIO, optimize_with_heights, with_free, with_nonnegative_heights
+from ..graph.calibration import LASER, RADIO, TURNING, optimize_with_heights, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
@@ -20,7 +20,7 @@ from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..radio.tag_pattern import without_pattern
-from . import scan_clouds, turn_checks
+from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
 from .progress import solver_figures
@@ -29,10 +29,12 @@ from .recordings import denser, later
 
 
 def make_clouds(estimate: Estimate, task: Task) -> Estimate:
-    """Make a cloud for each keyframe, and free the laser's mounting and clock."""
+    """Make a cloud for each keyframe, and free the laser's mounting and clock, or where it turns."""
     scans = scan_clouds.make(task.recordings, task.config, 0.0)
     task.stages.end("clouds", points=len(scans.clouds.points))
-    return replace(estimate, graph=with_free(estimate.graph, *LASER), scans=scans)
+    # Wheels that turn about another point of the base look like a laser elsewhere on it: one of the two is known.
+    kinds = LASER if estimate.graph.calibration.of_kinds(*LASER[:2]).any() else (*LASER, TURNING)
+    return replace(estimate, graph=with_free(estimate.graph, *kinds), scans=scans)
 
 
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
@@ -49,11 +51,14 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         estimate = cut
         track = _followed(estimate, _steps(estimate, task), task)
     estimate = _match_neighbours(estimate, track, task.following(estimate))
+    corrected = np.inf
     for _ in range(_RETIMINGS):
-        late = _late(estimate)
+        late = clock_offset.late(estimate, task)
         if late == 0.0:
             break
-        delay, estimate = estimate.lidar.delay + late, replace(estimate, scans=None)
+        if abs(late) > corrected:
+            return _without_offset(replace(estimate, scans=None), estimate.lidar.delay, task)
+        corrected, delay, estimate = abs(late), estimate.lidar.delay + late, replace(estimate, scans=None)
         estimate = _at_delay(estimate, late, delay, task)
         now = task.following(estimate)
         if abs(late) < _SAME_STEPS:
@@ -61,17 +66,36 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         else:
             estimate, steps = _descended(estimate, now)
             estimate = _match_neighbours(estimate, _followed(estimate, steps, now), now)
-    return estimate
+    return estimate if estimate.lidar.delay == 0.0 else _with_clock_at(estimate, estimate.lidar.delay)
 
 
-def _late(estimate: Estimate) -> float:
-    """Return by how much the lidar's clock is later than that with which the clouds were made, s; 0 where noise explains it."""
-    calibration = estimate.graph.calibration
-    late = calibration.get("laser_delay") - estimate.lidar.delay
-    if abs(late) < _CLOCK_TOLERANCE:
-        return 0.0
-    sigma = marginals(_with_inflated_ranges(estimate).problem).covariances.calibration[calibration.index("laser_delay")]
-    return late if abs(late) > _SIGNIFICANT * sigma else 0.0
+def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
+    """Return the estimate with the lidar's clock late by `delay` s and no longer an unknown, until covariances are taken.
+
+    An offset moves clouds along the velocity of the wheels, whose noise would bend steps and bias the offset; clouds made with
+    it need no velocity.
+    """
+    fixed = estimate.graph.calibration.of_kinds("laser_delay")
+    graph = estimate.graph.updated(
+        estimate.graph.poses, estimate.graph.anchors, np.where(fixed, delay, estimate.graph.calibration.values)
+    )
+    return replace(estimate, graph=replace(graph, fixed_calibration=graph.fixed_calibration | fixed))
+
+
+def _without_offset(estimate: Estimate, delay: float, task: Task) -> Estimate:
+    """Return the estimate with the clock of the lidar as that of the odometry, where a correction made its offset larger.
+
+    With a clock that is off by a constant, each correction leaves a part of the error before it.
+    """
+    estimate = _at_delay(_with_clock_at(estimate, 0.0), -delay, 0.0, task)
+    now = task.following(estimate)
+    task.stages.warn(
+        "clock-offset",
+        f"an offset of the lidar's clock ({delay:+.3f} s) grows when it is corrected: it is no constant, and none is used",
+        offset=delay,
+    )
+    estimate, steps = _descended(estimate, now)
+    return _match_neighbours(estimate, _followed(estimate, steps, now), now)
 
 
 def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
@@ -132,10 +156,6 @@ _LIKELY = 0.5
 
 _CUTS = 4
 """Keyframes added within a step that slipped, at most."""
-_CLOCK_TOLERANCE = 0.004
-"""Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
-_SIGNIFICANT = 3.0
-"""Standard deviations from which an offset of the lidar's clock is significant."""
 _SAME_STEPS = 0.015
 """Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
 _RETIMINGS = 4

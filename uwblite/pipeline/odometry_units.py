@@ -26,6 +26,22 @@ def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> Mapp
     return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
 
 
+def with_given_mounting_and_clock(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
+    """Return the settings without the calibration values that the recordings fix.
+
+    Against stamps of receipt in bursts no clock has an offset, nor where a format has one clock for all. Where the poses of a
+    log are those of the laser, the laser has its place, and the point about which the robot turns is unknown instead.
+    """
+    priors = config.calibration
+    late = {sensor for log in logs if log.screening is not None for sensor in log.screening.in_bursts}
+    if late or all(log.notes.one_clock for log in logs):
+        priors = replace(priors, laser_delay=0.0, range_delay=0.0 if "odometry" in late else priors.range_delay)
+    mounted = [log.mounting for log in logs if log.scans is not None]
+    if mounted and all(mounting.laser_is_base for mounting in mounted):
+        priors = replace(priors, laser_offset=0.0)
+    return replace(config, calibration=priors)
+
+
 def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres; warn of it.
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, spread
+from ..arrays import Bools, Floats, spread
 from ..graph import calibration
 from ..graph.calibration import (
     BIAS,
@@ -22,15 +22,17 @@ from ..graph.calibration import (
     with_free,
     with_nonnegative_heights,
 )
-from ..graph.graph import Graph
+from ..graph.graph import Graph, edge_cost
 from ..graph.optimizer import Optimizer
+from ..graph.robust import SQUARED
 from ..graph.solver import SolverConfig, SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import sideways_priors, wheel_edges
+from ..problem.evidence import laplace_marginal_likelihood
 from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
-from ..radio.range_measurements import learn_noise, range_edges, relocate
+from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
 from . import anchor_heights, joining, map_frame, other_minima
 from .estimate import Estimate, Task
@@ -53,7 +55,7 @@ def first_optimisation(task: Task, known: Sequence[Estimate | None] = ()) -> Est
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     known = known or [None] * len(estimates)
     estimates = [
-        _optimised(bootstrapped(estimate, n, task), task) if before is None else before
+        _of_likelier_radio(estimate, n, task) if before is None else before
         for n, (estimate, before) in enumerate(zip(estimates, known, strict=True))
     ]
     if len(estimates) == 1:
@@ -90,6 +92,23 @@ def heights_given(recording: Recording) -> Bools:
     """Return which of a recording's anchors (a,) have a given height above the tag."""
     heights = [recording.log.mounting.height_difference(a) for a in recording.anchor_ids]
     return np.array([height is not None for height in heights], dtype=bool)
+
+
+def _of_likelier_radio(estimate: Estimate, number: int, task: Task) -> Estimate:
+    """Bootstrap and optimise one recording with a calibrated radio; also with one that is not, where the result asks for it.
+
+    Wide priors lead to other places from the beginning, and noise that is learnt there justifies them. So they are an
+    alternative that is solved from the beginning as well, and that the likelihood of all ranges has to pay for.
+    """
+    priors = task.config.calibration
+    calibrated = replace(estimate, graph=prior_selection.with_calibrated_radio(estimate.graph, priors))
+    sound = _optimised(bootstrapped(calibrated, number, task), task)
+    if sound.ranges is None or not prior_selection.is_uncalibrated(sound.graph, priors):
+        return sound
+    wide = _optimised(bootstrapped(estimate, number, task), task)
+    if (missing := int(sound.placed.sum() - wide.placed.sum())) != 0:
+        return sound if missing > 0 else wide
+    return wide if evidence_against(wide, sound, task.config) > 0.0 else sound
 
 
 def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
@@ -140,8 +159,11 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
     config, estimate = task.config, with_range_noise(estimate, task.config)
     if lap == _NOISE_ROUNDS - 1:
         graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
-        estimate = replace(estimate, graph=with_free(graph, *RADIO))
-    return _solved(estimate, config.solver if lap else rough(config.solver), optimizer)
+        return _solved(replace(estimate, graph=with_free(graph, *RADIO)), config.solver, optimizer)
+    # A robust odometry would break where the path only begins badly.
+    odometry, solver = estimate.odometry, config.solver if lap else rough(config.solver)
+    estimate, result = _solved(replace(estimate, odometry=replace(odometry, kernel=SQUARED)), solver, optimizer)
+    return replace(estimate, odometry=odometry), result
 
 
 def _solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
@@ -168,6 +190,28 @@ def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool 
         through = blocked(tags, graph.anchors[estimate.ranges.anchor], surfaces)
     ranges, _ = learn_noise(estimate.ranges, graph, len(estimate.anchor_ids), config.ranges, steady=steady, blocked=through)
     return replace(estimate, ranges=ranges)
+
+
+def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> float:
+    """Return by how much the logarithm of the evidence of one estimate of a recording is greater than that of another.
+
+    The noise of the ranges was learnt under either, so that the ranges count with their normalised densities; both with the
+    same number of independent ranges, for errors that last are counted once.
+    """
+    values, shares = zip(*(_evidence_and_shares(estimate, config) for estimate in (one, other)), strict=True)
+    common = 0.5 * (shares[0] + shares[1]) * ((shares[0] > 0.0) & (shares[1] > 0.0))
+    gain = sum(sign * (rest + float(common @ density)) for sign, (rest, density) in zip((1.0, -1.0), values, strict=True))
+    return float(gain)
+
+
+def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tuple[float, Floats], Floats]:
+    """Return the logarithms of the evidence but for the ranges, and of each range's density (m,), and its independent share."""
+    ranges = estimate.ranges
+    assert ranges is not None
+    graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    squared = edge_cost(ranges, ranges.residuals(graph))
+    density, share = log_densities(ranges, graph, config.ranges)
+    return (laplace_marginal_likelihood(graph) + 0.5 * squared, density), share
 
 
 def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:

@@ -4,7 +4,6 @@ A map uses the scans nearest to each keyframe, and traces one whenever the laser
 slow robot that is about every fifth scan.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,10 +54,3 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
         return log
     left_out = log.notes.scans_left_out + len(scans.stamps) - len(kept)
     return replace(log, scans=scans.rows(kept), notes=replace(log.notes, scans_left_out=left_out))
-
-
-def with_one_clock(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
-    """Return the settings without an offset of the lidar's clock, where the format of all recordings excludes one."""
-    if not all(log.notes.one_clock for log in logs):
-        return config
-    return replace(config, calibration=replace(config.calibration, laser_delay=0.0))

@@ -12,7 +12,7 @@ from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import ScanEdges
 from ..odometry.turn_scale import TurnScale, turn_scales
-from ..radio.prior_selection import prior_sigma, with_prior_sigma
+from ..problem.evidence import prior_sigma, with_prior_sigma
 from .estimate import Estimate, Task
 
 

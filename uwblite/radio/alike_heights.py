@@ -20,7 +20,7 @@ from ..errors import SolverError
 from ..graph.calibration import HEIGHT
 from ..graph.graph import Graph, PriorEdges
 from ..graph.joint_covariance import calibration_covariance
-from .prior_selection import prior_sigma
+from ..problem.evidence import prior_sigma
 
 _LEAST = 0.3
 """Least spread of squared heights, m^2: anchors 1.5 m above the tag, mounted within 10 cm."""

@@ -27,6 +27,8 @@ _NARROWED, _PARTS = 5, 32
 """Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
 _LEAST_WILD = 1e-3
 """Share of gross errors that no number of ranges without one excludes."""
+_NEVER = 1e-300
+"""Density, 1/m, that is added where all parts underflow."""
 _WIDEST = 2.0
 """Least width of the distribution of gross errors, m."""
 
@@ -48,11 +50,15 @@ class RangeMixture:
     width: float
     """Width of the distribution of gross errors, m."""
 
+    def density(self, errors: Floats) -> Floats:
+        """Return the probability density (m,) of each error, 1/m."""
+        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
+        return (1.0 - self.tail - self.wild) * normal + self.tail * late + self.wild / self.width + _NEVER
+
     def core(self, errors: Floats) -> Floats:
         """Return the probability (m,) of each error to be of the core."""
-        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
-        core = (1.0 - self.tail - self.wild) * normal
-        return core / (core + self.tail * late + self.wild / self.width + 1e-300)
+        normal, _ = _densities(errors - self.centre, self.sigma, self.detour)
+        return (1.0 - self.tail - self.wild) * normal / self.density(errors)
 
     def log_density(self, errors: Floats) -> Floats:
         """Return the logarithm of the probability density (m,) of each error, 1/m."""
@@ -81,7 +87,7 @@ class RangeMixture:
         normal, late = _densities(off, self.sigma, self.detour)
         core = (1.0 - self.tail - self.wild) * normal
         slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
-        return slope / (core + self.tail * late + self.wild / self.width + 1e-300)
+        return slope / self.density(off + self.centre)
 
 
 def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> RangeMixture:

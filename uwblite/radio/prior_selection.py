@@ -27,9 +27,10 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from ..graph.calibration import HEIGHT, CalibrationConfig
-from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
+from ..graph.graph import Edges, Graph
 from ..graph.joint_covariance import calibration_covariance
+from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
 
 _STEPS = 4
 """Number of widths tried, from calibrated to uncalibrated radios, evenly spaced in their logarithm."""
@@ -64,20 +65,25 @@ def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     return with_prior_sigma(graph, sigma)
 
 
-def laplace_marginal_likelihood(graph: Graph) -> float:
-    """Return the logarithm of the marginal likelihood of a graph at its optimum (Laplace), but for terms that hypotheses share.
+def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:
+    """Return the graph with the priors of a radio whose antenna delays and unit are right, or narrower ones that it has."""
+    sigma = prior_sigma(graph)
+    for kind, widths in _widths(config):
+        own = graph.calibration.of_kinds(kind)
+        sigma[own] = np.minimum(sigma[own], widths[0])
+    return with_prior_sigma(graph, sigma)
 
-    Parameters
-    ----------
-    graph : solved, with all its edges; calibration values have priors.
 
-    Raises
-    ------
-    SolverError : the measurements do not determine the graph.
-    """
-    which = np.flatnonzero(~graph.fixed_calibration)
-    determinant = np.linalg.slogdet(calibration_covariance(graph)[np.ix_(which, which)])[1]
-    return float(0.5 * (determinant - graph.chi2()) - np.sum(np.log(prior_sigma(graph)[which])))
+def is_uncalibrated(graph: Graph, config: CalibrationConfig) -> bool:
+    """Return whether priors of biases or of the scale are wider than the next that is tried after a calibrated radio's."""
+    sigma = prior_sigma(graph)
+    return any(np.any(sigma[graph.calibration.of_kinds(kind)] > max(widths[:2])) for kind, widths in _widths(config))
+
+
+def _widths(config: CalibrationConfig) -> tuple[tuple[str, list[float]], ...]:
+    """Return the widths tried of each kind of error of a radio, from those of a calibrated one on."""
+    biases = _between(config.range_bias_sound, config.range_bias)
+    return (BIAS, biases), (RANGE_SCALE, _between(config.range_scale_sound, config.range_scale))
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
@@ -170,48 +176,9 @@ def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats)
     return np.asarray(np.linalg.solve(precision + np.diag(after**-2.0 - before**-2.0), precision @ mean))
 
 
-def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
-    """Return the logarithm of the marginal likelihood of other prior standard deviations, relative to those in use.
-
-    Parameters
-    ----------
-    mean, covariance : (n,) and (n, n) posterior of the unknowns.
-    before, after : (n,) prior standard deviations in use and to be judged.
-    """
-    precision = np.linalg.inv(covariance)
-    pulled = precision @ mean
-    other = precision + np.diag(after**-2.0 - before**-2.0)
-    sign, spread = np.linalg.slogdet(other)
-    if sign <= 0:
-        return -np.inf
-    gain = pulled @ np.linalg.solve(other, pulled) - mean @ pulled
-    determinant = np.linalg.slogdet(covariance)[1]
-    return float(0.5 * (gain - spread - determinant) - np.sum(np.log(after / before)))
-
-
-def _between(low: float, high: float) -> Sequence[float]:
+def _between(low: float, high: float) -> list[float]:
     return [high] if not 0.0 < low < high else np.geomspace(low, high, _STEPS).tolist()
 
 
 def _free(graph: Graph, name: str) -> Ints:
     return np.flatnonzero(graph.calibration.of_kinds(name) & ~graph.fixed_calibration)
-
-
-def prior_sigma(graph: Graph) -> Floats:
-    """Return the prior standard deviation (c,) of each calibration value, inf without a prior."""
-    sigma = np.full(len(graph.calibration.values), np.inf)
-    for priors in graph.calibration_priors:
-        sigma[priors.index] = 1.0 / priors.sqrt_information[:, 0, 0]
-    return sigma
-
-
-def with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
-    """Return the graph with other prior standard deviations (c,) of its calibration values."""
-    def changed(edges: object) -> bool:
-        return isinstance(edges, PriorEdges) and edges.block == "calibration"
-
-    edges = tuple(
-        replace(e, sqrt_information=(1.0 / sigma[e.index])[:, None, None]) if changed(e) else e  # type: ignore[attr-defined,type-var]
-        for e in graph.edges
-    )
-    return replace(graph, edges=edges)

@@ -103,9 +103,9 @@ def learn_noise(
         clear = np.flatnonzero(~late) if np.sum(~late) >= _ENOUGH_CLEAR else np.arange(len(own))
         noise = assumed(config)
         trust = np.ones(len(own))
-        if config.learn and len(own) >= 5:
+        if config.learn and len(own) >= _ENOUGH_ERRORS:
             mixture = nlos_mixture.fit(-errors[own[clear]], config.min_sigma)
-            trust = np.maximum(mixture.weights(-errors[own]), 1e-6)
+            trust = np.maximum(mixture.weights(-errors[own]), _LEAST_TRUST)
             noise = learn(positions[own[clear]], errors[own[clear]], mixture.core(-errors[own[clear]]), config)
         sigma[own] = max(noise.sigma, 1e-6)
         effective = np.hypot(
@@ -118,6 +118,23 @@ def learn_noise(
     return replace(edges, sigma=sigma, weights=weights), tuple(noises)
 
 
+def log_densities(edges: RangeEdges, graph: Graph, config: RangeNoiseConfig) -> tuple[Floats, Floats]:
+    """Return the logarithm of the density of each range's error (m,), 1/m, and the share (m,) that is independent of others.
+
+    The density is the mixture fitted to the errors of its anchor. With n correlated neighbours a share of 1 / n is independent;
+    0 where a range does not count, or its anchor has too few.
+    """
+    density, share = np.zeros(len(edges)), np.zeros(len(edges))
+    errors = -edges.residuals(graph)[:, 0] * edges.sigma
+    for anchor in np.unique(edges.anchor[edges.alive]).tolist():
+        own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
+        if len(own) >= _ENOUGH_ERRORS:
+            mixture = nlos_mixture.fit(errors[own], config.min_sigma)
+            density[own] = np.log(mixture.density(errors[own]))
+            share[own] = np.minimum(edges.own_weights[own] / np.maximum(mixture.weights(errors[own]), _LEAST_TRUST), 1.0)
+    return density, share
+
+
 def _delay_sigma(positions: Floats, delay: float, trust: Floats, noise: RangeNoise, steady: bool) -> Floats:
     """Return the standard deviation (m,) of an anchor's ranges through obstacles, from their delay.
 
@@ -128,6 +145,8 @@ def _delay_sigma(positions: Floats, delay: float, trust: Floats, noise: RangeNoi
     return effective_sigma(positions, RangeNoise(0.0, delay, noise.length), trust)
 
 
+_ENOUGH_ERRORS, _LEAST_TRUST = 5, 1e-6
+"""Least number of ranges to an anchor to which a mixture is fitted; weight of a gross error, which keeps a graph solvable."""
 _ENOUGH_CLEAR = 30
 """Least number of ranges in line of sight from which the noise is learnt from these alone."""
 _LEAST_DELAY = 0.15

@@ -8,7 +8,8 @@ from ..arrays import Floats, weighted_median
 from ..errors import DataError
 from ..findings import Finding, doubt, warning
 from ..odometry.attached import OUTSIDE
-from ..sensor_log import LaserScans, SensorLog, UwbRanges
+from ..sensor_log import LaserScans, SensorLog, UwbRanges, odometry_in_bursts
+from ..sensor_log import in_bursts as stamps_in_bursts
 
 _FEW_STAMPS = 20
 """Stamps that may be equal by chance."""
@@ -75,6 +76,19 @@ def made_up(log: SensorLog) -> list[Finding]:
         "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock"
     )
     return [warning("made-up-stamps", text)]
+
+
+def in_bursts(log: SensorLog) -> tuple[tuple[str, ...], list[Finding]]:
+    """Return the sensors (odometry, scans) whose stamps are times of receipt in bursts, and a remark that says so."""
+    names = ["odometry"] if odometry_in_bursts(log.odometry) else []
+    names += ["scans"] if log.scans is not None and stamps_in_bursts(log.scans.stamps) else []
+    if not names:
+        return (), []
+    text = (
+        f"the stamps of {' and '.join(names)} come in bursts: they are times of receipt behind a queue, not of measurement, so "
+        "no clock offset is estimated, and speeds mean little; stamp each reading when it is measured"
+    )
+    return tuple(names), [warning("stamps-of-receipt", text)]
 
 
 def set_back(log: SensorLog) -> list[Finding]:

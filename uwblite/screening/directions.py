@@ -94,7 +94,7 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Finding]]
         f"the laser's direction differs by {np.degrees(angle):+.0f} degrees from its given pose, by the motion that both "
         f"measure; corrected: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
     )
-    mounting = replace(log.mounting, T_base_laser=mount, tag_position=tags[0], more_tags=tags[1:])
+    mounting = replace(log.mounting, T_base_laser=mount, laser_is_base=False, tag_position=tags[0], more_tags=tags[1:])
     return replace(log, mounting=mounting), [warning("laser-turned-away", text)]
 
 

@@ -10,6 +10,7 @@ from ..findings import DOUBT, Finding, doubt, warning
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
+from .late_scans import with_late_scans_placed
 from .own_body import without_own_body
 from .shared_names import without_shared_names
 from .wheel_motion import Pairs
@@ -53,16 +54,17 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     remarks += [*set_right, *outside]
     units.refuse_wrong_lengths(log)
     odometry, repeats = odometry_chain.without_repeats(log.odometry)
-    log, bursts = stuck_sensors.without_bursts(replace(log, odometry=odometry))
+    log, spread = stuck_sensors.without_bursts(replace(log, odometry=odometry))
+    bursts, times = clocks.in_bursts(log)
     odometry = log.odometry
     odometry, glitches = odometry_chain.without_glitches(odometry)
     units.refuse_degrees(odometry)
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
-    remarks += [*_repeats(repeats), *bursts, *glitches, *broken, *turned]
+    remarks += [*_repeats(repeats), *spread, *times, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks, without_own_body]
     repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
-    repairs += [directions.heading_with_the_path] + [directions.laser_upright] * turn_laser
+    repairs += [directions.heading_with_the_path] + [directions.laser_upright] * turn_laser + [with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)
         remarks += more
@@ -76,7 +78,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
         more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]), log)
     more += _hardly_moving(log.odometry)
     breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
-    return replace(log, screening=Screening((*remarks, *more), breaks, _way_ratio(pairs)))
+    return replace(log, screening=Screening((*remarks, *more), breaks, _way_ratio(pairs), bursts))
 
 
 def _way_ratio(pairs: Pairs | None) -> float:
@@ -114,33 +116,38 @@ def _repeats(count: int) -> list[Finding]:
 
 
 def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
-    """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?"""
+    """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?
+
+    A gap in the messages is none in the odometry: the pose after it counts, with the noise of the way and turn that it shows,
+    unless other sensors find the robot elsewhere. What they measured while it drove has no place between the two poses.
+    """
     stamps, poses = log.odometry.stamps, log.odometry.poses
     if log.notes.one_clock:  # each scan brings the odometry's pose: between two of them nothing is silent
         return log, OdometryBreaks.none(), []
     span = np.diff(stamps)
     period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
     gaps = np.flatnonzero((span > max(_GAP, 20.0 * period)) & ~_as_between_others(log.odometry))
-    at, sigma, remarks, silent = [], [], list[Finding](), list[tuple[float, float]]()
+    at, remarks, silent = list[float](), list[Finding](), list[tuple[float, float]]()
     for k in gaps.tolist():
         a, b = float(stamps[k]), float(stamps[k + 1])
         step = se2.between(poses[k], poses[k + 1])
         held = bool(np.hypot(*step[:2]) < _STANDS[0])
         stood = held and bool(abs(step[2]) < _STANDS[1])
+        seen = any(_inside(sensor.stamps, a, b).any() for sensor in (log.ranges, log.scans) if sensor is not None)
         # A gyro may have turned with the robot while no sensor measured its distance.
         elsewhere = held and _elsewhere(log, a, b)
         when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
         if elsewhere:
             text = f"{when}, but the robot was moved meanwhile: only other sensors connect the path before and after"
             remarks.append(doubt("carried", text))
-        elif not stood:
+        elif not stood and seen:
             text = f"{when}, while the robot drove on; ranges and scans of that time were left out"
             remarks.append(warning("odometry-gap", text))
         if elsewhere or not stood:
             silent.append((a, b))
-        at.append(a)
-        sigma.append(_ANYWHERE if elsewhere else (0.02, 0.02, 0.02) if stood else (0.1, 0.1, 0.1))
-    found = OdometryBreaks(np.array(at), np.array(sigma)) if at else OdometryBreaks.none()
+        if elsewhere:
+            at.append(a)
+    found = OdometryBreaks(np.array(at), np.tile(_ANYWHERE, (len(at), 1))) if at else OdometryBreaks.none()
     return _without(log, silent), found, remarks
 
 
@@ -166,13 +173,18 @@ def _elsewhere(log: SensorLog, a: float, b: float) -> bool:
     return not same if same is not None else range_motion.excess(log, a, b) > 0.0
 
 
+def _inside(stamps: Floats, a: float, b: float) -> Bools:
+    """Return which stamps (n,) are well within a silence of the odometry."""
+    return np.asarray((stamps > a + 0.2) & (stamps < b - 0.2))
+
+
 def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
     """Leave out scans and ranges of times at which the robot's place is unknown."""
 
     def kept(stamps: Floats) -> Bools:
         inside = np.zeros(len(stamps), dtype=bool)
         for a, b in silent:
-            inside |= (stamps > a + 0.2) & (stamps < b - 0.2)
+            inside |= _inside(stamps, a, b)
         return ~inside
 
     if not silent:

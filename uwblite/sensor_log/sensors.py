@@ -171,6 +171,9 @@ class SensorMounting:
     """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
     more_tags: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(t, 3) x, y, z of further tags on the base."""
+    laser_is_base: bool = False
+    """The log's poses are those of the laser: each scan came with its pose and the robot's, and these are the same. The laser
+    is then where it is said to be, and the wheels may measure the motion of another point."""
 
     def __post_init__(self) -> None:
         settle(self, "mounting", {"T_base_laser": (3,), "tag_position": (3,), "more_tags": ("t", 3)})

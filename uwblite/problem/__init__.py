@@ -1,0 +1,1 @@
+"""The measurements with their weights: their solution, parts of it, and its evidence."""

@@ -1,0 +1,53 @@
+"""Stamps: whether they are times of measurement, or of receipt in bursts."""
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from .sensors import Odometry
+
+_WINDOW = 2.0
+"""Time on either side of a step over which a sensor keeps its rate and a robot its speed, more or less, s; queues are emptied
+more often."""
+_READINGS, _STEPS = 4, 100
+"""Least number of steps within a window, and of such steps in all, that show how regular stamps are."""
+_ARM = 0.3
+"""Distance from the middle of a robot at which a turn counts as way, m."""
+_ANYWHERE = 0.5
+"""Share of the time between two readings by which each may be displaced before their order means nothing."""
+
+
+def in_bursts(stamps: Floats, progress: Floats | None = None) -> bool:
+    """Return whether stamps tell the order of readings and not their times.
+
+    A sensor measures at a steady rate, and a robot drives at a steady speed for a second. Receipt behind a queue gives many
+    readings nearly one stamp, and the next ones come late. The median step then differs from that expected by more than half.
+
+    Parameters
+    ----------
+    stamps : (n,) s, non-decreasing.
+    progress : (n,) what grows in proportion to time, non-decreasing; None = the number of readings.
+    """
+    if len(stamps) <= _STEPS:
+        return False
+    way = np.arange(float(len(stamps))) if progress is None else progress
+    step, advance, middle = np.diff(stamps), np.diff(way), 0.5 * (stamps[1:] + stamps[:-1])
+    first = np.searchsorted(stamps, middle - _WINDOW)
+    last = np.searchsorted(stamps, middle + _WINDOW, "right") - 1
+    shown = (advance > 0.0) & (last - first >= _READINGS)
+    if shown.sum() < _STEPS:
+        return False
+    expected = (advance * (stamps[last] - stamps[first]))[shown] / (way[last] - way[first])[shown]
+    # Readings that all have one stamp expect no time between them.
+    off = np.abs(step[shown] - expected) > _ANYWHERE * expected
+    return bool(off.mean() > _ANYWHERE)
+
+
+def odometry_in_bursts(odometry: Odometry) -> bool:
+    """Return whether the stamps of an odometry tell the order of its readings and not their times, see in_bursts.
+
+    They are even neither in time nor by the way: a log thinned by motion is even by the way, and a robot may jerk.
+    """
+    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    advance = np.hypot(steps[:, 0], steps[:, 1]) + _ARM * np.abs(steps[:, 2])
+    return in_bursts(odometry.stamps) and in_bursts(odometry.stamps, np.concatenate([[0.0], np.cumsum(advance)]))
