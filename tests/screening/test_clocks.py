@@ -41,7 +41,7 @@ def test_stamps_of_receipt_are_named_with_their_sensors():
     for odometry, lidar, named in (*cases, (steady, steady, ())):
         sensors, remarks = clocks.in_bursts(SensorLog(moving(odometry), None, scans(lidar)))
         assert sensors == named
-        assert [(r.kind, r.doubt) for r in remarks] == [("stamps-of-receipt", False)] * bool(named)
+        assert [(r.kind, r.severity) for r in remarks] == [("stamps-of-receipt", "warning")] * bool(named)
         assert all(" and ".join(named) in r.text for r in remarks)
     assert clocks.in_bursts(SensorLog(moving(queue)))[0] == ("odometry",)
 
