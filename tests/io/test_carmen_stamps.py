@@ -161,6 +161,6 @@ def test_between_the_scans_of_a_corrected_log_nothing_is_silent(tmp_path):
         lines.append(f"FLASER 180 {' '.join(['2.5'] * 180)} {pose} {pose} {t} h {t}")
         lines.append(f"ODOM {pose} 0 0 0 -5.77 h -5.77")
     log = read(tmp_path, "\n".join(lines) + "\n")
-    assert not [r for r in screen(log.without(lidar=True)).screening.remarks if r.kind == "odometry-gap"]
+    assert not [r for r in screen(log.without(lidar=True)).screening.findings if r.kind == "odometry-gap"]
     told = replace(log, notes=replace(log.notes, one_clock=False))
-    assert [r for r in screen(told.without(lidar=True)).screening.remarks if r.kind == "odometry-gap"]
+    assert [r for r in screen(told.without(lidar=True)).screening.findings if r.kind == "odometry-gap"]
