@@ -4,6 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
+from .console import duration
 from .options import add_bag_arguments, add_mounting_arguments
 from .wording import signed
 
@@ -42,8 +43,15 @@ def run(args: argparse.Namespace) -> int:
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     diagnosis, seconds = (diagnose(log), model_seconds(log)) if args.quick else examined(log)
     cost = expected_cost(log, seconds)
-    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost))
+    unseen = [_ONLY_A_MAP_TELLS] if args.quick else []
+    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost) + unseen)
     return 3 if diagnosis.serious else 0
+
+
+_ONLY_A_MAP_TELLS = (
+    "not judged without a map: scales, biases and delays, anchors that were moved or may be mirrored, slips, and whether the"
+    " parts of the map fit together; check without --quick does"
+)
 
 
 def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
@@ -136,7 +144,8 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> l
 
 def _counts(figures: dict[str, Any]) -> str:
     odometry = figures["odometry"]
-    parts = [f"{odometry['duration s']:.0f} s, {odometry['path m']:.1f} m by {odometry['count']} odometry readings"]
+    span, readings = duration(odometry["duration s"]), f"{odometry['count']} odometry readings"
+    parts = [f"{span}, {odometry['path m']:.1f} m by {readings}"]
     parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
     if "uwb" in figures:
         parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")
