@@ -44,10 +44,6 @@ class Remark:
     """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
     stretches: tuple[tuple[float, float], ...] = ()
     """First and last time, s, of each stretch in which it was so; empty where it is no matter of stretches."""
-    place: str = ""
-    """Name of the place of an anchor that it concerns; empty where it concerns none."""
-    without_place: str = ""
-    """The text that remains where a map does not have that place; empty: none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
