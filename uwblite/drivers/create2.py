@@ -14,7 +14,7 @@ import math
 import struct
 from dataclasses import dataclass
 
-from .clock_map import ClockMap
+from .clock_map import rhythm_map
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
 from .odometer import BaseDriver, WheelOdometer, wrapped
@@ -41,8 +41,6 @@ STALL = 0.3
 """s by which a frame may come late because the computer stalled; later, frames were lost."""
 LOW_VOLTAGE = 13.0
 """V."""
-WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
-"""s, s, share: how far back the map from frames to time looks; the period is stated as 15 ms, and is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +89,7 @@ class Create2Driver(BaseDriver):
         self._new_clock()
 
     def _new_clock(self) -> None:
-        self._frames, self._map = 0, ClockMap(WINDOW, BUCKET, MOST_SKEW)
+        self._frames, self._map = 0, rhythm_map()
 
     def begin(self) -> None:
         """Forget half a frame; the encoders counted on."""
