@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from .clock_map import rhythm_map
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
-from .odometer import BaseDriver, WheelOdometer, wrapped
+from .odometer import BaseDriver, WheelOdometer, way_of
 from .session import Script, Wait
 
 BAUD = 115200
@@ -82,6 +82,8 @@ class Create2Driver(BaseDriver):
     baud : bit/s; a robot that was switched on with its clean button held for 10 s talks at 19200.
     """
 
+    frame, rhythm = Encoders, PERIOD
+
     def __init__(self, start: Pose = (0.0, 0.0, 0.0), baud: int = BAUD) -> None:
         self.baud = baud
         super().__init__(Create2Protocol(), "iRobot Create 2", WheelOdometer(TICK, WHEEL_BASE, MODULUS, start), LOW_VOLTAGE)
@@ -95,10 +97,6 @@ class Create2Driver(BaseDriver):
         """Forget half a frame; the encoders counted on."""
         super().begin()
         self._new_clock()
-
-    def spacing(self, event: Encoders | Corrupt) -> float | None:
-        """Return the time between two frames, s."""
-        return PERIOD if isinstance(event, Encoders) else None
 
     def script(self) -> Script[None]:
         """Ask for the stream, again whenever it stops: the robot falls asleep after five minutes, or was switched off."""
@@ -120,7 +118,8 @@ class Create2Driver(BaseDriver):
         pause = event.stamp - last.stamp if last is not None else 0.0
         if pause > STALL:
             actions.append(Lost(stamp, round(pause / PERIOD) - 1))
-        if last is not None and (pause > MAX_BLIND or _moved(last, event) > MAX_SPEED * max(pause, STALL)):
+        way = 0.0 if last is None else way_of((event.left - last.left, event.right - last.right), MODULUS, TICK)
+        if pause > MAX_BLIND or way > MAX_SPEED * max(pause, STALL):  # more than it can drive: the counts began again
             self._odometer.forget()
             why = f"sent nothing for {pause:.1f} s" if pause > MAX_BLIND else "restarted"
             actions.append(self.gap(f"{why}, the pose is held: its motion"))
@@ -140,9 +139,3 @@ class Create2Driver(BaseDriver):
     def stop(self) -> list[Action]:
         """Pause the stream."""
         return [Send(PAUSE)]
-
-
-def _moved(last: Encoders, event: Encoders) -> float:
-    """Return how far the wheels turned between two frames, m; more than they can means that the counts began again."""
-    ticks = (event.left - last.left, event.right - last.right)
-    return max(abs(wrapped(difference, MODULUS)) for difference in ticks) * TICK
