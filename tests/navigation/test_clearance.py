@@ -36,7 +36,7 @@ def test_distances_of_the_centres_and_narrow_places_are_those_that_a_search_thro
     clearance, shape, obstacles = clearance_map(grid, radius), grid.log_odds.shape, grid.states() == OCCUPIED
     row, col = (v.ravel() for v in np.indices(shape))
     true = np.where(obstacles.ravel(), 0.0, distance_to_squares(grid, obstacles, grid.geometry.centre_of(row, col)))
-    found = np.sqrt(clearance.squared.ravel())
+    found = 0.5 * grid.geometry.resolution * np.sqrt(clearance.half.ravel())
     assert found == pytest.approx(np.minimum(true, found.max()), abs=1e-6)
     assert found.max() >= min(true.max(), radius + COMFORT) - 1e-6
     stands = clearance.passable()
@@ -87,8 +87,8 @@ def test_unknown_space_is_an_obstacle_or_dear_and_specks_are_neither():
     grid = grid_of("\n".join(line.strip() for line in text.split("\n")))
     refused, priced = clearance_map(grid, 0.0), clearance_map(grid, 0.0, unknown="price")
     dark = grid.states() == UNKNOWN
-    assert np.array_equal(refused.squared == 0.0, dark & (np.arange(12) >= 8))
-    assert np.all(priced.squared > 0.0)
+    assert np.array_equal(refused.half == 0, dark & (np.arange(12) >= 8))
+    assert np.all(priced.half > 0)
     assert np.array_equal(priced.dear, dark & (np.arange(12) >= 8))
     assert np.all(priced.cell_cost()[~priced.dear] < UNKNOWN_PRICE)
     assert not refused.dear.any()

@@ -231,7 +231,9 @@ def test_a_robot_too_near_to_a_wall_may_leave_and_one_inside_of_it_not():
         planner.plan(np.array([50.0, 1.0]), [np.array([1.0, 0.7])])
 
 
-def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known():
+@pytest.mark.parametrize("at_once", [300_000, 200])
+def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known(monkeypatch, at_once):
+    monkeypatch.setattr(steps, "_AT_ONCE", at_once)
     text = "\n".join(["." * 40] * 16 + ["?" * 10 + "#" * 20 + "?" * 10] + ["?" * 40] * 16)
     grid = grid_of(text)
     planner, priced = make_planner(grid, 0.2), make_planner(grid, 0.2, unknown="price")

@@ -61,11 +61,6 @@ class ClearanceMap:
     """Unknown cells are obstacles."""
 
     @property
-    def squared(self) -> NDArray[np.float32]:
-        """(rows, cols) squared distance of the centres from the nearest obstacle, m^2."""
-        return self.half * np.float32(self._unit)
-
-    @property
     def _unit(self) -> float:
         return 0.25 * self.geometry.resolution**2
 

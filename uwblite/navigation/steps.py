@@ -110,35 +110,27 @@ class StepSearch:
 
     def nearest_reachable(self, first: int, goal: Floats) -> Floats:
         """Return the place (2,) that can be reached and is nearest to a goal (2,), m."""
-        best, away = np.full(2, np.nan), np.inf
-        for nodes in self.reachable(first):
-            far = np.hypot(*((places := self.places(nodes)) - goal).T)
+        return np.asarray(self.places(np.array([self._nearest(first, goal)]))[0])
+
+    def _nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
+        """Return the node that can be reached, is allowed (n,), and is nearest to a place (2,), m; -1 = there is none."""
+        best, away = -1, np.inf
+        for part in self.reachable(first):
+            nodes = part if allowed is None else part[allowed[part]]
+            far = np.hypot(*(self.places(nodes) - place).T)
             if far.min(initial=np.inf) < away:
-                best, away = places[np.argmin(far)].copy(), float(far.min())
+                best, away = int(nodes[np.argmin(far)]), float(far.min())
         return best
 
     def way_out(self, first: int, allowed: Bools) -> Ints | None:
-        """Return the nodes (k,) of the cheapest path to an allowed cell (rows, cols); None = there is none.
+        """Return the nodes (k,) of the cheapest path towards the nearest allowed cell (rows, cols) that can be reached.
 
-        In a large map, of a path to the nearest of them.
+        It ends where it comes to an allowed cell; None = there is none.
         """
-        good = allowed.ravel()
-        if self.regions is None:
-            nodes = self.nodes()
-            costs, before = dijkstra(self.graph(nodes), indices=np.searchsorted(nodes, first), return_predecessors=True)
-            cells = nodes[nodes < good.size]
-            costs[len(cells) :], costs[: len(cells)][~good[cells]] = np.inf, np.inf
-            last = int(np.argmin(costs))
-            return nodes[walk_back(before, int(np.searchsorted(nodes, first)), last)] if np.isfinite(costs[last]) else None
-        here, best = self.places(np.array([first]))[0], (np.inf, -1)
-        for nodes in self.reachable(first):
-            cells = nodes[nodes < good.size]
-            cells = cells[good[cells]]
-            away = np.hypot(*(self.places(cells) - here).T)
-            best = min(best, (float(away.min(initial=np.inf)), int(cells[np.argmin(away)]) if len(cells) else -1))
-        if (path := self.path(first, best[1]) if best[1] >= 0 else None) is None:
-            return None
-        return path[: 1 + int(np.argmax((path < good.size) & good[np.minimum(path, good.size - 1)]))]
+        good = np.concatenate([allowed.ravel(), np.zeros(len(self.clearance.tight), dtype=np.bool_)])
+        last = self._nearest(first, self.places(np.array([first]))[0], good)
+        path = None if last < 0 else self.path(first, last)
+        return None if path is None else path[: 1 + int(np.argmax(good[path]))]
 
     # ---- cells
 
