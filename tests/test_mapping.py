@@ -26,7 +26,7 @@ from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline import anchor_moves, final_stages
 from uwblite.pipeline.estimate import Task
-from uwblite.pipeline.final_stages import at_given_poses
+from uwblite.problem.parts import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
 from uwblite.radio.change_points import Move
 from uwblite.radio.trilateration import AnchorHypothesis

@@ -14,9 +14,9 @@ from itertools import combinations
 import numpy as np
 
 from ..graph.solver import SolverConfig
+from ..problem.parts import at_given_poses
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .estimate import Estimate, Task
-from .final_stages import at_given_poses
 from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
