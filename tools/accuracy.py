@@ -332,7 +332,10 @@ def real(args: argparse.Namespace) -> str:
     return f"## Recordings of others\n\nDefaults, from the raw logs; m. {PERTURBATION}\n\n{text}{more}"
 
 
-BENCHMARK = {"mit-csail": (0.049, 0.45, 0.106, 0.049, 0.004, 0.032), "fr079": (0.061, 0.65, 0.258, 0.061, 0.056, 0.045)}
+BENCHMARK = {
+    "mit-csail": (0.049, 0.45, 0.106, 0.049, 0.004, 0.032), "fr079": (0.061, 0.65, 0.258, 0.061, 0.056, 0.045),
+    "intel": (0.031, 0.6, float("nan"), 0.070, 0.031, 0.023),
+}  # fmt: skip
 """Bars on the mean errors over relations, m and degrees; translations that others reached, m: scan matching, GMapping, graph
 mapping (Kuemmerle et al. 2009) and Cartographer (Hess et al. 2016)."""
 PERTURBED = 1.3
