@@ -56,6 +56,10 @@ class RegistrationConfig:
     """Probability that an object moves by itself."""
     long: ClassVar[float] = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
+    fits: ClassVar[float] = 5.0 / 6.0
+    """Share of the points in view that match in the true place."""
+    useless: ClassVar[float] = 0.05
+    """Probability that two clouds show nothing of each other's place: 'none of these'."""
     worth: ClassVar[float] = 0.02
     """Posterior odds of a slip below which it is not searched for."""
     good_share: ClassVar[float] = 0.75
@@ -170,7 +174,7 @@ class Registration:
         """Take clouds, their rasters, the nearest surface by bearing (see visibility), and the deviation of a match, m."""
         self._clouds, self._raster, self.sigma = clouds, raster, sigma
         self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        self._reach = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 1.0
+        self._chance = np.full(len(clouds), 1.0 / 3.0)
         self._object, length = objects(clouds, RegistrationConfig.gap)
         self._most = -np.log(RegistrationConfig.moves) * np.maximum(length / RegistrationConfig.long, 1.0)
 
@@ -182,6 +186,7 @@ class Registration:
         points : of the sources, see pair_points. other : (e, 3) further poses to start from.
         """
         c = RegistrationConfig
+        self._chance = self._by_chance(i, points, prior.mean)
         sound = self._descend(i, points, prior.mean, prior.mean, prior.covariance)
         log_odds = np.where(sound.factors.asked > 0, self._most_odds(sound, prior), 0.0)
         rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
@@ -191,8 +196,22 @@ class Registration:
             lost = rows[poor]
             found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
-        log_odds[rows] = slipped.evidence - sound.evidence[rows]
+        none = np.log(c.useless)
+        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
         return Placement(sound, rows, slipped, log_odds)
+
+    def _by_chance(self, i: Ints, points: PairPoints, mean: Floats) -> Floats:
+        """Return the share (k,) of points that match each target cloud i (e,) where they do not belong, beside the prior."""
+        chance = np.full(len(self._clouds), 1.0 / 3.0)
+        matched, asked = np.zeros(len(i)), np.zeros(len(i))
+        for off in (-_BESIDE, _BESIDE):
+            for turned in (-_BESIDE, _BESIDE):
+                pose = mean + np.array([off, turned, 0.0])
+                for found in correspondences(self._clouds, self._raster, i, pose, points, RegistrationConfig.gate):
+                    matched[found.pairs] += found.good.sum(axis=1)
+                    asked[found.pairs] += (found.row >= 0).sum(axis=1)
+        chance[i] = np.clip((matched + 1.0) / (asked + 3.0), 0.05, 0.8)
+        return chance
 
     def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
         """Place some pairs (r,) whose wheels slipped, from the best of several starts (r, 3)."""
@@ -302,7 +321,11 @@ class Registration:
         variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
         squared = np.square(found.distance) / variance
         cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
-        through = usable & ~found.good & in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        through, in_view = in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        through &= usable & ~found.good
+        missed = usable & ~found.good & in_view & ~through
+        chance = self._chance[i][:, None]
+        cost += 2.0 * np.log((1.0 - chance) / (1.0 - c.fits)) * missed
         cost[through] = c.outlier
         group = self._object[found.row]
         many = int(group.max(initial=0)) + 1
@@ -313,7 +336,7 @@ class Registration:
         )
         most = np.full((len(i), many), -np.log(c.moves))
         most.reshape(-1)[key] = self._most[found.row[usable]]
-        gain = np.log(self._reach / (np.sqrt(2.0 * np.pi) * self.sigma))
+        gain = np.log(c.fits / chance) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
         return _Judged(
             1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
@@ -335,6 +358,8 @@ class _Judged:
 
 
 _FARTHEST, _WIDEST = 0.3, 0.15
+_BESIDE = 0.4
+"""Distance at which no point is where it belongs, m."""
 _UNLIKELY, _HUGE = 0.5, 50.0
 """Probability of standing still below which an object moves, and the largest exponent."""
 
