@@ -4,7 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from .console import duration
+from ..report.printable import duration
 from .options import add_bag_arguments, add_mounting_arguments
 from .wording import calibration_text, signed
 
