@@ -202,9 +202,8 @@ class Registration:
             found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
         none = np.log(c.useless)
-        odds = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
-        log_odds[rows] = of_fallible(odds, c.useless)
-        return Placement(sound, rows, slipped, log_odds)
+        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
+        return Placement(sound, rows, slipped, of_fallible(log_odds, c.useless))
 
     def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
         """Place some pairs (r,) whose wheels slipped, from the best of several starts (r, 3)."""
