@@ -251,18 +251,45 @@ def _against_broken_path(
         if not any(change.with_other(other) for other in done):
             together = [other for other in _changes(estimate, radios, kept) if change.with_other(other)]
             done.append(change)
-            rival = _Broken(estimate, task, radios, kept, together)
+            rival = BrokenStep(estimate, task, radios, kept, together)
             if together and rival.gain() > 0.0:
                 kept = rival.found
                 told.broken[rival.begin] = rival.told()
     return kept
 
 
-class _Broken:
+def range_evidence(estimate: Estimate, task: Task) -> float:
+    """Return the logarithm of the evidence of all ranges along the estimate's path, their anchors placed anew."""
+    radios = _radios(estimate, task)
+    return sum(explain(radio.track, task.config.trilateration, task.config.ranges).evidence for radio in radios)
+
+
+def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list["BrokenStep"]:
+    """Return the broken steps that explain what otherwise would be anchors that move together, each where it explains most.
+
+    Parameters
+    ----------
+    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor.
+    """
+    config, radios, best = task.config, _radios(estimate, task), list[BrokenStep]()
+    found = [explain(radio.track, config.trilateration, config.ranges) for radio in radios]
+    for change in _changes(estimate, radios, found):
+        if not any(change.with_other(other) for step in best for other in step.moves):
+            together = [other for other in _changes(estimate, radios, found) if change.with_other(other)]
+            tried = [BrokenStep(estimate, task, radios, found, together)]
+            rows = tried[0].recording.rows
+            within = suspects[(suspects > rows.start) & (suspects < tried[0].end)]
+            tried += [BrokenStep(estimate, task, radios, found, together, int(k)) for k in within]
+            best.append(max(tried, key=BrokenStep.gain))
+    return best
+
+
+class BrokenStep:
     """The rival of moves that begin together: a broken step of the path, after which a stretch of it is displaced as one."""
 
     def __init__(
-        self, estimate: Estimate, task: Task, radios: Sequence[_Radio], found: Sequence[Explanation], moves: Sequence[_Change]
+        self, estimate: Estimate, task: Task, radios: Sequence[_Radio], found: Sequence[Explanation],
+        moves: Sequence[_Change], begin: int | None = None,
     ) -> None:
         self.estimate, self.task, self.radios, self.moves, self.found = estimate, task, radios, moves, list(found)
         assert estimate.ranges is not None
@@ -270,7 +297,8 @@ class _Broken:
         first = max(moves, key=lambda move: len(move.interval))
         self.pose = [estimate.ranges.pose[radio.rows[radio.some]] for radio in radios]
         self.recording = task.recordings.each[int(radios[first.radio].track.recording[first.interval[0]])]
-        self.begin = max(int(self.pose[first.radio][first.interval[0]]), self.recording.rows.start + 1)
+        heard = int(self.pose[first.radio][first.interval[0]]) if begin is None else begin
+        self.begin = max(heard, self.recording.rows.start + 1)
         last, rows = int(first.interval[-1]), self.recording.rows
         more = last + 1 < len(self.pose[first.radio]) and rows.start <= self.pose[first.radio][last + 1] < rows.stop
         self.end = int(self.pose[first.radio][last]) + 1 if more else rows.stop
@@ -288,16 +316,32 @@ class _Broken:
 
     def gain(self) -> float:
         """Return by how much its evidence is greater than that of the moves."""
-        graph, ends = self.estimate.graph, 1 if self.end == self.recording.rows.stop else 2
+        poses = self.estimate.graph.poses
         for _ in range(MovePolicy.laps):
             # Places that a displaced stretch has pulled along hide some of the step, so both are found in turn.
-            self.motion, spread = self._fitted()
+            self.motion, self.spread = self._fitted()
             gain = self._evidence()
-        poses = graph.poses.copy()
+        return gain + self.log_odds_beforehand() - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
+
+    def log_odds_beforehand(self) -> float:
+        """Return the logarithm of the odds of a step broken like that, times the share of its prior that the ranges leave."""
+        ends = 1 if self.end == self.recording.rows.stop else 2
+        broken = ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
+        return broken + self.spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
+
+    def displaced(self, poses: Floats) -> Floats:
+        """Return poses (k, 3) with the stretch moved to where the ranges have it."""
+        poses = poses.copy()
         poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
-        gain += ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
-        gain += spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
-        return gain - 0.5 * (self._cost(poses) - self._cost(graph.poses))
+        return poses
+
+    def places(self, anchors: Floats) -> Floats:
+        """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
+        anchors = anchors.copy()
+        for radio, each in zip(self.radios, self.found, strict=True):
+            for number, place in zip(radio.numbers, each.places, strict=False):
+                anchors[number] = place
+        return anchors
 
     def _displacement(self) -> Floats:
         """Return the motion (3,) of the stretch in the map."""
