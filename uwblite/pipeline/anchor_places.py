@@ -252,7 +252,7 @@ def _against_broken_path(
             together = [other for other in _changes(estimate, radios, kept) if change.with_other(other)]
             done.append(change)
             rival = BrokenStep(estimate, task, radios, kept, together)
-            if together and rival.gain() > 0.0:
+            if together and rival.gain() + rival.log_prior() > 0.0:
                 kept = rival.found
                 told.broken[rival.begin] = rival.told()
     return kept
@@ -264,23 +264,24 @@ def range_evidence(estimate: Estimate, task: Task) -> float:
     return sum(explain(radio.track, task.config.trilateration, task.config.ranges).evidence for radio in radios)
 
 
-def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list["BrokenStep"]:
-    """Return the broken steps that explain what otherwise would be anchors that move together, each where it explains most.
+def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
+    """Return the broken steps that may explain what otherwise would be anchors that move together, each where it explains most,
+    with its gain.
 
     Parameters
     ----------
     suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor.
     """
-    config, radios, best = task.config, _radios(estimate, task), list[BrokenStep]()
+    config, radios, best = task.config, _radios(estimate, task), list[tuple[float, BrokenStep]]()
     found = [explain(radio.track, config.trilateration, config.ranges) for radio in radios]
     for change in _changes(estimate, radios, found):
-        if not any(change.with_other(other) for step in best for other in step.moves):
+        if not any(change.with_other(other) for _, step in best for other in step.moves):
             together = [other for other in _changes(estimate, radios, found) if change.with_other(other)]
             tried = [BrokenStep(estimate, task, radios, found, together)]
             rows = tried[0].recording.rows
             within = suspects[(suspects > rows.start) & (suspects < tried[0].end)]
             tried += [BrokenStep(estimate, task, radios, found, together, int(k)) for k in within]
-            best.append(max(tried, key=BrokenStep.gain))
+            best.append(max(((step.gain(), step) for step in tried), key=lambda each: each[0]))
     return best
 
 
@@ -315,19 +316,19 @@ class BrokenStep:
             self.found[move.radio] = replace(each, place=place)
 
     def gain(self) -> float:
-        """Return by how much its evidence is greater than that of the moves."""
+        """Return by how much its evidence is greater than that of the moves, if a step is broken there."""
         poses = self.estimate.graph.poses
         for _ in range(MovePolicy.laps):
             # Places that a displaced stretch has pulled along hide some of the step, so both are found in turn.
-            self.motion, self.spread = self._fitted()
+            self.motion, spread = self._fitted()
             gain = self._evidence()
-        return gain + self.log_odds_beforehand() - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
+        gain += spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
+        return gain - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
 
-    def log_odds_beforehand(self) -> float:
-        """Return the logarithm of the odds of a step broken like that, times the share of its prior that the ranges leave."""
+    def log_prior(self) -> float:
+        """Return the logarithm of the prior probability of a broken step just there, and of one where it ends."""
         ends = 1 if self.end == self.recording.rows.stop else 2
-        broken = ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
-        return broken + self.spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
+        return ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
 
     def displaced(self, poses: Floats) -> Floats:
         """Return poses (k, 3) with the stretch moved to where the ranges have it."""
@@ -337,10 +338,12 @@ class BrokenStep:
 
     def places(self, anchors: Floats) -> Floats:
         """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
+        assert self.estimate.ranges is not None
         anchors = anchors.copy()
         for radio, each in zip(self.radios, self.found, strict=True):
-            for number, place in zip(radio.numbers, each.places, strict=False):
-                anchors[number] = place
+            for number in radio.numbers:
+                own = each.place[(self.estimate.ranges.anchor[radio.rows[radio.some]] == number) & (each.place >= 0)]
+                anchors[number] = each.places[np.bincount(own).argmax()] if len(own) else anchors[number]
         return anchors
 
     def _displacement(self) -> Floats:

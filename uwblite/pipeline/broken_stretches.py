@@ -12,37 +12,63 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Ints
 from ..findings import Finding, doubt
-from ..graph.pose_edges import ScanEdges
+from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.registration import Registration
 from ..lidar.scan_matching import pair_points
 from ..lidar.visibility import nearest_by_bearing
 from ..odometry.slips import log_densities, with_slips
 from . import lidar_stages, surface_adjustment
-from .anchor_places import BrokenStep, broken_steps, range_evidence
+from .anchor_places import BreakPolicy, BrokenStep, broken_steps, decide_places, range_evidence
 from .estimate import Estimate, Task
 from .radio_stages import rough, with_range_noise
 
 _SUDDEN = 5.0
 """Standard deviations that a step of faultless wheels hardly ever exceeds."""
+_NOISE_ROUNDS = 2
+"""Number of solutions before clouds are matched anew; each begins with an estimate of the ranges' noise."""
 _AROUND = 2.0
 """Time within which steps that contradict the odometry are one slip, s: twice as long as one lasts on the mean, or less."""
 
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with each broken step of the lidar's path left to wheels and radio where that is more probable."""
+    """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
     if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
-    for step in broken_steps(estimate, task, _suspects(estimate, task)):
+    wheels, found = estimate.odometry, list[Finding]()
+    while len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
         stretch = _stretch(estimate, task, step.begin)
         other = _released(estimate, task, step, stretch)
-        gain = step.log_odds_beforehand() + _gain(other, estimate, task, step)
+        gain = _gain(other, estimate, wheels, task, step) + float(np.log(BreakPolicy.broken))
         task.stages.end("broken stretch", begin=round(float(task.recordings.stamps[stretch[0]]), 2), gain=round(gain, 1))
-        if gain > 0.0:
-            estimate = _adjusted(other, task)
-            task.stages.findings.append(_finding(step, stretch, task))
-    return estimate
+        if gain <= 0.0:
+            break
+        found.append(_finding(estimate, other, step, stretch, task))
+        estimate = other
+    if not found:
+        return estimate
+    _explain(task)
+    task.stages.findings += found
+    estimate = lidar_stages.solve_by_own_errors(decide_places(estimate, task), task)
+    return surface_adjustment.adjust_surfaces(estimate, task)
+
+
+def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
+    """Return the broken step that explains the ranges best; None where anchors that move explain them better, or none move."""
+    steps = broken_steps(estimate, task, _suspects(estimate, task))
+    gain, step = max(steps, key=lambda each: each[0], default=(0.0, None))
+    return step if gain > 0.0 else None
+
+
+def _explain(task: Task) -> None:
+    """Name the cause of what was said of anchors that seemed to move along the broken path."""
+    for k, finding in enumerate(task.stages.findings):
+        if finding.kind in ("moved-anchor", "path-displaced"):
+            task.stages.findings[k] = replace(finding, explained_by=(_KIND,))
+
+
+_KIND = "worse-than-parts"
 
 
 def _off(estimate: Estimate) -> Bools:
@@ -58,7 +84,7 @@ def _suspects(estimate: Estimate, task: Task) -> Ints:
 
 
 def _stretch(estimate: Estimate, task: Task, begin: int) -> tuple[int, int]:
-    """Return the first and last keyframe of the steps around a broken one, which ends at a keyframe, that contradict as well."""
+    """Return the first and last keyframe of the steps that contradict around a broken one, which ends at a keyframe."""
     stamps, of = task.recordings.stamps, task.recordings.of_keyframe
     ends = np.append(estimate.odometry.j[_off(estimate)], begin)
     ends = np.unique(ends[of[ends] == of[begin]])
@@ -79,13 +105,16 @@ def _released(estimate: Estimate, task: Task, step: BrokenStep, stretch: tuple[i
     far, (first, last) = _displaced(estimate, step), stretch
     graph = replace(estimate.graph, poses=step.displaced(estimate.graph.poses), anchors=step.places(estimate.graph.anchors))
     slips = (estimate.odometry.i >= first) & (estimate.odometry.j <= last)
+    wheels = with_slips(estimate.odometry, slips.astype(np.float64))
     lidar = estimate.joint.rows(_kept(estimate.joint, far, first, last))
-    other = replace(
-        estimate, graph=graph, joint=lidar, steps=None, surfaces=None, odometry=with_slips(estimate.odometry, slips.astype(float))
-    )
-    for _ in range(2):
+    other = replace(estimate, graph=graph, joint=lidar, steps=None, surfaces=None, odometry=wheels)
+    for _ in range(_NOISE_ROUNDS):
         other = lidar_stages.solved(with_range_noise(other, task.config), rough(task.config.solver))
-    return lidar_stages.refine_jointly(replace(other, joint=None), task)
+    other = lidar_stages.refine_jointly(replace(other, joint=None), task)
+    edges = other.closures.edges
+    agrees = np.abs(edges.residuals(other.graph)).max(axis=1, initial=0.0) <= _SUDDEN
+    reasons = ["leads across a broken step of the path"] * len(edges)
+    return replace(other, closures=other.closures.without(agrees, "contradicts-graph", reasons))
 
 
 def _kept(edges: ScanEdges, far: Bools, first: int, last: int) -> Bools:
@@ -94,43 +123,47 @@ def _kept(edges: ScanEdges, far: Bools, first: int, last: int) -> Bools:
     return ~(inside[0] | inside[1]) & (far[edges.i] == far[edges.j])
 
 
-def _gain(other: Estimate, estimate: Estimate, task: Task, step: BrokenStep) -> float:
-    """Return by how much the log likelihood of all measurements is greater along another path, all associations made anew."""
+def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task, step: BrokenStep) -> float:
+    """Return by how much the log likelihood of all measurements is greater along another path, all associations made anew.
+
+    Parameters
+    ----------
+    wheels : the odometry with the noise that it is judged by.
+    """
     assert estimate.joint is not None
     assert other.joint is not None
     far = _displaced(estimate, step)
     i, j = (np.concatenate([getattr(e.joint, end) for e in (estimate, other)]) for end in ("i", "j"))
     i, j = np.unique(np.stack([i, j])[:, far[i] != far[j]], axis=1)
     scans, points = estimate.lidar, pair_points(estimate.lidar.clouds, j, task.config.scan_to_scan.points)
-    rays_of = Registration(scans.clouds, scans.raster, nearest_by_bearing(scans.clouds), task.config.scan_to_scan.sigma)
-    degree = np.bincount(j, minlength=len(far))[j]
+    seen = Registration(scans.clouds, scans.raster, nearest_by_bearing(scans.clouds), task.config.scan_to_scan.sigma)
+    # The points of a cloud are the same in all of its pairs.
+    share = 1.0 / np.bincount(j, minlength=len(far))[j]
     scores = []
-    for each in (other, estimate):
-        rays = rays_of.log_likelihood(i, points, se2.between(each.graph.poses[i], each.graph.poses[j])) / degree
-        wheels = log_densities(estimate.odometry, each.graph)
-        scores.append(np.array([range_evidence(each, task), float(np.sum(wheels)), float(np.sum(rays))]))
-    return float(np.sum(scores[0] - scores[1]))
+    for graph, ranges in ((e.graph, range_evidence(e, task)) for e in (other, estimate)):
+        rays = seen.log_likelihood(i, points, se2.between(graph.poses[i], graph.poses[j]))
+        scores.append(ranges + float(np.sum(log_densities(wheels, graph))) + float(rays @ share))
+    return scores[0] - scores[1]
 
 
-def _adjusted(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with weights of ranges, and walls and columns, as after every joint refinement."""
-    return surface_adjustment.adjust_surfaces(lidar_stages.solve_by_own_errors(estimate, task), task)
-
-
-def _finding(step: BrokenStep, stretch: tuple[int, int], task: Task) -> Finding:
+def _finding(
+    estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task
+) -> Finding:
     """Return what the user is told of a stretch that was replaced."""
     stamps, start = task.recordings.stamps, float(step.recording.log.odometry.stamps[0])
     begin, end = (float(stamps[k]) for k in stretch)
-    off, turned = float(np.hypot(*step.motion[:2])), float(np.rad2deg(abs(step.motion[2])))
+    before, after = (se2.between(*e.graph.poses[list(stretch)]) for e in (estimate, other))
+    off = float(np.hypot(*(after - before)[:2]))
+    turned = float(np.rad2deg(abs(se2.wrap_angle(after[2] - before[2]))))
     told = doubt(
-        "worse-than-parts",
-        f"from t = {begin - start:.0f} to {end - start:.0f} s the lidar is not understood: wheels and ranges together deny "
-        f"{off:.1f} m and {turned:.0f} deg of its motion; its matches there were left out, and all scans matched anew from where "
-        "wheels and ranges have them",
+        _KIND,
+        f"from t = {begin - start:.0f} to {end - start:.0f} s the lidar is not understood: with its matches there left out and "
+        f"all scans matched anew, the robot moves {off:.1f} m and {turned:.0f} deg differently, and ranges, wheels and rays "
+        "together are more probable; the map follows that",
         off=off, turned=turned,
     )  # fmt: skip
     cure = (
-        f"`uwblite convert run.log part.log --end {begin - start:.0f}` and map it: the part before that is supported best; "
-        "`uwblite map --without lidar` shows what wheels and ranges say of the rest"
+        f"`uwblite convert run.log before.log --end {begin - start:.0f}` gives the part that is supported best; map that, or "
+        "`uwblite map run.log --without lidar` for what wheels and ranges alone say"
     )
     return replace(told, sensor="lidar", recording=step.recording.number + 1, stretches=((begin, end),), cure=cure)
