@@ -63,16 +63,21 @@ def tree_of(module: str) -> ast.Module:
     return ast.parse((PACKAGE / f"{module}.py").read_text())
 
 
+@cache
+def nodes_of(module: str) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree_of(module)))
+
+
 def imports_of(module: str):
     """Yield (imported module of this package, whether only for type checking)."""
     here = module.split("/")
     typing_only = {
         id(child)
-        for node in ast.walk(tree_of(module))
+        for node in nodes_of(module)
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         for child in ast.walk(node)
     }
-    for node in ast.walk(tree_of(module)):
+    for node in nodes_of(module):
         if not isinstance(node, ast.ImportFrom) or not node.level or id(node) in typing_only:
             continue
         base = here[: len(here) - node.level] + (node.module.split(".") if node.module else [])
@@ -116,7 +121,7 @@ def test_no_import_circles():
 
 @pytest.mark.parametrize("module", MODULES)
 def test_imports_within_the_package_are_relative(module):
-    for node in ast.walk(tree_of(module)):
+    for node in nodes_of(module):
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
         if isinstance(node, ast.ImportFrom) and not node.level:
             names = [node.module or ""]
@@ -151,7 +156,7 @@ CLOCKS = ("time.time", "time.monotonic", "time.perf_counter", "datetime.now", "d
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not m.startswith("cli/") and m != "__main__"])
 def test_library_code_is_silent_and_pure(module):
-    for node in ast.walk(tree_of(module)):
+    for node in nodes_of(module):
         if isinstance(node, ast.Attribute):
             name = ast.unparse(node)
             assert name != "os.environ", f"{module}:{node.lineno} reads the environment"
@@ -173,7 +178,7 @@ def test_library_code_is_silent_and_pure(module):
 def test_numbers_are_as_wide_as_addresses_or_named_as_wider(module):
     # On 32-bit machines numpy takes no 64-bit numbers as indices or counts, and 32 bits hold no ids of files: Ints and WIDE
     # of arrays.py say which is meant.
-    for node in ast.walk(tree_of(module)):
+    for node in nodes_of(module):
         name = node.attr if isinstance(node, ast.Attribute) else node.value if isinstance(node, ast.Constant) else ""
         assert name not in FIXED_WIDTHS, f"{module}:{node.lineno} says {name}; np.intp where it indexes, else WIDE of arrays.py"
 
@@ -190,7 +195,7 @@ def test_no_mutable_state_at_module_level(module):
         constant = all(n.strip("_").isupper() or n == "__all__" or n[:1].isupper() for n in names)
         made = isinstance(value, ast.List | ast.Set | ast.ListComp | ast.SetComp)
         assert constant or not made, f"{module}:{node.lineno} {names} looks mutable"
-    assert not [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.Global)], f"{module} rebinds a global"
+    assert not [n for n in nodes_of(module) if isinstance(n, ast.Global)], f"{module} rebinds a global"
 
 
 def run_python(*words, cwd=None, path=None):

@@ -25,7 +25,7 @@ from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Task
-from uwblite.pipeline.final_stages import at_given_poses
+from uwblite.problem.parts import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import Odometry, UwbRanges

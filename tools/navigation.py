@@ -32,6 +32,7 @@ from uwblite import se2
 from uwblite.errors import UwbliteError
 from uwblite.localization import Localizer, Scanner
 from uwblite.localization.known_map import KnownMap
+from uwblite.navigation.clearance import clearance_map
 from uwblite.navigation.planner import Planner, make_planner
 from uwblite.sensor_log import SensorMounting
 
@@ -247,7 +248,7 @@ def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed:
     rng = np.random.default_rng(seed)
     places = _free_places(planner)
     origin = se2.transform(se2.inverse(ground.T_truth_map), np.asarray(PLANS[place.world]().start)[:2])
-    roomy = places[planner.clearance.at(places)[0] >= ROOMY**2]
+    roomy = places[clearance_map(ground.result.grid, ROOMY).at(places)[0] >= ROOMY**2]
     here = roomy[np.argmin(np.hypot(*(roomy - origin).T))]
     start = np.array([*se2.transform(ground.T_truth_map, here), rng.uniform(-3.0, 3.0)])
     robot = Robot(place, seed, start)
@@ -277,10 +278,9 @@ def _free_places(planner: Planner) -> np.ndarray:
     """Return the places (n, 2), m, map frame, of the largest part of the map in which the robot can drive about."""
     from scipy.sparse.csgraph import connected_components
 
-    _, label = connected_components(planner.graph, directed=False)
-    g = planner.clearance.geometry
-    rows, cols = np.divmod(planner.nodes, g.cols)
-    return g.centre_of(rows, cols)[label == np.bincount(label).argmax()]
+    nodes = planner.steps.nodes()
+    _, label = connected_components(planner.steps.graph(nodes), directed=False)
+    return planner.steps.places(nodes)[label == np.bincount(label).argmax()]
 
 
 VARIANTS = (

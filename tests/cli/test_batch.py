@@ -122,6 +122,33 @@ def batch_args(recordings, out, *more):
     return parser.parse_args([*recordings, "--out", str(out), *more])
 
 
+@pytest.mark.slow
+def test_a_batch_that_is_killed_goes_on_where_it_was_and_is_alone_in_its_folder(made, recordings, tmp_path):
+    """It stands still after a row, a second batch is refused, and it is killed; the same command again makes the same bytes."""
+    out = tmp_path / "maps"
+    words = [sys.executable, "-m", "uwblite", "batch", *recordings, "--out", str(out), "--no-timings", "-q"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    first = subprocess.Popen(words, env=environment, start_new_session=True)
+    try:
+        while not (out / "batch.csv").exists() or not rows(out):
+            assert first.poll() is None
+            time.sleep(0.02)
+        os.killpg(first.pid, signal.SIGSTOP)
+        other = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=120)
+        assert other.returncode == 1
+        assert f"another run is writing {out}" in other.stderr
+    finally:
+        os.killpg(first.pid, signal.SIGKILL)
+        first.wait()
+    assert len(rows(out)) < len(recordings)
+    kept = inode(out / "monday")
+    again = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
+    assert again.returncode == made[1]
+    assert inode(out / "monday") == kept
+    for name in ("monday", "tuesday"):
+        assert contents(out / name) == contents(made[0] / name)
+
+
 def test_folders_have_the_names_of_the_recordings():
     assert batch.folder_names(["a/x.log", "b/y.log.gz", "z.mcap", "csv/"]) == ["x", "y", "z", "csv"]
     assert batch.folder_names(["a/run.log", "b/run.log", "c/other.log"]) == ["a_run", "b_run", "other"]

@@ -64,6 +64,7 @@ def test_every_odometry_stamp_has_a_pose(mapped):
     assert np.all(np.diff(stamps) > 0)
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_map, tmp_path, capsys):
     assert main(["map", str(minute_map.parent / "run.log.gz"), "--out", str(tmp_path / "2"), "--jobs", "2", "-q"]) in (0, 3)
     first, second = contents(minute_map), contents(tmp_path / "2")

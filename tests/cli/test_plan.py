@@ -50,7 +50,7 @@ def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_
     words = [*rooms[:-1], "0.35", "--from", "3,1", "--to", "3,3", "--json"]
     assert main(words) == 1
     output = capsys.readouterr()
-    assert "no path to (3.00, 3.00); the nearest reachable point is (" in output.err
+    assert "no path to (3.00, 3.00) with a radius of 0.35 m in cells of 0.1 m; the nearest reachable point is (" in output.err
     answer = json.loads(output.out)
     assert answer["exit_code"] == 1
     assert answer["nearest"][1] < 2.0
@@ -66,7 +66,7 @@ def test_a_result_of_map_is_planned_in_with_its_anchors(tmp_path, monkeypatch, c
     assert main(words) in (0, 1)
     assert "internal" not in capsys.readouterr().err
     (tmp_path / "map" / "map.yaml").unlink()
-    assert main(words) == 1
+    assert main([*words, "--force"]) == 1
     assert "no map.yaml" in capsys.readouterr().err
 
 

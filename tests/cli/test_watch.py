@@ -96,6 +96,41 @@ def test_a_round_is_begun_shown_and_followed_by_the_next(watched):
     assert FakeChild.made[1].stopped
 
 
+def test_ten_minutes_of_polling_follow_a_log_and_take_a_tenth_of_the_time(watched):
+    """A log of two parts, whose radio falls silent for a minute; a round takes 4 s at first and more as the log grows."""
+    made, log, folder, state = watched
+    make_map(folder)
+    part, written, rounds, silent = log, 0, [], []
+    for second in range(600):
+        if second == 300:
+            with part.open("a") as out:
+                written += out.write("COMMENT continued in run.2.log\n")
+            part = log.with_name("run.2.log")
+        with part.open("a") as out:
+            begin = 1000.0 + second
+            written += out.write(odom_lines(begin, begin + 1.0))
+            if not 400 <= second < 460:
+                written += out.write(f"UWB 5C0B 3.210 90 {begin + 0.5:.6f} host {begin + 0.5:.6f}\n")
+        now = 50.0 + second
+        if made._job is not None and now - made._job_began >= 4.0 + 0.01 * second:
+            rounds.append(now - made._job_began)
+            made._job.result = 0
+        made.step(now)
+        shown = state()
+        assert made.tail.bytes == written or second == 300  # the next part is found a step later
+        assert made.tail.last == pytest.approx(1000.9 + second, abs=0.11) or second == 300
+        assert sum(not job.stopped and job.result is None for job in FakeChild.made) <= 1
+        silent += [second] * any(s["late"] for s in shown["sensors"] if s["name"] == "radio")
+    assert len(rounds) >= 5
+    assert sum(rounds) <= 0.1 * 600 + max(rounds)
+    assert made.last is not None
+    assert not made.last.failed
+    assert made.last.recorded > 450
+    assert min(silent) in range(402, 440)
+    assert max(silent) in range(458, 462)
+    made.close()
+
+
 def test_a_round_that_fails_leaves_the_page_and_the_map(watched):
     made, log, folder, state = watched
     make_map(folder)

@@ -26,7 +26,8 @@ CARMEN = "# a comment\nODOM 0 0 0 0 0 0 1.0 robot 1.0\n"
 @pytest.mark.parametrize(
     ("text", "kind"),
     [(SQUARE, "g2o"), (TORO, "g2o"), (ISAM_EDGE, "g2o"), (ISAM, "isam"), (PYFG, "pyfg"), (TUM, "tum"), (LIBRSF, "librsf"),
-     (CARMEN, "log"), ("#ROSBAG V2.0\n", "bag"), ("hello\n", ""), ("", "")],
+     (CARMEN, "log"), ("#ROSBAG V2.0\n", "bag"), ("hello\n", ""), ("", ""), ("1.0 0.1 0.2\n", "numbers"),
+     ("\x0c\x80CSensoryFrame\x02\0", "rawlog")],
 )  # fmt: skip
 @pytest.mark.parametrize("packed", [False, True])
 def test_content_tells_the_format(tmp_path, text, kind, packed):
@@ -79,6 +80,8 @@ def test_angles_in_degrees_are_hinted(tmp_path):
         (SQUARE, "is a pose graph without scans .*: uwblite optimize"),
         (PYFG, "is a pose graph without scans .*: uwblite optimize"),
         (ISAM, "is a pose graph of iSAM"),
+        ("0.1 0.2 0.3\n0.1 0.2 0.3\n", "is a table of numbers without names, as MRPT exports"),
+        ("\x0c\x80CSensoryFrame\x02\0", "is a binary rawlog of MRPT"),
         (TUM, "is a trajectory, no recording: uwblite convert makes a folder of it"),
     ],
 )

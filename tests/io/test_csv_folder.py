@@ -178,3 +178,18 @@ def test_a_reach_that_is_not_stated_is_the_largest_reading(tmp_path, most):
     again = read_log(tmp_path / "x.log")
     assert again.notes.broken == 0
     np.testing.assert_allclose(again.scans.ranges, log.scans.ranges, atol=6e-4)
+
+
+def test_a_stamp_of_zero_among_others_was_never_set(tmp_path):
+    """In every table it takes the place of its row."""
+    write_csv_folder(tmp_path / "t", recording())
+    for name in ("odometry.csv", "ranges.csv", "scans.csv", "gyro.csv"):
+        rows = (tmp_path / "t" / name).read_text().splitlines()
+        rows[4] = "0.000000," + rows[4].split(",", 1)[1]
+        (tmp_path / "t" / name).write_text("\n".join(rows) + "\n")
+    read, log = read_csv_folder(tmp_path / "t"), recording()
+    for sensor in ("odometry", "ranges", "scans", "gyro"):
+        np.testing.assert_allclose(getattr(read, sensor).stamps, getattr(log, sensor).stamps, atol=1e-3)
+    np.testing.assert_array_equal(read.odometry.poses, log.odometry.poses)
+    assert read.notes.warnings[0].startswith("1 of 30 odometry messages have a stamp that no clock gives (the first is 0 s in")
+    assert len(read.notes.warnings) == 4

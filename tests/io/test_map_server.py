@@ -293,3 +293,27 @@ def test_evo_draws_a_path_on_the_map(tmp_path):
     result = subprocess.run([program, *command[1:]], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     assert list(tmp_path.glob("plot*.png"))
+
+
+USUAL = "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+WRITERS = {
+    "nav2": (b"# CREATOR: map_saver.cpp 0.050 m/pix\n", "mode: trinary\n" + USUAL.replace("0.196", "0.25")),
+    "slam_toolbox": (b"", "mode: trinary\n" + USUAL),
+    "cartographer": (b"# Cartographer map; 0.050000 m per pixel\n", USUAL),
+    "hector": (b"# CREATOR: Map_generator.cpp 0.050 m/pix\n", USUAL),
+    "GIMP": (b"# Created by GIMP version 2.10.34 PNM plug-in\n", USUAL),
+}
+"""Beginning of the picture and end of the YAML file, in the form of each program."""
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_maps_of_each_program_have_their_three_states(tmp_path, writer, ends):
+    head, settings = WRITERS[writer]
+    (tmp_path / "m.pgm").write_bytes(b"P5\n" + head + b"4 3\n255\n" + PIXELS.astype(np.uint8).tobytes())
+    text = "image: m.pgm\nresolution: 0.050000\norigin: [-1.000000, -2.000000, 0.000000]\n" + settings
+    (tmp_path / "m.yaml").write_bytes(text.replace("\n", ends).encode())
+    expected = np.full(PIXELS.shape, FREE)
+    expected[PIXELS == 0] = OCCUPIED
+    expected[(PIXELS == 205) | (PIXELS == 100)] = UNKNOWN
+    np.testing.assert_array_equal(read_map(tmp_path / "m.yaml").states(), expected[::-1])

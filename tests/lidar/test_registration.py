@@ -7,7 +7,7 @@ from helpers.laser_walks import ROOM, scanned
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, objects
+from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, matched_by_chance, objects
 from uwblite.lidar.scan_matching import PairPoints, pair_points
 from uwblite.lidar.visibility import nearest_by_bearing
 
@@ -17,10 +17,11 @@ SOUND, SLIPPED = np.array([0.01, 0.01, 0.01]), np.array([0.4, 0.4, 0.3])
 
 def registered(clouds, mean, sound=SOUND):
     """Register cloud 1 in cloud 0 where the odometry counts a motion."""
-    registration = Registration(clouds, rasterize(clouds, 0.1, 0.5), nearest_by_bearing(clouds), SIGMA)
-    covariance = np.diag(sound**2)[None]
+    covariance, raster = np.diag(sound**2)[None], rasterize(clouds, 0.1, 0.5)
     prior = Prior(np.array([mean]), covariance, covariance + np.diag(SLIPPED**2))
     one, points = np.array([0]), pair_points(clouds, np.array([1]), 150)
+    chance = matched_by_chance(clouds, raster, one, points, prior.mean)
+    registration = Registration(clouds, raster, nearest_by_bearing(clouds), SIGMA, chance)
     return registration, points, prior, registration.register(one, one + 1, points, prior, prior.mean)
 
 
@@ -110,3 +111,16 @@ def test_objects_end_at_gaps_and_at_the_end_of_a_cloud(room):
         for n in np.unique(number[rows]):
             own = np.flatnonzero(number[rows] == n)
             np.testing.assert_allclose(length[rows][own], away[own[:-1]].sum())
+
+
+def test_points_match_by_chance_in_clutter_and_hardly_in_a_room(room):
+    """Shelves each 0.4 m along both axes match wherever they are laid; the walls of a room do not."""
+    truth, clouds = room
+    shelves = [[x, y, x + 0.15, y] for x in np.arange(-2.8, 2.8, 0.4) for y in np.arange(-2.6, 2.6, 0.4)]
+    full = scanned(truth, np.array(shelves), 0.005, 4)
+    one, step = np.array([0]), se2.between(truth[:1], truth[1:])
+    shares = [
+        matched_by_chance(c, rasterize(c, 0.1, 0.5), one, pair_points(c, one + 1, 150), step)[0] for c in (clouds, full)
+    ]
+    assert shares[0] < 0.2
+    assert shares[1] > shares[0] + 0.1

@@ -9,7 +9,6 @@ from helpers.planted import box
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.graph.solver import SolverConfig
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.scan_to_scan import TrackingConfig, descend, follow, reattached
 from uwblite.odometry.slips import EVERY, LASTS
@@ -26,8 +25,8 @@ def odometry_steps(truth, clouds, stated):
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), SolverConfig())
-    return result.steps, result.wheels, result.searched
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig())
+    return result.steps, result.slipped, result.searched
 
 
 @pytest.fixture(scope="module")

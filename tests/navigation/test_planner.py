@@ -7,14 +7,17 @@ import pytest
 from helpers.planning_worlds import distance_to_squares, grid_of, random_grid
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from uwblite.grid.occupancy_grid import OCCUPIED
-from uwblite.navigation.planner import STEPS, NoPathError, make_planner
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OCCUPIED, OccupancyGrid
+from uwblite.navigation import steps
+from uwblite.navigation.planner import NoPathError, make_planner
+from uwblite.navigation.steps import STEPS
 
 RADIUS = 0.15
 
 
 def reference_costs(planner, first):
-    """Return the cost from one cell to every other (rows, cols) by a heap and loops."""
+    """Return the cost from one cell to every other (rows, cols) by a heap and loops; corners are not cut."""
     passable, cost = planner.clearance.passable(), planner.clearance.cell_cost().astype(np.float64)
     found = np.full(passable.shape, np.inf)
     queue = [(0.0, first)]
@@ -25,7 +28,8 @@ def reference_costs(planner, first):
         found[row, col] = here
         for dr, dc in STEPS:
             r, c = row + dr, col + dc
-            if 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1] and passable[r, c]:
+            inside = 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1]
+            if inside and passable[r, c] and passable[r, col] and passable[row, c]:
                 step = planner.clearance.geometry.resolution * np.hypot(dr, dc) * 0.5 * (cost[row, col] + cost[r, c])
                 heapq.heappush(queue, (here + step, (r, c)))
     return found
@@ -33,9 +37,14 @@ def reference_costs(planner, first):
 
 def free_places(planner, count, seed):
     """Return places (count, 2) where the robot may stand."""
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(planner.nodes), count)
-    return planner.clearance.geometry.centre_of(*np.divmod(planner.nodes[chosen], planner.clearance.geometry.cols))
+    return planner.steps.places(np.random.default_rng(seed).choice(planner.steps.nodes(), count))
+
+
+def step_cost(planner, start, goal):
+    """Return the cost of the cheapest steps from beside one place to beside another, by a search through the whole map."""
+    nodes = planner.steps.nodes()
+    first, last = np.searchsorted(nodes, [planner._beside(start), planner._beside(goal)])
+    return dijkstra(planner.steps.graph(nodes), indices=first)[last]
 
 
 @pytest.mark.parametrize("unknown", ["refuse", "price"])
@@ -44,11 +53,13 @@ def test_costs_of_the_steps_are_those_of_a_plain_dijkstra(seed, unknown):
     grid = random_grid(seed)
     grid.log_odds[20:30, 20:26] = 0.0
     planner = make_planner(grid, RADIUS, unknown=unknown)
-    costs = dijkstra(planner.graph, indices=0)
-    first = np.divmod(int(planner.nodes[0]), grid.geometry.cols)
+    nodes = np.flatnonzero(planner.clearance.passable())
+    graph = planner.steps.graph(nodes)
+    costs = dijkstra(graph, indices=0)
+    first = np.divmod(int(nodes[0]), grid.geometry.cols)
     reference = reference_costs(planner, first).ravel()
-    assert costs == pytest.approx(reference[planner.nodes], rel=1e-6)
-    assert abs(planner.graph - planner.graph.T).max() < 1e-12
+    assert costs == pytest.approx(reference[nodes], rel=1e-6)
+    assert abs(graph - graph.T).max() < 1e-12
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -60,8 +71,7 @@ def test_laws_of_a_path(seed):
         try:
             path = planner.plan(start, [goal], step=0.07)
         except NoPathError:
-            node = planner._beside(start)
-            assert not np.isfinite(dijkstra(planner.graph, indices=node)[planner._beside(goal)])
+            assert not np.isfinite(step_cost(planner, start, goal))
             continue
         straight = np.hypot(*(goal - start))
         assert np.array_equal(path.poses[[0, -1], :2], [start, goal])
@@ -76,30 +86,80 @@ def test_laws_of_a_path(seed):
         assert distance_to_squares(grid, obstacles, np.concatenate([dense, start[None]])).min() >= RADIUS - 1e-6
         assert np.all(path.clearances <= distance_to_squares(grid, obstacles, path.poses[:, :2]) + 1e-6)
         # Smoothing gains; the bounds between the cells, and a corner's worth, make a straight way of steps a little dearer.
-        steps = dijkstra(planner.graph, indices=planner._beside(start))[planner._beside(goal)]
-        assert path.cost <= steps * 1.005 + 1e-3
+        assert path.cost <= step_cost(planner, start, goal) * 1.005 + 1e-3
         assert planner.plan(goal, [start]).cost == pytest.approx(path.cost, rel=0.02, abs=1e-3)
 
 
-@pytest.mark.parametrize("nearby", [0.0, 0.25, 1e9])
+@pytest.mark.parametrize("block", [(8, 64), (16, 64)])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_search_among_short_paths_finds_what_one_through_the_whole_map_does(monkeypatch, seed, nearby):
-    monkeypatch.setattr("uwblite.navigation.planner._NEARBY", nearby)
-    grid = random_grid(seed, rows=60, cols=80, boxes=20)
+def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeypatch, seed, block):
+    """Regions are made in a map of 150 x 200 cells, and pieces of 5,000 nodes: connected exactly, and hardly dearer."""
+    grid = random_grid(seed, rows=150, cols=200, boxes=200)
     grid.log_odds[20:30, 20:26] = 0.0
-    planner = make_planner(grid, RADIUS, unknown="price")
-    label = connected_components(planner.graph)[1]
-    nodes = np.flatnonzero(label == np.bincount(label).argmax())
-    for first, last in np.random.default_rng(seed).choice(nodes, (20, 2)).tolist():
-        cells = planner._search(first, last, planner._places(np.array([last]))[0])
-        assert (cells[0], cells[-1]) == (first, last)
-        cost = np.asarray(planner.graph[cells[:-1], cells[1:]]).sum()
-        assert cost == pytest.approx(dijkstra(planner.graph, indices=first)[last], abs=1e-9)
+    whole = make_planner(grid, RADIUS, unknown="price")
+    monkeypatch.setattr(steps, "_AT_ONCE", 5000)
+    monkeypatch.setattr(steps, "_BLOCK", block[0])
+    parts = make_planner(grid, RADIUS, unknown="price")
+    assert parts.steps.regions is not None
+    nodes = whole.steps.nodes()
+    assert np.array_equal(nodes, parts.steps.nodes())
+    label = connected_components(whole.steps.graph(nodes))[1]
+    dearer = []
+    for first, last in np.random.default_rng(seed).choice(len(nodes), (30, 2)).tolist():
+        found = parts.steps.path(int(nodes[first]), int(nodes[last]))
+        assert (found is not None) == (label[first] == label[last])
+        reached = np.concatenate(list(parts.steps.reachable(int(nodes[first]))))
+        assert np.array_equal(np.sort(reached), nodes[label == label[first]])
+        if found is None:
+            continue
+        assert (found[0], found[-1]) == (nodes[first], nodes[last])
+        start, goal = whole.steps.places(nodes[[first, last]])
+        one, other = whole.plan(start, [goal]), parts.plan(start, [goal])
+        assert distance_to_squares(grid, grid.states() == OCCUPIED, other.poses[:, :2]).min() >= RADIUS - 1e-6
+        dearer.append(other.cost / max(one.cost, 1e-9))
+    assert np.median(dearer) < 1.01
+    assert np.mean(dearer) < 1.05
+
+
+@pytest.mark.parametrize("cells", [7, 8, 9])
+@pytest.mark.parametrize("resolution", [0.05, 0.1])
+@pytest.mark.parametrize("shift", [0, 1])
+def test_a_door_is_open_to_a_radius_a_tenth_of_a_cell_below_half_its_width(cells, resolution, shift):
+    """Whether its middle lies on a cell or between two; the wall is as thick as three cells."""
+    log_odds = np.full((60, 40 + shift), -4.0, dtype=np.float32)
+    log_odds[29:32] = 4.0
+    log_odds[29:32, 15 + shift : 15 + shift + cells] = -4.0
+    grid = OccupancyGrid(GridGeometry(resolution, np.zeros(2), *log_odds.shape), log_odds)
+    start, goal = resolution * np.array([18.0, 8.0]), resolution * np.array([18.3, 51.0])
+    half = 0.5 * cells * resolution
+    for upright in (grid, OccupancyGrid(GridGeometry(resolution, np.zeros(2), *log_odds.T.shape), log_odds.T.copy())):
+        turned = upright is not grid
+        ends = [end[::-1] if turned else end for end in (start, goal)]
+        path = make_planner(upright, half - 0.1 * resolution).plan(ends[0], [ends[1]])
+        places = np.concatenate([path.poses[:-1, :2] + s * np.diff(path.poses[:, :2], axis=0) for s in np.linspace(0, 1, 9)])
+        least = distance_to_squares(upright, upright.states() == OCCUPIED, places).min()
+        assert half - 0.1 * resolution - 1e-9 <= least <= half + 1e-9
+        with pytest.raises(NoPathError, match=f"in cells of {resolution:g} m"):
+            make_planner(upright, half + 0.01 * resolution).plan(ends[0], [ends[1]])
+
+
+def test_a_gap_between_two_corners_is_open_to_a_tenth_of_a_cell():
+    """The walls end in corners that lie askew to each other: of what is between them the robot needs all."""
+    for right, up in ((5, 3), (6, 4), (7, 2), (4, 4), (3, 6)):
+        log_odds = np.full((70, 70), -4.0, dtype=np.float32)
+        log_odds[30 : 30 + 6, :30] = 4.0
+        log_odds[36 + up : 42 + up, 30 + right :] = 4.0
+        grid = OccupancyGrid(GridGeometry(0.1, np.zeros(2), 70, 70), log_odds)
+        half = 0.05 * np.hypot(right, up)
+        path = make_planner(grid, half - 0.012).plan(np.array([3.0, 1.5]), [np.array([4.0, 6.0])])
+        assert distance_to_squares(grid, grid.states() == OCCUPIED, path.poses[:, :2]).min() >= half - 0.012 - 1e-9
+        with pytest.raises(NoPathError):
+            make_planner(grid, half + 0.001).plan(np.array([3.0, 1.5]), [np.array([4.0, 6.0])])
 
 
 def test_an_open_way_is_taken_without_a_search(monkeypatch):
     planner = make_planner(grid_of("\n".join(["." * 60] * 60)), 0.2)
-    monkeypatch.setattr("uwblite.navigation.planner.dijkstra", None)
+    monkeypatch.setattr("uwblite.navigation.steps.dijkstra", None)
     path = planner.plan(np.array([1.03, 1.11]), [np.array([4.5, 3.2])])
     assert path.cost == pytest.approx(np.hypot(3.47, 2.09), rel=1e-12)
     with pytest.raises(TypeError):
@@ -135,7 +195,7 @@ def test_a_narrow_door_is_passed_in_the_middle_and_too_narrow_a_one_not():
     path = make_planner(grid, 0.15).plan(start, [goal])
     assert np.abs(path.poses[:, 0] - 2.05).max() < 0.06
     with pytest.raises(NoPathError, match=r"no path to .* nearest reachable point") as caught:
-        make_planner(grid, 0.25).plan(start, [goal])
+        make_planner(grid, 0.255).plan(start, [goal])
     assert caught.value.nearest[1] < 2.0
     assert np.hypot(*(caught.value.nearest - goal)) < 1.8
 
@@ -171,7 +231,9 @@ def test_a_robot_too_near_to_a_wall_may_leave_and_one_inside_of_it_not():
         planner.plan(np.array([50.0, 1.0]), [np.array([1.0, 0.7])])
 
 
-def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known():
+@pytest.mark.parametrize("at_once", [300_000, 200])
+def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known(monkeypatch, at_once):
+    monkeypatch.setattr(steps, "_AT_ONCE", at_once)
     text = "\n".join(["." * 40] * 16 + ["?" * 10 + "#" * 20 + "?" * 10] + ["?" * 40] * 16)
     grid = grid_of(text)
     planner, priced = make_planner(grid, 0.2), make_planner(grid, 0.2, unknown="price")

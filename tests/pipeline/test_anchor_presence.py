@@ -80,7 +80,7 @@ def test_readings_without_a_distance_are_no_hearing_and_ranges_without_weight_ar
     of_a = first & (estimate.ranges.anchor == 0)
     estimate.ranges = replace(estimate.ranges, weights=np.where(of_a, 0.0, 1.0))
     assert [w.figures["anchor"] for w in named(estimate, task)] == ["B"]
-    task.stages.warnings.clear()
+    task.stages.findings.clear()
     estimate.ranges = replace(estimate.ranges, ranges=np.where(of_a, 0.0, 1.0))
     name_new_and_absent_anchors(estimate, task)
     assert sorted(w.figures["anchor"] for w in task.stages.warnings) == ["A", "B"]

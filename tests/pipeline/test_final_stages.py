@@ -18,8 +18,9 @@ from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import final_stages
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.final_stages import _sweeps, at_given_poses
+from uwblite.pipeline.final_stages import _sweeps
 from uwblite.pipeline.recordings import gather
+from uwblite.problem.parts import at_given_poses
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.odometry_units import odometry_unit_factors, with_given_mounting_and_clock, with_units_checked
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import Recordings
+from uwblite.sensor_log import LogNotes
 
 
 @pytest.mark.parametrize(("errors", "factors"), [
@@ -93,7 +94,7 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
 ])  # fmt: skip
 def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
     mounting = SimpleNamespace(laser_is_base=False)
-    logs = [SimpleNamespace(screening=SimpleNamespace(in_bursts=s), mounting=mounting, scans=0) for s in late]
+    logs = [SimpleNamespace(screening=SimpleNamespace(in_bursts=s), mounting=mounting, scans=0, notes=LogNotes()) for s in late]
     config = MappingConfig()
     found = with_given_mounting_and_clock(config, logs)
     expected = replace(config.calibration, range_delay=radio, laser_delay=lidar)
@@ -104,7 +105,9 @@ def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
 def test_a_laser_whose_poses_the_log_gives_is_where_it_is_said_to_be(is_base, fixed):
     """None: a recording without lidar."""
     logs = [
-        SimpleNamespace(screening=None, mounting=SimpleNamespace(laser_is_base=bool(b)), scans=None if b is None else 0)
+        SimpleNamespace(
+            screening=None, notes=LogNotes(), mounting=SimpleNamespace(laser_is_base=bool(b)), scans=None if b is None else 0
+        )
         for b in is_base
     ]
     assert with_given_mounting_and_clock(MappingConfig(), logs).calibration.laser_offset == (0.0 if fixed else 0.1)

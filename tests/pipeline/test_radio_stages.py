@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import planted
 from helpers.laser_walks import chained
 from helpers.planted_graphs import loop, plain_ranges
 from scipy.spatial.distance import pdist
@@ -19,7 +20,9 @@ from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import reestimate_ranges, select_range_priors
+from uwblite.pipeline.radio_stages import evidence_against, first_optimisation, reestimate_ranges, select_range_priors
+from uwblite.pipeline.recordings import gather
+from uwblite.sensor_log import SensorLog, SensorMounting
 
 
 def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(monkeypatch):
@@ -131,3 +134,45 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
         assert made == done
     without = replace(estimate, ranges=None)
     assert radio_stages._optimised(without, None) is without
+
+
+PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
+
+
+def surveyed(bias=(0.0,) * 4, scale=1.0, seed=3):
+    """Return the task of a walk of 80 m among four anchors, with a radio of such biases, m, and scale."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 80.0)
+    radio = planted.ranges(rng, stamps, truth, PLACES, sigma=0.08, bias=bias)
+    radio = replace(radio, ranges=radio.ranges * scale)
+    wheels = planted.odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
+    level = SensorMounting(anchor_height=0.0)
+    config = MappingConfig()
+    return Task(gather([SensorLog(wheels, radio, None, level)], config.keyframes), config, Constraints(), Stages(None, None))
+
+
+@pytest.mark.parametrize(
+    ("bias", "scale"), [((0.0,) * 4, 1.0), ((0.1, -0.05, 0.08, 0.0), 1.0), ((0.9, 0.5, 1.2, 0.8), 1.0), ((0.0,) * 4, 1.07)]
+)
+def test_anchors_of_a_calibrated_radio_and_of_one_that_is_not(bias, scale):
+    """The wide priors of the latter are paid for by its ranges alone. Distances between anchors are known to the biases of two
+    calibrated radios, 0.1 m times the root of 2 as a standard deviation: three of these."""
+    found = first_optimisation(surveyed(bias, scale))
+    assert found.placed.all()
+    assert np.max(np.abs(pdist(found.graph.anchors) - pdist(PLACES))) < 0.42
+    calibration = found.graph.calibration
+    if scale != 1.0:
+        assert calibration.get("range_scale") == pytest.approx(scale - 1.0, abs=0.02)
+    if np.ptp(bias) > 0.3:
+        assert np.mean(calibration.values[calibration.of_kinds("bias")]) == pytest.approx(np.mean(bias), abs=0.3)
+
+
+def test_evidence_is_for_the_better_of_two_estimates_and_against_the_other():
+    task = surveyed()
+    found = first_optimisation(task)
+    anchors = found.graph.anchors + np.array([[0.4, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    worse = replace(found, graph=replace(found.graph, anchors=anchors))
+    gain = evidence_against(found, worse, task.config)
+    assert gain > 10.0
+    assert evidence_against(worse, found, task.config) == pytest.approx(-gain)
+    assert evidence_against(found, found, task.config) == 0.0

@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.joint_covariance import anchor_covariance
 from uwblite.graph.marginals import marginals
-from uwblite.pipeline.shared_anchors import Places, agreement, fitted, other_place, places_of, together
+from uwblite.pipeline.shared_anchors import Places, agreement, fitted, places_of, together
 
 MOTION = np.array([30.0, -12.0, 2.1])
 """T_placed_found."""
@@ -60,18 +60,6 @@ def test_chi2_is_that_of_the_distance_where_two_places_are_compared():
     motion, chi2 = fitted(found, placed, [(0, 0), (1, 1)])
     assert chi2 == pytest.approx(1.2**2 / (4 * 0.04 + 2 * 0.25**2))
     np.testing.assert_allclose(se2.transform(motion, found.at), [[-0.6, 0.0], [9.6, 0.0]], atol=1e-9)
-
-
-def test_an_anchor_of_no_common_place_is_called_as_the_place_where_it_stands():
-    """C stands where another recording had it before; from no place of the same radio it is another one's."""
-    _, placed = seen_twice()
-    placed = swinging(("A", "B", "C", "D", "E", "C#2"), np.vstack([WORLD, [[64.0, 22.0]]]), 0.05)
-    found, _ = seen_twice([(2, se2.rotate(0.06, se2.rotate(-MOTION[2], np.array([4.2, 2.1]))))])
-    _, pairs = agreement(found, placed)
-    assert 2 not in [k for k, _ in pairs]
-    assert other_place(found, placed, pairs, 2) == "C#2"
-    far, _ = seen_twice([(2, (-3.0, 9.0))])
-    assert other_place(far, placed, pairs, 2) is None
 
 
 def test_two_recordings_together_know_each_anchor_as_their_least_squares_does():

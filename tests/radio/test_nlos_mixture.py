@@ -45,6 +45,14 @@ def test_the_probability_of_the_core_is_bayes(mixture):
     np.testing.assert_allclose(mixture.core(errors)[seen], (core / np.where(seen, total, 1.0))[seen], rtol=1e-6, atol=1e-9)
 
 
+@given(shapes)
+def test_the_density_is_that_of_its_three_parts(mixture):
+    """Gross errors are as likely anywhere, and far from the core they are all that there is."""
+    errors = mixture.centre + mixture.sigma * np.array([-200.0, -5.0, -1.0, 0.0, 2.0, 9.0, 400.0])
+    np.testing.assert_allclose(mixture.density(errors), density(mixture, errors), rtol=1e-6, atol=1e-290)
+    assert mixture.density(errors[:1])[0] == pytest.approx(mixture.wild / mixture.width, abs=1e-290)
+
+
 @given(st.floats(0.02, 0.5), st.floats(0.1, 5.0), st.floats(-6.0, 30.0))
 def test_the_expected_detour_of_a_late_range_is_the_mean_over_all_detours(sigma, detour, error):
     """By the trapezoid over detours d: exp(-d / detour) times the core's density at what is left of the error."""

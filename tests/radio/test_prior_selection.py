@@ -14,7 +14,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import prior_selection
-from uwblite.radio.prior_selection import _mean_under, _units, select_priors
+from uwblite.radio.prior_selection import _mean_under, _units, is_uncalibrated, select_priors, with_calibrated_radio
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -212,3 +212,27 @@ def test_the_mean_under_other_priors_is_that_of_the_same_measurements():
     covariance = np.linalg.inv(a.T @ a + np.diag(before**-2.0))
     expected = np.linalg.solve(a.T @ a + np.diag(after**-2.0), a.T @ y)
     np.testing.assert_allclose(_mean_under(covariance @ a.T @ y, covariance, before, after), expected)
+
+
+def test_a_calibrated_radio_has_the_narrowest_priors_tried():
+    graph, _ = solved(0)
+    done = with_calibrated_radio(graph, CONFIG)
+    before, after = widths(graph), widths(done)
+    sound = {"range_scale": CONFIG.range_scale_sound} | {f"bias:A0{k}": CONFIG.range_bias_sound for k in range(4)}
+    assert after == pytest.approx(before | sound)
+    # A prior that is narrower stays.
+    narrow = replace(CONFIG, range_bias_sound=0.5, range_bias=0.5)
+    assert widths(with_calibrated_radio(done, narrow)) == pytest.approx(after)
+
+
+@pytest.mark.parametrize(("bias", "scale", "asked"), [
+    ((0.0, 0.0, 0.0, 0.0), 1.0, False), ((0.1, -0.05, 0.08, 0.0), 1.0, False), ((0.9, 0.4, 1.3, 0.7), 1.0, True),
+    ((0.0, 0.0, 0.0, 0.0), 1.07, True),
+])  # fmt: skip
+def test_wide_priors_are_asked_for_where_a_calibrated_radio_contradicts_its_ranges(bias, scale, asked):
+    graph, edges = solved(2, bias=bias, scale=scale)
+    calibrated = with_calibrated_radio(graph, CONFIG)
+    done = optimize(calibrated.with_edges(edges))[0]
+    chosen = select_priors(calibrated.updated(done.poses, done.anchors, done.calibration.values), (edges,), CONFIG)
+    assert is_uncalibrated(chosen, CONFIG) == asked
+    assert not is_uncalibrated(calibrated, CONFIG)

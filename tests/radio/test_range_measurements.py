@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.radio.range_measurements import learn_noise, range_edges, relocate
+from uwblite.radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -195,3 +195,23 @@ def test_noise_is_learnt_from_clear_ranges_where_there_are_thirty(clear, least, 
     noisy = replace(edges, ranges=edges.distances(graph) + error)
     _, (noise,) = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=blocked)
     assert least < noise.sigma < most
+
+
+def test_densities_of_ranges_are_normalised_and_counted_once_where_errors_last():
+    """By what is expected of normal errors, -log(sigma) - log(2 pi e) / 2 each; a range without weight counts for nothing."""
+    config = RangeNoiseConfig()
+    _, truth, frames, places, _, edges = world(1, metres=150.0, sigma=0.0)
+    graph = Graph(truth[frames.index], places)
+    edges = replace(edges, ranges=edges.distances(graph) + 0.1 * np.random.default_rng(6).standard_normal(len(edges)))
+    learnt = learn_noise(edges, graph, 3, config)[0]
+    density, share = log_densities(learnt, graph, config)
+    assert density.mean() == pytest.approx(-np.log(0.1) - 0.5 * np.log(2.0 * np.pi * np.e), abs=0.1)
+    assert np.all((share > 0.0) & (share <= 1.0))
+    # An error that is the same for all ranges nearby.
+    lasting = replace(edges, ranges=edges.ranges + 0.2 * np.sin(graph.poses[edges.pose, 0] / 1.5))
+    assert log_densities(learn_noise(lasting, graph, 3, config)[0], graph, config)[1].sum() < 0.5 * share.sum()
+    weights = learnt.own_weights * (np.arange(len(learnt)) >= 10)
+    density, share = log_densities(replace(learnt, weights=weights), graph, config)
+    assert not share[:10].any()
+    assert not density[:10].any()
+    assert share[10:].all()

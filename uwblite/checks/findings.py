@@ -51,6 +51,10 @@ class Findings:
         return tuple(sorted(self._found, key=lambda f: RANKS.index(f.rank)))
 
 
+_FINEST = 1e-6
+"""s; stamps are written no finer, and differences below are those of numbers that are no times."""
+
+
 def timing(
     stamps: Floats, topic: str, found: Findings, *, expected_gap: float, repeats: float | None = None
 ) -> dict[str, float]:  # fmt: skip
@@ -63,7 +67,8 @@ def timing(
     repeats : share of equal stamps that is not right, where some are; None = any is wrong.
     """
     steps = np.diff(stamps)
-    period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    some = steps > _FINEST
+    period = float(np.median(steps[some])) if some.any() else 0.0
     duration = float(stamps[-1] - stamps[0])
     gap = max(expected_gap, 5.0 * period)
     gaps = np.flatnonzero(steps > gap)

@@ -4,6 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
+from ..report.printable import duration
 from .options import add_bag_arguments, add_mounting_arguments
 from .wording import calibration_text, signed
 
@@ -145,7 +146,8 @@ _ONLY_A_MAP = (
 
 def _counts(figures: dict[str, Any]) -> str:
     odometry = figures["odometry"]
-    parts = [f"{odometry['duration s']:.0f} s, {odometry['path m']:.1f} m by {odometry['count']} odometry readings"]
+    span, readings = duration(odometry["duration s"]), f"{odometry['count']} odometry readings"
+    parts = [f"{span}, {odometry['path m']:.1f} m by {readings}"]
     parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
     if "uwb" in figures:
         parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")

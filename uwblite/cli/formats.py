@@ -20,7 +20,7 @@ TRAJECTORIES = {".tum": "tum", ".kitti": "kitti"}
 
 
 def format_of(path: str) -> str:
-    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'kitti' or 'map' (a result); '' where none shows.
+    """Return 'csv', 'map' (a result), 'kitti' or a format that format_of_content knows; '' where nothing shows one.
 
     A name tells where it ends like one of the format; what it does not tell, and whether it is a bag, the content does.
     """
@@ -101,6 +101,10 @@ _OTHERS = {
     "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ --to csv), to which"
     " ranges.csv (stamp,anchor,range,quality) and scans.csv may be added; uwblite evaluate compares with it",
     "kitti": "is a trajectory without times, no recording",
+    "rawlog": "is a binary rawlog of MRPT, which is not read: rawlog-edit exports odometry and scans as text, of which a folder"
+    " of tables can be made (docs/formats.md: odometry.csv, scans.csv, ranges.csv)",
+    "numbers": "is a table of numbers without names, as MRPT exports its rawlogs: a folder of tables is read, with odometry.csv"
+    " (stamp,x,y,theta; poses, not steps), scans.csv and ranges.csv (docs/formats.md)",
 }
 """What is no recording, and the verb that takes it."""
 

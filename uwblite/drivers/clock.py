@@ -11,8 +11,6 @@ from statistics import median
 
 from .clock_map import ClockMap
 
-MAX_SKEW = 1e-3
-"""Largest plausible relative error of a crystal; anything above is a broken estimate."""
 BACKWARD = 1.0
 """s; a scan may have begun before the last reading of the clock, more than that is another power-up."""
 LEAP = 0.1

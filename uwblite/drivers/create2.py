@@ -14,10 +14,10 @@ import math
 import struct
 from dataclasses import dataclass
 
-from .clock_map import ClockMap
+from .clock_map import rhythm_map
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
-from .odometer import BaseDriver, WheelOdometer, wrapped
+from .odometer import BaseDriver, WheelOdometer, way_of
 from .session import Script, Wait
 
 BAUD = 115200
@@ -41,8 +41,6 @@ STALL = 0.3
 """s by which a frame may come late because the computer stalled; later, frames were lost."""
 LOW_VOLTAGE = 13.0
 """V."""
-WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
-"""s, s, share: how far back the map from frames to time looks; the period is stated as 15 ms, and is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +82,8 @@ class Create2Driver(BaseDriver):
     baud : bit/s; a robot that was switched on with its clean button held for 10 s talks at 19200.
     """
 
+    frame, rhythm = Encoders, PERIOD
+
     def __init__(self, start: Pose = (0.0, 0.0, 0.0), baud: int = BAUD) -> None:
         self.baud = baud
         super().__init__(Create2Protocol(), "iRobot Create 2", WheelOdometer(TICK, WHEEL_BASE, MODULUS, start), LOW_VOLTAGE)
@@ -91,16 +91,12 @@ class Create2Driver(BaseDriver):
         self._new_clock()
 
     def _new_clock(self) -> None:
-        self._frames, self._map = 0, ClockMap(WINDOW, BUCKET, MOST_SKEW)
+        self._frames, self._map = 0, rhythm_map()
 
     def begin(self) -> None:
         """Forget half a frame; the encoders counted on."""
         super().begin()
         self._new_clock()
-
-    def spacing(self, event: Encoders | Corrupt) -> float | None:
-        """Return the time between two frames, s."""
-        return PERIOD if isinstance(event, Encoders) else None
 
     def script(self) -> Script[None]:
         """Ask for the stream, again whenever it stops: the robot falls asleep after five minutes, or was switched off."""
@@ -122,7 +118,8 @@ class Create2Driver(BaseDriver):
         pause = event.stamp - last.stamp if last is not None else 0.0
         if pause > STALL:
             actions.append(Lost(stamp, round(pause / PERIOD) - 1))
-        if last is not None and (pause > MAX_BLIND or _moved(last, event) > MAX_SPEED * max(pause, STALL)):
+        way = 0.0 if last is None else way_of((event.left - last.left, event.right - last.right), MODULUS, TICK)
+        if pause > MAX_BLIND or way > MAX_SPEED * max(pause, STALL):  # more than it can drive: the counts began again
             self._odometer.forget()
             why = f"sent nothing for {pause:.1f} s" if pause > MAX_BLIND else "restarted"
             actions.append(self.gap(f"{why}, the pose is held: its motion"))
@@ -142,9 +139,3 @@ class Create2Driver(BaseDriver):
     def stop(self) -> list[Action]:
         """Pause the stream."""
         return [Send(PAUSE)]
-
-
-def _moved(last: Encoders, event: Encoders) -> float:
-    """Return how far the wheels turned between two frames, m; more than they can means that the counts began again."""
-    ticks = (event.left - last.left, event.right - last.right)
-    return max(abs(wrapped(difference, MODULUS)) for difference in ticks) * TICK

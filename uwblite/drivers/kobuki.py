@@ -19,7 +19,7 @@ from .clock import BACKWARD, DeviceClock
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
 from .framing import HeadedFrames
-from .odometer import BaseDriver, WheelOdometer, wrapped
+from .odometer import BaseDriver, WheelOdometer, way_of
 
 PERIOD = 0.020
 """s between packets."""
@@ -116,6 +116,8 @@ class KobukiDriver(BaseDriver):
     start : pose of the base at the first packet; m, m, rad.
     """
 
+    frame, rhythm = Feedback, PERIOD
+
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
         odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
         super().__init__(KobukiProtocol(), "Kobuki base", odometer, LOW_BATTERY)
@@ -123,10 +125,6 @@ class KobukiDriver(BaseDriver):
         self._series = Continuity(_follows)
         self._packets = 0
         self._last: Feedback | None = None
-
-    def spacing(self, event: Feedback | Corrupt) -> float | None:
-        """Return the time between two packets, s."""
-        return PERIOD if isinstance(event, Feedback) else None
 
     def take(self, event: Feedback) -> list[Action]:
         """Turn packets into poses. One that leaps, and the first, count only if the next one goes on from it."""
@@ -167,8 +165,7 @@ def _began_again(last: Feedback, event: Feedback) -> bool:
 
 
 def _way(left: int, right: int) -> float:
-    """Return how far the wheels turned at least, m, by differences of their counters."""
-    return max(abs(wrapped(difference, ENCODER_MODULUS)) for difference in (left, right)) * TICK
+    return way_of((left, right), ENCODER_MODULUS, TICK)
 
 
 def _follows(before: Feedback, after: Feedback) -> bool:

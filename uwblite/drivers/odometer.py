@@ -11,6 +11,11 @@ def wrapped(difference: float, modulus: int) -> float:
     return (difference + modulus // 2) % modulus - modulus // 2 if modulus else difference
 
 
+def way_of(ticks: tuple[int, int], modulus: int, tick: float) -> float:
+    """Return how far the wheels turned at least, m, by differences of their counters that wrap at a modulus."""
+    return max(abs(wrapped(difference, modulus)) for difference in ticks) * tick
+
+
 class WheelOdometer:
     """Integrate two wheels: each step a chord along the mean of both headings (Borenstein).
 

@@ -68,6 +68,10 @@ class Driver:
 
     baud = 115200
     """bit/s to open the port with."""
+    frame: type | None = None
+    """Of the events that are frames of a steady stream."""
+    rhythm = 0.0
+    """s between two of them; 0 = it is to be learnt."""
 
     def __init__(self, protocol: ByteProtocol, title: str) -> None:
         self.protocol, self.title = protocol, title
@@ -86,11 +90,8 @@ class Driver:
         return self.protocol.feed(data, now)
 
     def spacing(self, event: Any) -> float | None:
-        """Return by how many s the device sends a frame of a steady stream after the one before; 0 = that is not known.
-
-        None = the event is no such frame, or its time is known otherwise.
-        """
-        return None
+        """Return how long after the one before the device sends a frame, s; None = the event is none, or has its own time."""
+        return self.rhythm if self.frame is not None and isinstance(event, self.frame) else None
 
     def script(self) -> Script[None]:
         """Hold the conversation; by default, listen."""

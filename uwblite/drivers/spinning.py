@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .clock import DeviceClock
-from .clock_map import ClockMap
+from .clock_map import rhythm_map
 from .events import Action, LaserScan, Lost, Reopen, SetDtr
 from .framing import FrameReader
 from .session import Driver, Identity, Script, Wait
@@ -12,8 +12,6 @@ from .sweep import Fan, Samples, SweepAssembler
 
 SILENCE = 3.0
 """s without a reading after which the lidar is started again."""
-WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
-"""s, s, share: a lidar without a clock measures at a rate that is stated within a few percent only."""
 LONG = 0.6
 """Turns without a reading after which, by the motor's place alone, it is unknown how many went by."""
 PAUSE = 1.0
@@ -40,7 +38,7 @@ class SpinningDriver(Driver):
     def __init__(self, protocol: FrameReader, fan: Fan, clock: DeviceClock | None = None) -> None:
         super().__init__(protocol, self.title)
         self.facts = dict[str, str]()
-        self._clock, self._map = clock, ClockMap(WINDOW, BUCKET, MOST_SKEW)
+        self._clock, self._map = clock, rhythm_map()
         self._assembler = SweepAssembler(fan)
         self._received: Samples | None = None
         self._last: Samples | None = None
@@ -53,7 +51,7 @@ class SpinningDriver(Driver):
 
     def _forget(self) -> None:
         self._assembler.clear()
-        self._last, self._time, self._map = None, 0.0, ClockMap(WINDOW, BUCKET, MOST_SKEW)
+        self._last, self._time, self._map = None, 0.0, rhythm_map()
 
     def script(self) -> Script[None]:
         """Start the lidar and listen, again and again."""

@@ -53,7 +53,7 @@ class LineClock:
                 " their lines among the odometry"
             )
             return by_line
-        return _placed(lines, stamps, false_stamps(stamps), what, warnings)
+        return placed(lines, stamps, false_stamps(stamps), what, warnings)
 
 
 AS_WRITTEN = LineClock(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0), False, False)
@@ -114,7 +114,7 @@ def judged(
         )
         rows[:, 0] = _made_up(rows)
     else:
-        rows[:, 0] = _placed(lines, rows[:, 0], false_stamps(rows[:, 0]), "odometry", warnings)
+        rows[:, 0] = placed(lines, rows[:, 0], false_stamps(rows[:, 0]), "odometry", warnings)
     return rows, LineClock(lines, rows[:, 0], _travelled(rows), made, made or corrected)
 
 
@@ -204,7 +204,7 @@ def longest_ascent(values: Floats) -> Bools:
     return chosen
 
 
-def _placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[str]) -> Floats:
+def placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[str]) -> Floats:
     """Return stamps (n,), s, with the false ones between those of the lines before and after."""
     if not false.any():
         return stamps

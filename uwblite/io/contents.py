@@ -8,6 +8,8 @@ import zlib
 from .carmen_messages import is_message_name
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
+_RAWLOGS = (b"CObservation", b"CSensoryFrame", b"CActionCollection")
+"""Names of the classes that a binary rawlog of MRPT begins with."""
 _GZIP = b"\x1f\x8b"
 _BYTES = 1 << 16
 """At the beginning, by which a text is told; scans before the first word of another kind are shorter."""
@@ -17,16 +19,20 @@ _LIBRSF = {b"range2", b"odom2diff", b"odom2", b"point2", b"gt2", b"range3", b"od
 _CARMEN = {b"ODOM", b"FLASER", b"PARAM", b"ROBOTLASER1", b"RAWLASER1", b"RLASER", b"UWB", b"SYNC"}
 _NAME_OF_PYFG = re.compile(rb"[A-Za-z]\d+$")
 _COLUMNS_OF_TUM = 8
+_LINES = 20
+"""By which a table of numbers is told."""
 
 
 def format_of_content(path: str) -> str:
-    """Return 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf' or 'tum' for a file; '' of what is none of them, or cannot be read.
+    """Return 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'rawlog' or 'numbers' (a table without names) for a file.
 
-    TORO files are 'g2o', whose reader takes them.
+    '' of what is none of them, or cannot be read. TORO files are 'g2o', whose reader takes them.
     """
     start = _beginning(path)
     if start.startswith(_BAGS):
         return "bag"
+    if any(name in start[:200] for name in _RAWLOGS):
+        return "rawlog"
     lines = [line.split() for line in start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:-1]]
     lines = [words for words in lines if words and not words[0].startswith(b"#")]
     names = {words[0] for words in lines}
@@ -39,8 +45,8 @@ def format_of_content(path: str) -> str:
         return "isam"
     if names & _LIBRSF:
         return "librsf"
-    if lines and all(len(words) == _COLUMNS_OF_TUM and _is_number(words[0]) for words in lines):
-        return "tum"
+    if lines and all(_is_number(word) for words in lines[:_LINES] for word in words):
+        return "tum" if all(len(words) == _COLUMNS_OF_TUM for words in lines) else "numbers"
     return "log" if names and all(is_message_name(name) for name in names) else ""
 
 

@@ -29,6 +29,7 @@ from ..config import from_dict, parse_toml, setting
 from ..errors import ConfigError, FormatError
 from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
+from .carmen_stamps import false_stamps, placed
 from .files import replacing
 from .folders import refuse_foreign, replacing_folder, unmarked
 from .scan_geometry import largest_reading, without_reach
@@ -158,10 +159,10 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
         if isinstance(scanner := stated.get("scans"), dict) and scanner.get("range_max") != scanner.get("range_max"):
             scanner["range_max"] = np.inf  # nan states none either
         sensors = from_dict(Sensors, stated)
-    table = _in_order(_table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest))
-    ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
+    table = _in_order(_table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest), "odometry", warnings)
+    ranges = _read_ranges(path / "ranges.csv", digest, warnings) if (path / "ranges.csv").exists() else None
     scans = _read_scans(path / "scans.csv", sensors.scans, digest, warnings) if (path / "scans.csv").exists() else None
-    gyro = _read_gyro(path / "gyro.csv", digest) if (path / "gyro.csv").exists() else None
+    gyro = _read_gyro(path / "gyro.csv", digest, warnings) if (path / "gyro.csv").exists() else None
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
     notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest(), warnings=tuple(warnings))
@@ -242,16 +243,23 @@ def _table(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Float
     return np.array(cells).reshape(-1, len(names))
 
 
-def _in_order(table: Floats) -> Floats:
+def _in_order(table: Floats, what: str, warnings: list[str]) -> Floats:
+    """Return rows (n, k) in the order of their stamps, which are made sound before."""
+    table[:, 0] = _sound(table[:, 0], what, warnings)
     return table[np.argsort(table[:, 0], kind="stable")]
 
 
-def _read_gyro(path: Path, digest: "hashlib._Hash") -> Gyro:
-    table = _in_order(_table(path, ("stamp", "heading"), digest))
+def _sound(stamps: Floats, what: str, warnings: list[str]) -> Floats:
+    """Return stamps (n,), s, in the order of rows, those that no clock gives placed by their rows; the header is line 1."""
+    return placed(np.arange(2, len(stamps) + 2), stamps, false_stamps(stamps), what, warnings)
+
+
+def _read_gyro(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> Gyro:
+    table = _in_order(_table(path, ("stamp", "heading"), digest), "gyro", warnings)
     return Gyro(table[:, 0].copy(), np.unwrap(table[:, 1]))
 
 
-def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
+def _read_ranges(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> UwbRanges | None:
     cells, anchors, names = array("d"), array("q"), dict[str, int]()
     for line, row in _columns(path, ("stamp", "anchor", "range", "quality"), digest):
         cells.extend([_number(row[k], path, line) for k in (0, 2, 3)])
@@ -266,6 +274,7 @@ def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
     ids = tuple(sorted({one_word(name) for name in names}))
     index = np.array([ids.index(one_word(name)) for name in names], dtype=np.intp)
     table = np.array(cells).reshape(-1, 3)
+    table[:, 0] = _sound(table[:, 0], "range", warnings)
     order = np.argsort(table[:, 0], kind="stable")
     return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)
 
@@ -291,7 +300,8 @@ def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash", war
         raise FormatError(
             "scans need their geometry in sensors.toml ([scans] angle_min, angle_increment, range_max)", str(path)
         )
-    order = np.argsort(stamps, kind="stable")
+    times = _sound(np.array(stamps), "scan", warnings)
+    order = np.argsort(times, kind="stable")
     ranges = np.array(readings).reshape(-1, beams)[order]
     g, reach = geometry, geometry.range_max
     with np.errstate(invalid="ignore"):
@@ -300,4 +310,4 @@ def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash", war
             reach = largest_reading(ranges)
             warnings.append(without_reach(reach))
             ranges[ranges > np.float32(reach)] = np.inf
-    return LaserScans(np.array(stamps)[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)
+    return LaserScans(times[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)

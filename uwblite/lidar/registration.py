@@ -6,7 +6,8 @@ are compared by their evidence, the marginal likelihood of the source's surfaces
 
     log E = log N(T; mean, C) + sum over objects log((1 - m) exp(g - chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|,
 
-where g is what a match gains over a point in unknown space, at most as much as an object that moves loses.
+where g is what a match gains over one by chance, at most as much as an object that moves loses. That share is measured beside
+the place. Two clouds may also show nothing of each other's place; then neither part gains.
 
 The surfaces of a cloud are cut into objects, runs of neighbouring points. An object moves by itself with probability m, which
 falls with its length: people, trolleys and animals are short, walls are not. It counts as one thing however many rays meet
@@ -56,6 +57,10 @@ class RegistrationConfig:
     """Probability that an object moves by itself."""
     long: ClassVar[float] = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
+    fits: ClassVar[float] = 5.0 / 6.0
+    """Share of the points in view that match in the true place."""
+    useless: ClassVar[float] = 0.05
+    """Probability that two clouds show nothing of each other's place: 'none of these'."""
     worth: ClassVar[float] = 0.02
     """Posterior odds of a slip below which it is not searched for."""
     good_share: ClassVar[float] = 0.75
@@ -166,11 +171,16 @@ def _best(placed: Sequence[Placed]) -> Placed:
 class Registration:
     """Clouds ready for registration with each other."""
 
-    def __init__(self, clouds: Clouds, raster: CloudRasters, nearest: Floats, sigma: float) -> None:
-        """Take clouds, their rasters, the nearest surface by bearing (see visibility), and the deviation of a match, m."""
+    def __init__(self, clouds: Clouds, raster: CloudRasters, nearest: Floats, sigma: float, chance: Floats) -> None:
+        """Take clouds and their rasters.
+
+        Parameters
+        ----------
+        nearest : surface by bearing, see visibility. sigma : standard deviation of a match, m. chance : see matched_by_chance.
+        """
         self._clouds, self._raster, self.sigma = clouds, raster, sigma
         self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        self._reach = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 1.0
+        self._chance = chance
         self._object, length = objects(clouds, RegistrationConfig.gap)
         self._most = -np.log(RegistrationConfig.moves) * np.maximum(length / RegistrationConfig.long, 1.0)
 
@@ -191,7 +201,8 @@ class Registration:
             lost = rows[poor]
             found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
-        log_odds[rows] = slipped.evidence - sound.evidence[rows]
+        none = np.log(c.useless)
+        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
         return Placement(sound, rows, slipped, log_odds)
 
     def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
@@ -309,7 +320,11 @@ class Registration:
         variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
         squared = np.square(found.distance) / variance
         cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
-        through = usable & ~found.good & in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        through, in_view = in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        through &= usable & ~found.good
+        missed = usable & ~found.good & in_view & ~through
+        chance = self._chance[i][:, None]
+        cost += 2.0 * np.log(np.maximum((1.0 - chance) / (1.0 - c.fits), 1.0)) * missed
         cost[through] = c.outlier
         group = self._object[found.row]
         many = int(group.max(initial=0)) + 1
@@ -320,7 +335,7 @@ class Registration:
         )
         most = np.full((len(i), many), -np.log(c.moves))
         most.reshape(-1)[key] = self._most[found.row[usable]]
-        gain = np.log(self._reach / (np.sqrt(2.0 * np.pi) * self.sigma))
+        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
         return _Judged(
             1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
@@ -350,6 +365,29 @@ def _difference(pose: Floats, mean: Floats) -> Floats:
     off = pose - mean
     off[:, 2] = se2.wrap_angle(off[:, 2])
     return off
+
+
+def matched_by_chance(clouds: Clouds, raster: CloudRasters, i: Ints, points: PairPoints, mean: Floats) -> Floats:
+    """Return the share (k,) of points of sources that match each target cloud i (e,) where they do not belong: aside.
+
+    Parameters
+    ----------
+    points : of the sources, see pair_points. mean : (e, 3) about where these belong, T_i_j.
+    """
+    matched = np.ones(len(i))
+    for x in (-_ASIDE, _ASIDE):
+        for y in (-_ASIDE, _ASIDE):
+            aside = mean + np.array([x, y, 0.0])
+            for found in correspondences(clouds, raster, i, aside, points, RegistrationConfig.gate):
+                matched[found.pairs] += found.good.sum(axis=1)
+    # One match of three beforehand (Laplace's rule of succession).
+    chance = np.full(len(clouds), 1.0 / 3.0)
+    chance[i] = matched / (4 * (points.row >= 0).sum(axis=1) + 3)
+    return chance
+
+
+_ASIDE = 0.4
+"""Distance along both axes at which no point is where it belongs, m; along a wall, points match all the same."""
 
 
 def objects(clouds: Clouds, gap: float) -> tuple[Ints, Floats]:

@@ -15,13 +15,12 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..graph.solver import SolverConfig
 from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, Registration
+from .registration import Placed, Prior, Registration, matched_by_chance
 from .scan_matching import match, measured, pair_points
 from .visibility import nearest_by_bearing
 
@@ -53,7 +52,9 @@ class ScanOdometry:
     steps: RelativePoseEdges
     """Those that were measured."""
     wheels: OdometryEdges
-    """With the noise learnt from the measured steps."""
+    """With the noise learnt from the measured steps, as if they had not slipped."""
+    slipped: OdometryEdges
+    """The same with the uncertainty of slips."""
     miss: float
     """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
@@ -92,7 +93,7 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
 
 def follow(
     clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
-    config: TrackingConfig, solver: SolverConfig,
+    config: TrackingConfig,
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
@@ -101,23 +102,24 @@ def follow(
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes. graph : holds their calibration.
     steps : the same steps after descent, see descend. gate : reach of the raster, m.
-    solver : for the calibration of the wheels.
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
     certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
     noise = reestimate_wheel_noise(wheels, certain, graph)
-    registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma)
+    points, mean = pair_points(clouds, i + 1, config.points), noise.corrected(graph)
+    chance = matched_by_chance(clouds, raster, i, points, mean)
+    registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma, chance)
     sound = covariance_of(noise, graph)
-    prior = Prior(noise.corrected(graph), sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
-    found = registration.register(i, i + 1, pair_points(clouds, i + 1, config.points), prior, steps.pose)
+    prior = Prior(mean, sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
+    found = registration.register(i, i + 1, points, prior, steps.pose)
     slips = posterior(found.log_odds, wheels.duration)
     placed = found.chosen(slips)
     seen = np.flatnonzero(placed.factors.matched >= _FEWEST)
     edges = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
     miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
-        edges, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving
+        edges, noise, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving
     )
 
 

@@ -43,8 +43,8 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
     return nearest.reshape(-1, _BEARINGS)
 
 
-def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> Bools:
-    """Return which points x, y (e, n), m, stand in the space that was free around the origins of clouds i (e,).
+def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> tuple[Bools, Bools]:
+    """Return which points x, y (e, n), m, stand in the space that was free around clouds i (e,), and which were in view.
 
     Parameters
     ----------
@@ -53,7 +53,8 @@ def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> Bools:
     distance = np.sqrt(x * x + y * y)
     bins = ((np.arctan2(y, x) + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.intp)
     bins *= bins < _BEARINGS
-    return np.asarray(distance < free[i[:, None], bins] - _MARGIN)
+    until = free[i[:, None], bins]
+    return distance < until - _MARGIN, (until > 0.0) & (distance < until + _MARGIN)
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:

@@ -1,25 +1,26 @@
 """Distance of every place of a map from the nearest obstacle, and the cost of driving there.
 
-An obstacle is a whole cell, a square with the edge h. The exact Euclidean distance transform (Felzenszwalb and
-Huttenlocher 2012; scipy.ndimage) gives the distance of every cell's centre from the nearest obstacle's centre; h / sqrt(2)
-less is a lower bound d of the distance from the obstacle itself. Between the centres the bound comes from interpolation.
-Let p be the average of the four centres c_i around it with the bilinear weights w_i, and q any point of an obstacle. Then
+An obstacle is a whole cell, a square with the edge h. Distances between the centres, edges and corners of cells are whole in
+halves of a cell, and along and across the rows they part: with g(c, r) the distance of column c from the nearest obstacle
+of row r, d^2 = min over r of g^2 + (r's own distance)^2 (Felzenszwalb and Huttenlocher 2012, here up to a reach). Between the
+centres a bound comes from interpolation: let p be the average of the four centres c_i around it with the bilinear weights
+w_i, and q any point of an obstacle. Then
 
     sum w_i |c_i - q|^2 = |p - q|^2 + sum w_i |c_i - p|^2,   hence
     |p - q|^2 >= sum w_i d_i^2 - h^2 (u (1 - u) + v (1 - v)),   u, v = p's coordinates between the centres, 0..1.
 
 In the same way no point of a line between p and p' comes closer than sqrt(min(d^2, d'^2) - |p - p'|^2 / 4). Checks at
-sub-cell resolution with these bounds therefore hold for every point between the samples too.
+sub-cell resolution with these bounds therefore hold for every point between the samples too; where the bound does not decide,
+the squares around are looked at one by one.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -31,6 +32,12 @@ UNKNOWN_PRICE = 5.0
 """Cost of a metre through unknown space, in metres of open space, where it is not refused."""
 _SPECK = 0.015
 """m^2; islands of unknown cells that are smaller are noise of the map and no obstacle."""
+_STRIP = 64
+"""Rows whose distances are found together, so that they stay in a processor's cache."""
+_ROUNDING = 1e-9
+"""Relative; a robot may touch what it passes."""
+_AT_A_TIME = 1 << 20
+"""Squares looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,23 +45,43 @@ class ClearanceMap:
     """Distances from obstacles and costs, for a round robot."""
 
     geometry: GridGeometry
-    squared: NDArray[np.float32]
-    """(rows, cols) square of the smallest distance that an obstacle can have from the cell's centre, m^2."""
-    price: NDArray[np.float32]
-    """(rows, cols) factor of a metre through the cell: 1, or UNKNOWN_PRICE."""
+    half: NDArray[np.unsignedinteger]
+    """(rows, cols) square of the distance from a cell's centre to the nearest obstacle, in half cells; cut off where nearness
+    costs nothing any more."""
+    obstacles: Bools
+    """(rows, cols)."""
+    dear: Bools
+    """(rows, cols) cells where a metre costs UNKNOWN_PRICE."""
     radius: float
     """Of the robot, m."""
+    tight: Floats
+    """(k, 2) m; places on edges and corners of cells where the robot may stand, though in none of the centres beside them, or
+    in two across a corner alone: in narrow passages, with an obstacle on either side."""
     refused: bool = True
     """Unknown cells are obstacles."""
 
-    def passable(self) -> Bools:
-        """Return in which cells' centres (rows, cols) the robot may stand, so that every step to a neighbour is safe too."""
-        # A step is as long as the diagonal at most: see the bound of a line above.
-        return self.squared >= self.radius**2 + 0.5 * self.geometry.resolution**2
+    @property
+    def _unit(self) -> float:
+        return 0.25 * self.geometry.resolution**2
 
-    def cell_cost(self) -> NDArray[np.float32]:
-        """Return the cost (rows, cols) of a metre driven at the cells' centres."""
-        return (self._nearness(self.squared) * self.price).astype(np.float32)
+    @property
+    def least(self) -> int:
+        """Smallest square of a distance that the robot needs, in half cells."""
+        return _least(self.radius, self.geometry.resolution)
+
+    def passable(self, rows: slice = slice(None)) -> Bools:
+        """Return in which cells' centres (rows, cols) the robot may stand.
+
+        Straight steps to a neighbour then keep the radius too: along an axis no square is nearer to a point between two
+        centres than to one of them. So do diagonal ones where all four cells around their middle are passable.
+        """
+        return np.asarray(self.half[rows] >= self.least)
+
+    def cell_cost(self, rows: Ints | slice = slice(None), cols: Ints | slice = slice(None)) -> NDArray[np.float32]:
+        """Return the cost of a metre driven at the centres of cells."""
+        half = self.half[rows, cols]
+        table = self._nearness(self._unit * np.arange(int(half.max(initial=0)) + 1)).astype(np.float32)
+        return np.asarray(np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), np.float32(1.0)) * table[half])
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return lower bounds (...) of the squared clearance, m^2, and costs of a metre (...), at points (..., 2), m.
@@ -68,14 +95,68 @@ class ClearanceMap:
         col, row = np.moveaxis(low.astype(np.intp), -1, 0)
         inside = (row >= 0) & (row < grid.rows - 1) & (col >= 0) & (col < grid.cols - 1)
         first = np.where(inside, row * grid.cols + col, 0)
-        flat = self.squared.ravel()
+        flat = self.half.ravel()
         lower = (1.0 - u) * flat[first] + u * flat[first + inside]
         upper_first = first + inside * grid.cols
         upper = (1.0 - u) * flat[upper_first] + u * flat[upper_first + inside]
-        bound = (1.0 - v) * lower + v * upper - grid.resolution**2 * (u * (1.0 - u) + v * (1.0 - v))
-        squared = np.where(inside, np.maximum(bound, 0.0), 0.0)
-        nearest = first + inside * ((v > 0.5) * grid.cols + (u > 0.5))
-        return squared, self._nearness(squared) * self.price.ravel()[nearest]
+        between = np.where(inside, (1.0 - v) * lower + v * upper, 0.0)
+        squared = self._unit * np.maximum(between - 4.0 * (u * (1.0 - u) + v * (1.0 - v)), 0.0)
+        nearest = row + (v > 0.5), col + (u > 0.5)
+        price = np.where(inside & self.dear[tuple(np.where(inside, n, 0) for n in nearest)], UNKNOWN_PRICE, 1.0)
+        return squared, self._nearness(self._unit * between) * price
+
+    def is_obstacle(self, points: Floats) -> Bools:
+        """Return which points (n, 2), m, lie in an obstacle, or outside the map."""
+        row, col = self.geometry.cell_of(points)
+        inside = self.geometry.inside(row, col)
+        return ~inside | self.obstacles[np.where(inside, row, 0), np.where(inside, col, 0)]
+
+    def keeps(self, points: Floats, bound: Floats, needed: Floats, owner: Ints) -> Bools:
+        """Return which owners' points all keep a squared distance.
+
+        Parameters
+        ----------
+        points : (n, 2) m. bound : (n,) what `at` says of them, m^2. needed : (n,) m^2.
+        owner : (n,) whose point each is, 0 ... in order; every owner has one.
+        """
+        grid, kept = self.geometry, np.ones(int(owner.max(initial=-1)) + 1, dtype=np.bool_)
+        needed = needed * (1.0 - _ROUNDING)
+        open_ = np.flatnonzero(bound < needed)
+        cell = (points[open_] - grid.origin) / grid.resolution
+        col, row = np.floor(cell).astype(np.intp).T
+        outside = ~grid.inside(row, col)
+        row, col = np.clip(row, 0, grid.rows - 1), np.clip(col, 0, grid.cols - 1)
+        # No square is farther from a point than from the centre of its cell and back.
+        most = np.sqrt(self.half[row, col]) + 2.0 * np.hypot(*(cell - np.floor(cell) - 0.5).T)
+        kept[owner[open_[outside | (self._unit * most**2 < needed[open_])]]] = False
+        rest = open_[kept[owner[open_]]]
+        kept[owner[rest[self._exact(points[rest]) < needed[rest]]]] = False
+        return kept
+
+    def distances(self, points: Floats) -> Floats:
+        """Return the distances (n,) of points (n, 2) from the nearest obstacle, m, up to the radius; beyond, lower bounds.
+
+        Distances that cost nothing count as the radius and COMFORT.
+        """
+        squared = self.at(points)[0]
+        near = np.flatnonzero(squared < self.radius**2)
+        squared[near] = np.minimum(self._exact(points[near]), self.radius**2)
+        return np.asarray(np.minimum(np.sqrt(squared), self.radius + COMFORT))
+
+    def _exact(self, points: Floats) -> Floats:
+        """Return the squared distance (n,) of points from the nearest obstacle within the radius and a cell more, m^2."""
+        grid = self.geometry
+        reach = int(np.ceil(self.radius / grid.resolution)) + 1
+        dy, dx = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
+        found = [np.zeros(0)]
+        for part in np.split(points, range(step := max(_AT_A_TIME // len(dx), 1), len(points), step)):
+            cell = (part - grid.origin) / grid.resolution
+            col, row = (n[:, None] + d for n, d in zip(np.floor(cell).astype(np.intp).T, (dx, dy), strict=True))
+            solid = ~grid.inside(row, col)
+            solid |= self.obstacles[np.clip(row, 0, grid.rows - 1), np.clip(col, 0, grid.cols - 1)]
+            away = [np.maximum(np.abs(p[:, None] - n - 0.5) - 0.5, 0.0) for p, n in zip(cell.T, (col, row), strict=True)]
+            found.append(np.where(solid, away[0] ** 2 + away[1] ** 2, np.inf).min(axis=1, initial=np.inf))
+        return 4.0 * self._unit * np.concatenate(found)
 
     def _nearness(self, squared: Floats | NDArray[np.float32]) -> Floats:
         near = np.clip(1.0 - (np.sqrt(squared) - self.radius) / COMFORT, 0.0, 1.0)
@@ -90,24 +171,84 @@ def clearance_map(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse"
     radius : of the robot, m.
     unknown : 'refuse' makes unknown cells obstacles, 'price' makes them dear.
     """
-    states = grid.states()
+    states, geometry = grid.states(), grid.geometry
     dark = states == UNKNOWN
-    dark &= ~_specks(dark, grid.geometry.resolution)
+    dark &= ~_specks(dark, geometry.resolution)
     refused = unknown == "refuse"
-    obstacles = (states == OCCUPIED) | (dark & refused)
-    price = np.where(dark & (not refused), np.float32(UNKNOWN_PRICE), np.float32(1.0))
-    return ClearanceMap(grid.geometry, _squared_distances(obstacles, grid.geometry.resolution), price, radius, refused)
+    obstacles = states == OCCUPIED
+    obstacles |= dark & refused
+    dear = np.broadcast_to(np.False_, dark.shape) if refused else dark
+    half, tight = _measured(obstacles, geometry, radius)
+    return ClearanceMap(geometry, half, obstacles, dear, radius, tight, refused)
 
 
-def _squared_distances(obstacles: Bools, resolution: float) -> NDArray[np.float32]:
-    """Return squared distances (rows, cols) of the centres from the obstacles, m^2; what lies outside the map is one."""
-    walled = np.pad(obstacles, 1, constant_values=True)
-    cells = ndimage.distance_transform_edt(~walled)[1:-1, 1:-1]
-    return np.square(np.maximum(resolution * (cells - math.sqrt(0.5)), 0.0)).astype(np.float32)
+def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[NDArray[np.unsignedinteger], Floats]:
+    """Return `half` and `tight` of a map with obstacles (rows, cols)."""
+    least, near = _least(radius, geometry.resolution), int(np.ceil(radius / geometry.resolution)) + 1
+    reach = min(int(np.ceil((radius + COMFORT) / geometry.resolution)) + 1, max(obstacles.shape) + 1)
+    cut = (2 * reach) ** 2
+    half = np.empty(obstacles.shape, dtype=np.uint16 if 2 * cut < 1 << 16 else np.uint32)
+    tight = []
+    for first in range(0, geometry.rows, _STRIP):
+        rows = slice(first, min(first + _STRIP, geometry.rows))
+        count = rows.stop - rows.start
+        centres, edges = (squares.astype(half.dtype) for squares in _along_rows(_rows(obstacles, rows, reach), cut))
+        stands = np.zeros((count + 1, geometry.cols + 1), dtype=np.bool_)
+        found = _across_rows(centres, count + 1, reach, reach, 0, cut)
+        half[rows], stands[:, :-1] = found[:count], found >= least
+        for right, up, squares in ((1, 0, edges), (0, 1, centres), (1, 1, edges)):
+            may = _across_rows(squares, count, reach, min(near, reach), up, cut) >= least
+            beside = [stands[dr : dr + count, dc : dc + geometry.cols] for dr in range(up + 1) for dc in range(right + 1)]
+            none = ~np.logical_or.reduce(beside)
+            across = (beside[0] == beside[3]) & (beside[1] == beside[2]) & (beside[0] != beside[1]) if right and up else none
+            may &= none | across
+            row, col = np.nonzero(may)
+            tight.append(geometry.centre_of(row + first, col) + 0.5 * geometry.resolution * np.array([right, up]))
+    return half, np.concatenate(tight)
+
+
+def _rows(obstacles: Bools, rows: slice, margin: int) -> Bools:
+    """Return some rows with a margin and one row more above; what lies outside the map is an obstacle."""
+    low, high = max(rows.start - margin, 0), min(rows.stop + 1 + margin, len(obstacles))
+    outside = (low - rows.start + margin, rows.stop + 1 + margin - high)
+    return np.pad(obstacles[low:high], (outside, (0, 0)), constant_values=True)
+
+
+def _along_rows(obstacles: Bools, cut: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return squared distances along the rows (rows, cols) from an obstacle, of centres and of the edges to their right."""
+    cols = obstacles.shape[1]
+    at, most = np.arange(cols, dtype=np.int32), int(np.sqrt(cut))
+    left = at - np.maximum.accumulate(np.where(obstacles, at, np.int32(-1)), axis=1)
+    right = np.minimum.accumulate(np.where(obstacles, at, np.int32(cols))[:, ::-1], axis=1)[:, ::-1] - at
+    centres = np.asarray(np.clip(2 * np.minimum(left, right) - 1, 0, most))
+    edges = np.zeros_like(left)
+    edges[:, :-1] = np.minimum(2 * np.minimum(left[:, :-1], right[:, 1:]), most)
+    return centres**2, edges**2
+
+
+def _across_rows(
+    along: NDArray[np.unsignedinteger], count: int, margin: int, reach: int, up: int, cut: int
+) -> NDArray[np.unsignedinteger]:  # fmt: skip
+    """Return squared distances (count, cols) in half cells, of centres or, `up` by half a cell, of the edges above."""
+    found = np.full((count, along.shape[1]), cut, dtype=along.dtype)
+    for d in range(up - reach, reach + 1):
+        gap = 2 * max(d - 1, -d) if up else max(2 * abs(d) - 1, 0)
+        np.minimum(found, along[margin + d : margin + d + count] + along.dtype.type(gap**2), out=found)
+    return found
+
+
+def _least(radius: float, resolution: float) -> int:
+    """Return the least square of a distance, in half cells: half a cell at least, which parts a free cell from an obstacle."""
+    return max(int(np.ceil((2.0 * radius / resolution) ** 2 * (1.0 - _ROUNDING))), 1)
 
 
 def _specks(dark: Bools, resolution: float) -> Bools:
     """Return which unknown cells (rows, cols) belong to islands that are too small to matter."""
-    labels, _ = ndimage.label(dark)
-    small = np.bincount(labels.ravel()) * resolution**2 < _SPECK
-    return np.asarray(small[labels] & dark)
+    if not dark.any():
+        return dark
+    labels, count = ndimage.label(dark)
+    sizes = np.zeros(count + 1, dtype=np.intp)
+    for first in range(0, len(dark), _STRIP):
+        sizes += np.bincount(labels[first : first + _STRIP].ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.asarray((sizes * resolution**2 < _SPECK)[labels] & dark)

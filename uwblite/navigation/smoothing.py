@@ -22,7 +22,7 @@ _STARTS_PER_SHORTCUT = 4
 """Shortcuts of the same reach that overlap."""
 _PLACES_PER_OCTAVE = 8
 """Places on a straight piece between one distance from its nearer end and twice that distance."""
-_SIEVE = 16
+_SIEVE = (2, 4, 8, 16)
 """Parts of a shortcut, at whose ends it is looked up first: most of the long ones lead through obstacles."""
 _CORNER_COST = 1e-3
 """m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
@@ -64,12 +64,13 @@ def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats,
     first = np.cumsum(pieces + 1) - (pieces + 1)
     owner = np.repeat(np.arange(len(pieces)), pieces + 1)
     share = (np.arange(len(owner)) - first[owner]) / pieces[owner]
-    squared, cost = clearance.at(begin[owner] + share[:, None] * (end - begin)[owner])
+    points = begin[owner] + share[:, None] * (end - begin)[owner]
+    squared, cost = clearance.at(points)
     step = lengths / pieces
-    clear = np.minimum.reduceat(squared, first) - 0.25 * step**2 >= clearance.radius**2
+    clear = clearance.keeps(points, squared, (clearance.radius**2 + 0.25 * step**2)[owner], owner)
     last = first + pieces
     costs = step * (np.add.reduceat(cost, first) - 0.5 * (cost[first] + cost[last]))
-    return Lines(costs, clear, np.minimum.reduceat(squared, first) <= 0.0)
+    return Lines(costs, clear, np.logical_or.reduceat(clearance.is_obstacle(points), first))
 
 
 def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
@@ -107,10 +108,13 @@ def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
 
 
 def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
-    """Return which lines (m,) keep the clearance at a few places at least."""
-    share = np.arange(1, _SIEVE)[:, None, None] / _SIEVE
-    squared, _ = clearance.at(begin + share * (end - begin))
-    return np.asarray(squared.min(axis=0) >= clearance.radius**2)
+    """Return which lines (m,) keep the clearance at a few places at least: at the middle, at quarters ..."""
+    left = np.arange(len(begin))
+    for parts in _SIEVE:
+        for k in range(1, parts, 2):
+            squared, _ = clearance.at(begin[left] + k / parts * (end - begin)[left])
+            left = left[squared >= clearance.radius**2]
+    return np.bincount(left, minlength=len(begin)) > 0
 
 
 def _shortcuts(corners: int) -> tuple[Ints, Ints]:

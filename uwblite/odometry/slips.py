@@ -14,7 +14,7 @@ from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges
 
-EVERY, LASTS = 100.0, 2.0
+EVERY, LASTS = 600.0, 2.0
 """Mean time between two slips and mean duration of one, s: a kerb, a carpet, wet leaves, a door sill."""
 SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as

@@ -34,6 +34,8 @@ class BreakPolicy:
     """Probability that a recording's path has one."""
     size: ClassVar[float] = 1.0
     """Standard deviation of the error of such a step, m and rad."""
+    turns: ClassVar[int] = 8
+    """Headings from which the error of the step is sought."""
     rounds: ClassVar[int] = 4
     """Most solutions of a path that ranges hold; two are usual."""
 
@@ -394,7 +396,8 @@ class BrokenStep:
             for points in ([at[one] for at, one, _ in moved], [at[other] for at, _, other in moved])
         )
         shift = np.append((here - there).mean(axis=0), 0.0)
-        starts = [np.zeros(3), shift, *([se2.align(there, here)] if len(here) > 1 else [])]
+        turned = [np.array([0.0, 0.0, angle]) for angle in np.linspace(-np.pi, np.pi, BreakPolicy.turns, endpoint=False)]
+        starts = [np.zeros(3), shift, *turned, *([se2.align(there, here)] if len(here) > 1 else [])]
         tried = [least_squares(errors, start, loss="cauchy", f_scale=_LOSS) for start in starts]
         done = min(tried, key=lambda each: float(each.cost))
         spread = -0.5 * np.linalg.slogdet(done.jac.T @ done.jac)[1] - 3.0 * np.log(BreakPolicy.size)

@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_free, with_nonnegative_heights
+from ..graph.calibration import HEIGHT, with_free, with_nonnegative_heights
 from ..graph.covariances import Covariances
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
@@ -21,6 +21,7 @@ from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
+from ..problem.parts import at_given_poses
 from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
@@ -167,12 +168,6 @@ def _with_alike_heights(given: Graph, estimate: Estimate, task: Task) -> Graph:
         return given
     shown = with_alike_heights(optimize(given.with_edges(estimate.ranges), task.config.solver)[0])
     return replace(given, edges=shown.edges[: len(given.edges)])
-
-
-def at_given_poses(graph: Graph) -> Graph:
-    """Return the graph with only anchors and the systematic errors of their ranges free, as far as they were free before."""
-    fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
-    return replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed)
 
 
 def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:

@@ -23,7 +23,7 @@ from ..radio.trilateration import AnchorHypothesis
 from ..sensor_log.anchor_names import first_place, place_name
 from .estimate import Estimate
 from .recordings import Recording, Recordings
-from .shared_anchors import Pairs, Places, agreement, other_place, places_of, together
+from .shared_anchors import Pairs, Places, agreement, places_of, together
 
 
 def join(estimates: Sequence[Estimate], recordings: Recordings) -> Estimate:
@@ -53,7 +53,7 @@ def join(estimates: Sequence[Estimate], recordings: Recordings) -> Estimate:
         called = list(own.names)
         for k, name in enumerate(own.names):
             if name in placed.names and (k, placed.names.index(name)) not in agree:
-                called[k] = other_place(own, placed, agree, k) or place_name(name, 1, number)
+                called[k] = place_name(name, 1, number)
                 names[number][names[number].index(name)] = called[k]
         placed = together(placed, own, called)
     return _one_graph(estimates, motions, names, recordings)

@@ -46,18 +46,15 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """
     estimate, steps = _descended(make_clouds(estimate, task), task)
     track = _followed(estimate, steps, task)
-    cut = _with_keyframes_where_slipped(replace(estimate, odometry=track.wheels), track.slips, task)
-    if cut is not None:
-        estimate = cut
-        track = _followed(estimate, _steps(estimate, task), task)
-    estimate = _match_neighbours(estimate, track, task.following(estimate))
+    estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     corrected = np.inf
     for _ in range(_RETIMINGS):
         late = clock_offset.late(estimate, task)
         if late == 0.0:
             break
         if abs(late) > corrected:
-            return _without_offset(replace(estimate, scans=None), estimate.lidar.delay, task)
+            estimate, track = _without_offset(replace(estimate, scans=None), estimate.lidar.delay, task)
+            break
         corrected, delay, estimate = abs(late), estimate.lidar.delay + late, replace(estimate, scans=None)
         estimate = _at_delay(estimate, late, delay, task)
         now = task.following(estimate)
@@ -65,8 +62,26 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
             estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
         else:
             estimate, steps = _descended(estimate, now)
-            estimate = _match_neighbours(estimate, _followed(estimate, steps, now), now)
-    return estimate if estimate.lidar.delay == 0.0 else _with_clock_at(estimate, estimate.lidar.delay)
+            track = _followed(estimate, steps, now)
+            estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, now)
+    if estimate.lidar.delay != 0.0:
+        estimate = _with_clock_at(estimate, estimate.lidar.delay)
+    return _with_slips(estimate, track, task.following(estimate))
+
+
+def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
+
+    Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
+    """
+    if not np.any(track.slips > _LIKELY):
+        return estimate
+    track = _followed(estimate, _steps(estimate, task), task)
+    cut = _with_keyframes_where_slipped(replace(estimate, odometry=track.slipped), track.slips, task)
+    if cut is not None:
+        estimate, task = cut, task.following(cut)
+        track = _followed(estimate, _steps(estimate, task), task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -82,7 +97,7 @@ def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
     return replace(estimate, graph=replace(graph, fixed_calibration=graph.fixed_calibration | fixed))
 
 
-def _without_offset(estimate: Estimate, delay: float, task: Task) -> Estimate:
+def _without_offset(estimate: Estimate, delay: float, task: Task) -> tuple[Estimate, ScanOdometry]:
     """Return the estimate with the clock of the lidar as that of the odometry, where a correction made its offset larger.
 
     With a clock that is off by a constant, each correction leaves a part of the error before it.
@@ -95,7 +110,8 @@ def _without_offset(estimate: Estimate, delay: float, task: Task) -> Estimate:
         offset=delay,
     )
     estimate, steps = _descended(estimate, now)
-    return _match_neighbours(estimate, _followed(estimate, steps, now), now)
+    track = _followed(estimate, steps, now)
+    return _match_neighbours(replace(estimate, odometry=track.wheels), track, now), track
 
 
 def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
@@ -129,9 +145,8 @@ def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
     """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
     scans, config = estimate.lidar, task.config
     return scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
-        rough(config.solver),
-    )  # fmt: skip
+        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan
+    )
 
 
 def _with_keyframes_where_slipped(estimate: Estimate, slips: Floats, task: Task) -> Estimate | None:
@@ -165,7 +180,7 @@ _RETIMINGS = 4
 def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
     """Match each cloud with those just before and after it, so that sub-maps are stiff; objects that move are left out."""
     config, rules, graph = task.config, task.config.refinement, estimate.graph
-    estimate = replace(estimate, odometry=track.wheels, scans=scan_clouds.only(estimate.lidar, ~track.moving, config))
+    estimate = replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, config))
     weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])

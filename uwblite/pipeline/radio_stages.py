@@ -4,7 +4,6 @@ Each recording is bootstrapped on its own, then the recordings are joined. Once 
 the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,23 +40,14 @@ from .progress import solver_figures
 from .recordings import Recording
 
 
-def first_optimisation(task: Task, known: Sequence[Estimate | None] = ()) -> Estimate:
-    """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation).
-
-    Parameters
-    ----------
-    known : of each recording, where it was bootstrapped before from the same measurements, see Estimate.alone; else None.
-    """
+def first_optimisation(task: Task) -> Estimate:
+    """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
     recordings = task.recordings
     task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
     estimates = [dead_reckoning(recording, task.config) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
-    known = known or [None] * len(estimates)
-    estimates = [
-        _of_likelier_radio(estimate, n, task) if before is None else before
-        for n, (estimate, before) in enumerate(zip(estimates, known, strict=True))
-    ]
+    estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
         return anchor_heights.with_likelier_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)

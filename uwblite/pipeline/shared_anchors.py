@@ -14,7 +14,6 @@ from scipy.linalg import cho_factor, cho_solve
 from .. import se2
 from ..arrays import Floats, Ints
 from ..graph.joint_covariance import anchor_covariance
-from ..sensor_log.anchor_names import radio_name
 from .estimate import Estimate
 
 _SYSTEMATIC = 0.25
@@ -75,16 +74,6 @@ def agreement(found: Places, placed: Places) -> tuple[Floats, Pairs]:
         motion, chi2 = less[k]
         del pairs[k]
     return motion, pairs if chi2 < _MOVED or len(pairs) > 2 else []
-
-
-def other_place(found: Places, placed: Places, pairs: Pairs, anchor: int) -> str | None:
-    """Return the name of another place of the same radio where an anchor (number) stands, given the pairs that agree."""
-    least: tuple[float, str | None] = (_MOVED, None)
-    _, chi2 = fitted(found, placed, pairs)
-    for k, other in enumerate(placed.names):
-        if radio_name(other) == radio_name(found.names[anchor]) and k not in (theirs for _, theirs in pairs):
-            least = min(least, (fitted(found, placed, [*pairs, (anchor, k)])[1] - chi2, other), key=lambda one: one[0])
-    return least[1]
 
 
 def together(placed: Places, found: Places, names: Sequence[str]) -> Places:

@@ -27,7 +27,8 @@ def log_odds_of_constant(values: Floats, sigmas: Floats, prior: float) -> float:
     total = np.bincount(second, sigmas**-2.0, 2)
     means = np.bincount(second, values * sigmas**-2.0, 2) / np.maximum(total, _NOTHING)
     with np.errstate(divide="ignore"):
-        return min(_log_odds(values, sigmas, prior), _log_odds(means, 1.0 / np.sqrt(total), prior))
+        of_halves = np.asarray(total**-0.5, dtype=np.float64)
+    return min(_log_odds(values, sigmas, prior), _log_odds(means, of_halves, prior))
 
 
 def _log_odds(values: Floats, sigmas: Floats, prior: float) -> float:

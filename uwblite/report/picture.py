@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,7 @@ def draw_map(
     image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
-        _paste(image[:height], shaded(grid) if colours is None else colours, grid.geometry, low, scale)
+        _paste(image[:height], grid.log_odds if colours is None else colours, grid.geometry, low, scale)
 
     def pixel(points: Floats) -> Floats:
         return np.stack([(points[..., 0] - low[0]) * scale, height - (points[..., 1] - low[1]) * scale], axis=-1)
@@ -158,19 +159,28 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 
 def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the more certain a cell, the closer to white or black."""
-    image = np.full((*grid.log_odds.shape, 3), PAPER, dtype=np.uint8)
+    return _colours(grid.log_odds)
+
+
+def _painted(cells: NDArray[Any]) -> Image:
+    """Return the colours (rows, cols, 3) of log-odds (rows, cols); colours stay as they are."""
+    return _colours(cells) if cells.ndim == 2 else cells
+
+
+def _colours(log_odds: NDArray[np.float32]) -> Image:
+    image = np.full((*log_odds.shape, 3), PAPER, dtype=np.uint8)
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
-    for rows in grid.geometry.strips():
-        known = grid.log_odds[rows] != 0.0
-        p = grid.probability(rows)[known]
+    for part, colours in zip(np.split(log_odds, step := range(256, len(log_odds), 256)), np.split(image, step), strict=True):
+        known = part != 0.0
+        p = (1.0 / (1.0 + np.exp(-part[known]))).astype(np.float32)
         free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, None]
         wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, None]
-        image[rows][known] = np.rint(paper + free * (floor - paper) + wall * (ink - paper))
+        colours[known] = np.rint(paper + free * (floor - paper) + wall * (ink - paper))
     return image
 
 
-def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, scale: float) -> None:
-    """Copy the cells into the picture; where several cells share a pixel the darkest shows."""
+def _paste(image: Image, cells: NDArray[Any], geometry: GridGeometry, low: Floats, scale: float) -> None:
+    """Copy the cells, log-odds or colours, into the picture; where several cells share a pixel the darkest shows."""
     height, width = image.shape[:2]
     pixels = scale * geometry.resolution
     first_col, first_row = np.rint((geometry.origin - low) / geometry.resolution).astype(int).tolist()
@@ -179,6 +189,7 @@ def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, sc
         row = (height - 1 - np.arange(height)) // each - first_row
         col = np.arange(width) // each - first_col
         rows, cols = (row >= 0) & (row < geometry.rows), (col >= 0) & (col < geometry.cols)
+        colours = _painted(cells)
         image[_span_of(rows), _span_of(cols)] = colours.take(col[cols], axis=1).take(row[rows], axis=0)
         return
     together = round(1.0 / pixels)
@@ -186,13 +197,14 @@ def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, sc
     rows, row_starts = np.unique(row, return_index=True)
     cols, col_starts = np.unique(col, return_index=True)
 
-    def reduced(extreme: np.ufunc) -> Image:
-        return np.asarray(extreme.reduceat(extreme.reduceat(colours, row_starts, axis=0), col_starts, axis=1), dtype=np.uint8)
+    def reduced(extreme: np.ufunc) -> NDArray[Any]:
+        return np.asarray(extreme.reduceat(extreme.reduceat(cells, row_starts, axis=0), col_starts, axis=1))
 
-    darkest, brightest = reduced(np.minimum), reduced(np.maximum)
-    cells = np.where(darkest[:, :, :1] < PAPER[0] - 20, darkest, brightest)
+    # Log-odds are the larger, the darker a cell is.
+    darkest, brightest = (_painted(reduced(e)) for e in (np.minimum, np.maximum)[:: -1 if cells.ndim == 2 else 1])
+    shown = np.where(darkest[:, :, :1] < PAPER[0] - 20, darkest, brightest)
     seen_rows, seen_cols = (rows >= 0) & (rows < height), (cols >= 0) & (cols < width)
-    image[np.ix_(height - 1 - rows[seen_rows], cols[seen_cols])] = cells[np.ix_(seen_rows, seen_cols)]
+    image[np.ix_(height - 1 - rows[seen_rows], cols[seen_cols])] = shown[np.ix_(seen_rows, seen_cols)]
 
 
 def _span_of(inside: Bools) -> slice:
