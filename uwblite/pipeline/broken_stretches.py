@@ -2,9 +2,9 @@
 
 A step of the path that scan matching has broken tears the map, and ranges along it look like anchors that were moved together.
 Both explanations are scored on one set of measurements, with associations made anew for either: the evidence of all ranges with
-the anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on the
-surfaces and in the free space of the other. The problem with the step left to wheels and radio is solved from the estimate, and
-replaces it only where it is the more probable one: ranges that are wrong together do not outweigh what both sides saw.
+the anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on
+the surfaces and in the free space of the other. The problem with the step left to wheels and radio is solved from the estimate,
+and replaces it only where it is the more probable one: ranges that are wrong together do not outweigh what both sides saw.
 """
 
 from dataclasses import replace
@@ -13,9 +13,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Ints
-from ..findings import Finding, doubt
+from ..findings import Finding, doubt, kinds
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..lidar.registration import Registration
+from ..lidar.registration import Registration, matched_by_chance
 from ..lidar.scan_matching import pair_points
 from ..lidar.visibility import nearest_by_bearing
 from ..odometry.slips import log_densities, with_slips
@@ -34,6 +34,8 @@ _AROUND = 2.0
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
+    if kinds(task.stages.findings).isdisjoint(_SYMPTOMS):
+        return estimate
     if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
     wheels, found = estimate.odometry, list[Finding]()
@@ -64,11 +66,13 @@ def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
 def _explain(task: Task) -> None:
     """Name the cause of what was said of anchors that seemed to move along the broken path."""
     for k, finding in enumerate(task.stages.findings):
-        if finding.kind in ("moved-anchor", "path-displaced"):
+        if finding.kind in _SYMPTOMS:
             task.stages.findings[k] = replace(finding, explained_by=(_KIND,))
 
 
 _KIND = "worse-than-parts"
+_SYMPTOMS = ("moved-anchor", "path-displaced")
+"""Kinds of what is said of ranges along a broken path."""
 
 
 def _off(estimate: Estimate) -> Bools:
@@ -135,8 +139,8 @@ def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task
     far = _displaced(estimate, step)
     i, j = (np.concatenate([getattr(e.joint, end) for e in (estimate, other)]) for end in ("i", "j"))
     i, j = np.unique(np.stack([i, j])[:, far[i] != far[j]], axis=1)
-    scans, points = estimate.lidar, pair_points(estimate.lidar.clouds, j, task.config.scan_to_scan.points)
-    seen = Registration(scans.clouds, scans.raster, nearest_by_bearing(scans.clouds), task.config.scan_to_scan.sigma)
+    points = pair_points(estimate.lidar.clouds, j, task.config.scan_to_scan.points)
+    seen = _registration(estimate, task)
     # The points of a cloud are the same in all of its pairs.
     share = 1.0 / np.bincount(j, minlength=len(far))[j]
     scores = []
@@ -144,6 +148,14 @@ def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task
         rays = seen.log_likelihood(i, points, se2.between(graph.poses[i], graph.poses[j]))
         scores.append(ranges + float(np.sum(log_densities(wheels, graph))) + float(rays @ share))
     return scores[0] - scores[1]
+
+
+def _registration(estimate: Estimate, task: Task) -> Registration:
+    """Return the likelihood of rays, with the share that matches by chance as neighbouring clouds show it."""
+    clouds, raster, config = estimate.lidar.clouds, estimate.lidar.raster, task.config.scan_to_scan
+    i, j, poses = estimate.odometry.i, estimate.odometry.j, estimate.graph.poses
+    chance = matched_by_chance(clouds, raster, i, pair_points(clouds, j, config.points), se2.between(poses[i], poses[j]))
+    return Registration(clouds, raster, nearest_by_bearing(clouds), config.sigma, chance)
 
 
 def _finding(
