@@ -67,10 +67,9 @@ def _explain(task: Task) -> None:
     """Name the cause of what was said of anchors that seemed to move along the broken path."""
     for k, finding in enumerate(task.stages.findings):
         if finding.kind in _SYMPTOMS:
-            task.stages.findings[k] = replace(finding, explained_by=(_KIND,))
+            task.stages.findings[k] = replace(finding, explained_by=("worse-than-parts",))
 
 
-_KIND = "worse-than-parts"
 _SYMPTOMS = ("moved-anchor", "path-displaced")
 """Kinds of what is said of ranges along a broken path."""
 
@@ -168,7 +167,7 @@ def _finding(
     off = float(np.hypot(*(after - before)[:2]))
     turned = float(np.rad2deg(abs(se2.wrap_angle(after[2] - before[2]))))
     told = doubt(
-        _KIND,
+        "worse-than-parts",
         f"from t = {begin - start:.0f} to {end - start:.0f} s the lidar is not understood: with its matches there left out and "
         f"all scans matched anew, the robot moves {off:.1f} m and {turned:.0f} deg differently, and ranges, wheels and rays "
         "together are more probable; the map follows that",
