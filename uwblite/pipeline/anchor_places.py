@@ -267,23 +267,25 @@ def range_evidence(estimate: Estimate, task: Task) -> float:
 
 
 def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
-    """Return the broken steps that may explain what otherwise would be anchors that move together, each where it explains most,
-    with its gain.
+    """Return broken steps that explain ranges beside anchors that move together, the best one of each such time, with its gain.
 
     Parameters
     ----------
-    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor.
+    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor, and
+        where they say nothing against anchors that stand still, it may still be broken.
     """
-    config, radios, best = task.config, _radios(estimate, task), list[tuple[float, BrokenStep]]()
+    config, radios, groups = task.config, _radios(estimate, task), list[list[_Change]]()
     found = [explain(radio.track, config.trilateration, config.ranges) for radio in radios]
     for change in _changes(estimate, radios, found):
-        if not any(change.with_other(other) for _, step in best for other in step.moves):
-            together = [other for other in _changes(estimate, radios, found) if change.with_other(other)]
-            tried = [BrokenStep(estimate, task, radios, found, together)]
-            rows = tried[0].recording.rows
-            within = suspects[(suspects > rows.start) & (suspects < tried[0].end)]
-            tried += [BrokenStep(estimate, task, radios, found, together, int(k)) for k in within]
-            best.append(max(((step.gain(), step) for step in tried), key=lambda each: each[0]))
+        if not any(change.with_other(other) for group in groups for other in group):
+            groups.append([other for other in _changes(estimate, radios, found) if change.with_other(other)])
+    best = []
+    for group in groups or [[]]:
+        tried = [BrokenStep(estimate, task, radios, found, group)] if group else []
+        end = tried[0].end if tried else len(estimate.graph.poses)
+        tried += [BrokenStep(estimate, task, radios, found, group, int(k)) for k in suspects if k < end]
+        gains = [step.gain() for step in tried]
+        best += [(max(gains), tried[int(np.argmax(gains))])] if tried else []
     return best
 
 
@@ -297,14 +299,12 @@ class BrokenStep:
         self.estimate, self.task, self.radios, self.moves, self.found = estimate, task, radios, moves, list(found)
         assert estimate.ranges is not None
         self.before = list(found)
-        first = max(moves, key=lambda move: len(move.interval))
         self.pose = [estimate.ranges.pose[radio.rows[radio.some]] for radio in radios]
-        self.recording = task.recordings.each[int(radios[first.radio].track.recording[first.interval[0]])]
-        heard = int(self.pose[first.radio][first.interval[0]]) if begin is None else begin
-        self.begin = max(heard, self.recording.rows.start + 1)
-        last, rows = int(first.interval[-1]), self.recording.rows
-        more = last + 1 < len(self.pose[first.radio]) and rows.start <= self.pose[first.radio][last + 1] < rows.stop
-        self.end = int(self.pose[first.radio][last]) + 1 if more else rows.stop
+        heard, self.end = self._extent() if moves else (0, len(estimate.graph.poses))
+        begin = heard if begin is None else begin
+        self.recording = task.recordings.each[int(task.recordings.of_keyframe[begin])]
+        self.begin = max(begin, self.recording.rows.start + 1)
+        self.end = min(self.end, self.recording.rows.stop)
         for k, (radio, pose, each) in enumerate(zip(radios, self.pose, self.found, strict=True)):
             outside = np.flatnonzero((pose < self.begin) | (pose >= self.end))
             if len(each.found) == 1 and len(outside) >= task.config.trilateration.min_ranges:
@@ -316,6 +316,15 @@ class BrokenStep:
             place = each.place.copy()
             place[move.interval] = move.before
             self.found[move.radio] = replace(each, place=place)
+
+    def _extent(self) -> tuple[int, int]:
+        """Return the first keyframe of the longest move, and the one at which it ends or the recording does."""
+        first = max(self.moves, key=lambda move: len(move.interval))
+        pose, last = self.pose[first.radio], int(first.interval[-1])
+        recording = self.radios[first.radio].track.recording
+        more = last + 1 < len(pose) and recording[last + 1] == recording[last]
+        end = int(pose[last]) + 1 if more else self.task.recordings.each[int(recording[last])].rows.stop
+        return int(pose[first.interval[0]]), end
 
     def gain(self) -> float:
         """Return by how much its evidence is greater than that of the moves, if a step is broken there."""
@@ -392,10 +401,10 @@ class BrokenStep:
 
         moved = [(self.before[m.radio].places, m.before, int(self.before[m.radio].place[m.interval[0]])) for m in self.moves]
         here, there = (
-            se2.transform(se2.inverse(origin), np.array(points))
+            se2.transform(se2.inverse(origin), np.array(points).reshape(-1, 2))
             for points in ([at[one] for at, one, _ in moved], [at[other] for at, _, other in moved])
         )
-        shift = np.append((here - there).mean(axis=0), 0.0)
+        shift = np.append((here - there).sum(axis=0) / max(len(moved), 1), 0.0)
         turned = [np.array([0.0, 0.0, angle]) for angle in np.linspace(-np.pi, np.pi, BreakPolicy.turns, endpoint=False)]
         starts = [np.zeros(3), shift, *turned, *([se2.align(there, here)] if len(here) > 1 else [])]
         tried = [least_squares(errors, start, loss="cauchy", f_scale=_LOSS) for start in starts]
