@@ -58,7 +58,7 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0))
     estimate = refine_jointly(estimate, task)
     task.stages.done.clear()
-    task.stages.warn("moved-anchor", "an anchor was moved")
+    task.stages.doubt("path-displaced", "the ranges fit another path")
     return estimate, task, true
 
 
@@ -101,7 +101,7 @@ def test_what_was_said_of_anchors_along_a_torn_path_names_its_cause():
     task.stages.warn("clock-offset", "another matter")
     replace_broken_stretches(estimate, task)
     by_kind = {finding.kind: finding.explained_by for finding in task.stages.findings}
-    assert by_kind == {"moved-anchor": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
+    assert by_kind == {"path-displaced": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
 
 
 def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
@@ -112,27 +112,31 @@ def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
     assert gain > 0.0
     assert len(step.moves) >= 3
     assert replace_broken_stretches(estimate, task) is estimate
-    assert [finding.kind for finding in task.stages.findings] == ["moved-anchor"]
+    assert [finding.kind for finding in task.stages.findings] == ["path-displaced"]
 
 
 def test_one_anchor_that_is_moved_breaks_no_path():
     estimate, task, _ = walked(shift=(2.5, -1.5), moved=(1,))
     assert replace_broken_stretches(estimate, task) is estimate
-    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["moved-anchor"], [])
+    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
 
 
 def test_a_sound_path_stays_and_costs_no_solution():
     """A slip that the scans followed rightly is no broken step."""
     estimate, task, _ = walked()
     assert replace_broken_stretches(estimate, task) is estimate
-    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["moved-anchor"], [])
+    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
 
 
-def test_nothing_is_compared_where_all_anchors_stayed():
+def test_nothing_is_compared_where_one_anchor_moved_or_none():
     sound, task, _ = walked()
     estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
     task.stages.findings.clear()
     assert replace_broken_stretches(estimate, task) is estimate
+    task.stages.warn("moved-anchor", "an anchor was moved")
+    assert replace_broken_stretches(estimate, task) is estimate
+    task.stages.warn("moved-anchor", "another anchor was moved")
+    assert replace_broken_stretches(estimate, task) is not estimate
 
 
 @pytest.mark.parametrize("part", ["scans", "ranges", "joint"])

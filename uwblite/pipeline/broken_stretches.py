@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Ints
-from ..findings import Finding, doubt, kinds
+from ..findings import Finding, doubt
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.registration import Registration, matched_by_chance
 from ..lidar.scan_matching import pair_points
@@ -34,7 +34,8 @@ _AROUND = 2.0
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
-    if kinds(task.stages.findings).isdisjoint(_SYMPTOMS):
+    said = [finding.kind for finding in task.stages.findings if finding.kind in _SYMPTOMS]
+    if said in ([], ["moved-anchor"]):
         return estimate
     if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
@@ -71,7 +72,7 @@ def _explain(task: Task) -> None:
 
 
 _SYMPTOMS = ("moved-anchor", "path-displaced")
-"""Kinds of what is said of ranges along a broken path."""
+"""Kinds of what is said of ranges along a broken path; one anchor alone that moves is no symptom."""
 
 
 def _off(estimate: Estimate) -> Bools:
