@@ -7,7 +7,7 @@ from helpers.laser_walks import ROOM, scanned
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, matched_by_chance, objects
+from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, matched_by_chance, objects, of_fallible
 from uwblite.lidar.scan_matching import PairPoints, pair_points
 from uwblite.lidar.visibility import nearest_by_bearing
 
@@ -36,7 +36,8 @@ def test_clouds_tell_a_slip_from_none(room, slip, sign):
     truth, clouds = room
     step = se2.between(truth[0], truth[1])
     *_, found = registered(clouds, step + slip)
-    assert sign * found.log_odds[0] > 3.0
+    # As sure as a pair of clouds can be: it is wrong with the probability `useless`.
+    assert sign * found.log_odds[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
     (pose,) = found.chosen(np.array([float(sign > 0)])).pose
     assert np.abs(se2.between(step, pose)).max() < 0.015
 
@@ -124,3 +125,12 @@ def test_points_match_by_chance_in_clutter_and_hardly_in_a_room(room):
     ]
     assert shares[0] < 0.2
     assert shares[1] > shares[0] + 0.1
+
+
+def test_evidence_that_may_be_wrong_is_bounded_and_keeps_its_sign():
+    odds = np.array([-400.0, -2.0, 0.0, 2.0, 400.0])
+    bounded = of_fallible(odds, 0.05)
+    np.testing.assert_allclose(bounded, -bounded[::-1], atol=1e-12)
+    np.testing.assert_allclose(bounded[[0, 2, 4]], [-np.log(19.0), 0.0, np.log(19.0)], atol=1e-9)
+    assert np.all(np.diff(bounded) > 0.0)
+    np.testing.assert_allclose(of_fallible(odds[1:4], 0.0), odds[1:4])

@@ -202,7 +202,8 @@ class Registration:
             found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
         none = np.log(c.useless)
-        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
+        odds = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
+        log_odds[rows] = of_fallible(odds, c.useless)
         return Placement(sound, rows, slipped, log_odds)
 
     def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
@@ -356,7 +357,17 @@ class _Judged:
     """(e,) the same where every point agreed."""
 
 
-_FARTHEST, _WIDEST = 0.3, 0.15
+def of_fallible(log_odds: Floats, wrong: float) -> Floats:
+    """Return the log odds (e,) by evidence that is the other way round with a probability.
+
+    Where people crowd about the robot, one pair of clouds can favour a false place by any factor: the model of the surfaces is
+    wrong there, and only several pairs in a row tell.
+    """
+    favoured = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_HUGE, _HUGE)))
+    right = (1.0 - wrong) * favoured + wrong * (1.0 - favoured)
+    return np.asarray(np.log(right) - np.log1p(-right))
+
+
 _UNLIKELY, _HUGE = 0.5, 50.0
 """Probability of standing still below which an object moves, and the largest exponent."""
 

@@ -20,7 +20,7 @@ from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, Registration, matched_by_chance
+from .registration import Placed, Prior, Registration, RegistrationConfig, matched_by_chance
 from .scan_matching import match, measured, pair_points
 from .visibility import nearest_by_bearing
 
@@ -115,7 +115,7 @@ def follow(
     found = registration.register(i, i + 1, points, prior, steps.pose)
     slips = posterior(found.log_odds, wheels.duration)
     placed = found.chosen(slips)
-    seen = np.flatnonzero(placed.factors.matched >= _FEWEST)
+    seen = np.flatnonzero((placed.factors.matched >= _FEWEST) & (placed.evidence > np.log(RegistrationConfig.useless)))
     edges = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
     miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
