@@ -20,6 +20,7 @@ from .pipeline import (
     anchor_heights,
     anchor_places,
     anchor_presence,
+    broken_stretches,
     closure_rounds,
     constraint_edges,
     final_stages,
@@ -130,6 +131,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
                 yield lidar_stages.refine_jointly
                 yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
+                yield broken_stretches.replace_broken_stretches
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places

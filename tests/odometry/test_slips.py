@@ -6,13 +6,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
+from scipy.integrate import trapezoid
 from scipy.linalg import expm
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.odometry.slips import EVERY, LASTS, SPEED, TURN_RATE, covariance_of, posterior, slip_sigma, with_slips
+from uwblite.odometry.slips import (
+    EVERY,
+    LASTS,
+    SPEED,
+    TURN_RATE,
+    covariance_of,
+    log_densities,
+    posterior,
+    slip_sigma,
+    with_slips,
+)
 
 NOISE = np.array([0.01, 0.005, 0.006])
 RARE = np.array([EVERY, LASTS]) / (EVERY + LASTS)
@@ -83,3 +94,21 @@ def test_wheels_that_stand_still_while_they_slip_do_not_hold_a_measured_step():
     assert np.all(np.abs(step - measured[4]) < np.array([0.025, 0.025, 0.01]))
     others = np.arange(8) != 4
     np.testing.assert_allclose(loose.sqrt_information[others], wheels.sqrt_information[others])
+
+
+def test_densities_of_steps_are_those_of_the_mixture():
+    """About a step that wheels counted, sound and slipping add up; the density integrates to one."""
+    truth = np.array([[0.0, 0.0, 0.3], [0.2, 0.05, 0.4]])
+    wheels = chained(truth, NOISE)
+    spread = slip_sigma(wheels)[0] + NOISE.max()
+    grid = [np.concatenate([-w * np.geomspace(8.0, 1e-4, 60), w * np.geomspace(1e-4, 8.0, 60)]) for w in spread]
+    corners = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
+    step = se2.between(truth[0], truth[1]) + corners
+    poses = np.concatenate([truth[:1], se2.compose(truth[:1], step)])
+    ends = np.arange(1, len(poses))
+    many = wheels.rows(np.zeros(len(ends), dtype=np.intp))
+    density = np.exp(log_densities(replace(many, i=np.zeros(len(ends), dtype=np.intp), j=ends), Graph(poses)))
+    volume = density.reshape(120, 120, 120)
+    for axis, values in zip((2, 1, 0), reversed(grid), strict=True):
+        volume = trapezoid(volume, values, axis=axis)
+    assert volume == pytest.approx(1.0, abs=0.03)

@@ -274,6 +274,13 @@ class Registration:
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / far, np.abs(step[:, 2]) / wide)
         return np.asarray(step / np.maximum(reach, 1.0)[:, None])
 
+    def log_likelihood(self, i: Ints, points: PairPoints, pose: Floats) -> Floats:
+        """Return the log likelihood (e,) of sources in targets i (e,) at poses (e, 3), by that in unknown space."""
+        if not len(i):
+            return np.zeros(0)
+        _, judged = self._match(i, points, pose, RegistrationConfig.gate, np.zeros((len(i), 3, 3)))
+        return np.concatenate([part.likelihood for part in judged])
+
     def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats, covariance: Floats) -> Bools:
         """Return which points (p,) of all clouds belong to objects of sources j (e,) that moved by themselves.
 

@@ -64,6 +64,23 @@ def posterior(log_odds: Floats, duration: Floats) -> Floats:
     return np.asarray(both[:, 1] / both.sum(axis=1))
 
 
+def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
+    """Return the logarithm of the density (e,) of each step at a graph's poses, sound or slipping with their shares of time."""
+    sound = covariance_of(wheels, graph)
+    slipping = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
+    off = se2.between(graph.poses[wheels.i], graph.poses[wheels.j]) - wheels.corrected(graph)
+    off[:, 2] = se2.wrap_angle(off[:, 2])
+    share = LASTS / (EVERY + LASTS)
+    parts = [np.log(p) + _log_normal(off, covariance) for p, covariance in ((1.0 - share, sound), (share, slipping))]
+    return np.asarray(np.logaddexp(*parts))
+
+
+def _log_normal(off: Floats, covariance: Floats) -> Floats:
+    """Return the logarithm of the normal density (e,) of errors (e, 3) with covariances (e, 3, 3)."""
+    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+    return np.asarray(-0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * covariance)[1]))
+
+
 def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
     """Return the odometry with the expected information of each step, which slips with a probability (e,)."""
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2

@@ -253,29 +253,58 @@ def _against_broken_path(
         if not any(change.with_other(other) for other in done):
             together = [other for other in _changes(estimate, radios, kept) if change.with_other(other)]
             done.append(change)
-            rival = _Broken(estimate, task, radios, kept, together)
-            if together and rival.gain() > 0.0:
+            rival = BrokenStep(estimate, task, radios, kept, together)
+            if together and rival.gain() + rival.log_prior() > 0.0:
                 kept = rival.found
                 told.broken[rival.begin] = rival.told()
     return kept
 
 
-class _Broken:
+def range_evidence(estimate: Estimate, task: Task) -> float:
+    """Return the logarithm of the evidence of all ranges along the estimate's path, their anchors placed anew."""
+    radios = _radios(estimate, task)
+    return sum(explain(radio.track, task.config.trilateration, task.config.ranges).evidence for radio in radios)
+
+
+def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
+    """Return broken steps that explain ranges beside anchors that move together, the best one of each such time, with its gain.
+
+    Parameters
+    ----------
+    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor, and
+        where they say nothing against anchors that stand still, it may still be broken.
+    """
+    config, radios, groups = task.config, _radios(estimate, task), list[list[_Change]]()
+    found = [explain(radio.track, config.trilateration, config.ranges) for radio in radios]
+    for change in _changes(estimate, radios, found):
+        if not any(change.with_other(other) for group in groups for other in group):
+            groups.append([other for other in _changes(estimate, radios, found) if change.with_other(other)])
+    best = []
+    for group in groups or [[]]:
+        tried = [BrokenStep(estimate, task, radios, found, group)] if group else []
+        end = tried[0].end if tried else len(estimate.graph.poses)
+        tried += [BrokenStep(estimate, task, radios, found, group, int(k)) for k in suspects if k < end]
+        gains = [step.gain() for step in tried]
+        best += [(max(gains), tried[int(np.argmax(gains))])] if tried else []
+    return best
+
+
+class BrokenStep:
     """The rival of moves that begin together: a broken step of the path, after which a stretch of it is displaced as one."""
 
     def __init__(
-        self, estimate: Estimate, task: Task, radios: Sequence[_Radio], found: Sequence[Explanation], moves: Sequence[_Change]
+        self, estimate: Estimate, task: Task, radios: Sequence[_Radio], found: Sequence[Explanation],
+        moves: Sequence[_Change], begin: int | None = None,
     ) -> None:
         self.estimate, self.task, self.radios, self.moves, self.found = estimate, task, radios, moves, list(found)
         assert estimate.ranges is not None
         self.before = list(found)
-        first = max(moves, key=lambda move: len(move.interval))
         self.pose = [estimate.ranges.pose[radio.rows[radio.some]] for radio in radios]
-        self.recording = task.recordings.each[int(radios[first.radio].track.recording[first.interval[0]])]
-        self.begin = max(int(self.pose[first.radio][first.interval[0]]), self.recording.rows.start + 1)
-        last, rows = int(first.interval[-1]), self.recording.rows
-        more = last + 1 < len(self.pose[first.radio]) and rows.start <= self.pose[first.radio][last + 1] < rows.stop
-        self.end = int(self.pose[first.radio][last]) + 1 if more else rows.stop
+        heard, self.end = self._extent() if moves else (0, len(estimate.graph.poses))
+        begin = heard if begin is None else begin
+        self.recording = task.recordings.each[int(task.recordings.of_keyframe[begin])]
+        self.begin = max(begin, self.recording.rows.start + 1)
+        self.end = min(self.end, self.recording.rows.stop)
         for k, (radio, pose, each) in enumerate(zip(radios, self.pose, self.found, strict=True)):
             outside = np.flatnonzero((pose < self.begin) | (pose >= self.end))
             if len(each.found) == 1 and len(outside) >= task.config.trilateration.min_ranges:
@@ -288,18 +317,45 @@ class _Broken:
             place[move.interval] = move.before
             self.found[move.radio] = replace(each, place=place)
 
+    def _extent(self) -> tuple[int, int]:
+        """Return the first keyframe of the longest move, and the one at which it ends or the recording does."""
+        first = max(self.moves, key=lambda move: len(move.interval))
+        pose, last = self.pose[first.radio], int(first.interval[-1])
+        recording = self.radios[first.radio].track.recording
+        more = last + 1 < len(pose) and recording[last + 1] == recording[last]
+        end = int(pose[last]) + 1 if more else self.task.recordings.each[int(recording[last])].rows.stop
+        return int(pose[first.interval[0]]), end
+
     def gain(self) -> float:
-        """Return by how much its evidence is greater than that of the moves."""
-        graph, ends = self.estimate.graph, 1 if self.end == self.recording.rows.stop else 2
+        """Return by how much its evidence is greater than that of the moves, if a step is broken there."""
+        poses = self.estimate.graph.poses
         for _ in range(MovePolicy.laps):
             # Places that a displaced stretch has pulled along hide some of the step, so both are found in turn.
             self.motion, spread = self._fitted()
             gain = self._evidence()
-        poses = graph.poses.copy()
-        poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
-        gain += ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
         gain += spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
-        return gain - 0.5 * (self._cost(poses) - self._cost(graph.poses))
+        return gain - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
+
+    def log_prior(self) -> float:
+        """Return the logarithm of the prior probability of a broken step just there, and of one where it ends."""
+        ends = 1 if self.end == self.recording.rows.stop else 2
+        return ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
+
+    def displaced(self, poses: Floats) -> Floats:
+        """Return poses (k, 3) with the stretch moved to where the ranges have it."""
+        poses = poses.copy()
+        poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
+        return poses
+
+    def places(self, anchors: Floats) -> Floats:
+        """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
+        assert self.estimate.ranges is not None
+        anchors = anchors.copy()
+        for radio, each in zip(self.radios, self.found, strict=True):
+            for number in radio.numbers:
+                own = each.place[(self.estimate.ranges.anchor[radio.rows[radio.some]] == number) & (each.place >= 0)]
+                anchors[number] = each.places[np.bincount(own).argmax()] if len(own) else anchors[number]
+        return anchors
 
     def _displacement(self) -> Floats:
         """Return the motion (3,) of the stretch in the map."""
@@ -345,10 +401,10 @@ class _Broken:
 
         moved = [(self.before[m.radio].places, m.before, int(self.before[m.radio].place[m.interval[0]])) for m in self.moves]
         here, there = (
-            se2.transform(se2.inverse(origin), np.array(points))
+            se2.transform(se2.inverse(origin), np.array(points).reshape(-1, 2))
             for points in ([at[one] for at, one, _ in moved], [at[other] for at, _, other in moved])
         )
-        shift = np.append((here - there).mean(axis=0), 0.0)
+        shift = np.append((here - there).sum(axis=0) / max(len(moved), 1), 0.0)
         turned = [np.array([0.0, 0.0, angle]) for angle in np.linspace(-np.pi, np.pi, BreakPolicy.turns, endpoint=False)]
         starts = [np.zeros(3), shift, *turned, *([se2.align(there, here)] if len(here) > 1 else [])]
         tried = [least_squares(errors, start, loss="cauchy", f_scale=_LOSS) for start in starts]

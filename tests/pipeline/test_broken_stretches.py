@@ -1,0 +1,167 @@
+"""The map is at least as probable as its parts: a torn path is mended, one that only the radio denies is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.laser_walks import HALL
+from helpers.planted import aligned_error, chain, odometry, ranges, scans, wander
+
+from uwblite import se2
+from uwblite.constraints import Constraints
+from uwblite.graph.calibration import scan_indices
+from uwblite.graph.pose_edges import ScanEdges
+from uwblite.lidar.scan_matching import pair_points
+from uwblite.odometry.keyframes import KeyframeConfig
+from uwblite.pipeline import scan_clouds
+from uwblite.pipeline.anchor_places import broken_steps, range_evidence
+from uwblite.pipeline.broken_stretches import _registration, _stretch, replace_broken_stretches
+from uwblite.pipeline.estimate import Task
+from uwblite.pipeline.lidar_stages import refine_jointly
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
+from uwblite.pipeline.recordings import gather
+from uwblite.radio.bootstrap_attempt import BootstrapResult
+from uwblite.sensor_log import SensorLog
+
+ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
+SLIP = 60.0
+
+
+
+def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
+    """Return an estimate at the true poses, all clouds matched, its task and the true poses.
+
+    The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift.
+    """
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 60.0, half_width=4.0)
+    motion = se2.between(truth[:-1], truth[1:])
+    motion[(stamps[:-1] >= SLIP) & (stamps[:-1] < SLIP + 1.0)] *= [0.0, 0.0, 1.0]
+    radio = ranges(rng, stamps, truth, ANCHORS, rate=2.0, sigma=0.05)
+    tag = se2.interpolate_trajectory(stamps, truth, radio.stamps)[:, :2]
+    place = ANCHORS[radio.anchor]
+    late = (radio.stamps > SLIP) & np.isin(radio.anchor, moved)
+    measured = radio.ranges + late * (np.hypot(*(place + shift - tag).T) - np.hypot(*(place - tag).T))
+    log = SensorLog(
+        odometry(stamps, chain(truth[0], motion)), replace(radio, ranges=measured),
+        scans(stamps, truth, HALL, rate=4.0, sweep=0.0, range_max=6.0, noise=0.01, rng=rng),
+    )  # fmt: skip
+    task = Task(gather([log], KeyframeConfig()), MappingConfig(), Constraints(), Stages(None, None))
+    estimate, true = dead_reckoning(task.recordings.each[0], task.config), se2.interpolate_trajectory(
+        stamps, truth, task.recordings.stamps
+    )
+    graph = replace(estimate.graph, poses=true, anchors=ANCHORS.copy())
+    yes = np.ones(4, dtype=bool)
+    estimate = replace(estimate, graph=graph, bootstrap=BootstrapResult(graph, yes, ((),) * 4, ~yes))
+    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0))
+    estimate = refine_jointly(estimate, task)
+    task.stages.done.clear()
+    task.stages.doubt("path-displaced", "the ranges fit another path")
+    return estimate, task, true
+
+
+def torn(estimate, task, by):
+    """Return the estimate whose scans say that the slip went further, by a motion (3,), and deny nothing of that."""
+    k = int(np.searchsorted(task.recordings.stamps, SLIP + 0.5))
+    poses, joint = estimate.graph.poses.copy(), estimate.joint
+    poses[k:] = se2.compose(se2.compose(se2.compose(poses[k - 1], by), se2.inverse(poses[k - 1])), poses[k:])
+    joint = joint.rows((joint.i >= k) == (joint.j >= k))
+    one, none = np.array([k - 1]), np.zeros((1, 3))
+    step = ScanEdges(
+        one, one + 1, se2.between(poses[one], poses[one + 1]), np.diag([100.0, 100.0, 300.0])[None], none, none,
+        scan_indices(estimate.graph.calibration), kernel=joint.kernel,
+    )  # fmt: skip
+    joint = replace(joint, by_surface=None).followed_by(step)
+    graph = replace(estimate.graph, poses=poses)
+    return with_range_noise(replace(estimate, graph=graph, joint=joint), task.config)
+
+
+def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
+    sound, task, true = walked()
+    estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
+    assert aligned_error(estimate.graph.poses[:, :2], true[:, :2]) > 1.0
+    mended = replace_broken_stretches(estimate, task)
+    assert aligned_error(mended.graph.poses[:, :2], true[:, :2]) < 0.05
+    # Their heights and constant errors are unknown.
+    np.testing.assert_allclose(mended.graph.anchors, ANCHORS, atol=0.4)
+    finding = task.stages.findings[-1]
+    assert (finding.kind, finding.severity, finding.sensor, finding.recording) == ("worse-than-parts", "doubt", "lidar", 1)
+    ((begin, end),) = finding.stretches
+    assert SLIP - 2.0 < begin < end < SLIP + 4.0
+    assert finding.figures["off"] == pytest.approx(3.0, abs=0.5)
+    assert "--end 5" in finding.cure or "--end 6" in finding.cure
+    assert "--without lidar" in finding.cure
+
+
+def test_what_was_said_of_anchors_along_a_torn_path_names_its_cause():
+    sound, task, _ = walked()
+    estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
+    task.stages.warn("clock-offset", "another matter")
+    replace_broken_stretches(estimate, task)
+    by_kind = {finding.kind: finding.explained_by for finding in task.stages.findings}
+    assert by_kind == {"path-displaced": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
+
+
+def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
+    """All anchors seem to be moved as one, and a broken step would explain that; both sides of it saw the same walls."""
+    estimate, task, _ = walked(shift=(2.5, -1.5))
+    estimate = with_range_noise(estimate, task.config)
+    ((gain, step),) = broken_steps(estimate, task, np.zeros(0, dtype=np.intp))
+    assert gain > 0.0
+    assert len(step.moves) >= 3
+    assert replace_broken_stretches(estimate, task) is estimate
+    assert [finding.kind for finding in task.stages.findings] == ["path-displaced"]
+
+
+def test_one_anchor_that_is_moved_breaks_no_path():
+    estimate, task, _ = walked(shift=(2.5, -1.5), moved=(1,))
+    assert replace_broken_stretches(estimate, task) is estimate
+    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
+
+
+def test_a_sound_path_stays_and_costs_no_solution():
+    """A slip that the scans followed rightly is no broken step."""
+    estimate, task, _ = walked()
+    assert replace_broken_stretches(estimate, task) is estimate
+    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
+
+
+def test_nothing_is_compared_where_one_anchor_moved_or_none():
+    sound, task, _ = walked()
+    estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
+    task.stages.findings.clear()
+    assert replace_broken_stretches(estimate, task) is estimate
+    task.stages.warn("moved-anchor", "an anchor was moved")
+    assert replace_broken_stretches(estimate, task) is estimate
+    task.stages.warn("moved-anchor", "another anchor was moved")
+    assert replace_broken_stretches(estimate, task) is not estimate
+
+
+@pytest.mark.parametrize("part", ["scans", "ranges", "joint"])
+def test_without_lidar_or_radio_nothing_competes(part):
+    estimate, task, _ = walked()
+    estimate = replace(estimate, **{part: None})
+    assert replace_broken_stretches(estimate, task) is estimate
+
+
+def test_the_stretch_is_the_slip_around_the_broken_step():
+    estimate, task, _ = walked()
+    k = int(np.searchsorted(task.recordings.stamps, SLIP + 0.5))
+    first, last = _stretch(estimate, task, k)
+    stamps = task.recordings.stamps
+    assert SLIP - 1.0 < stamps[first] < stamps[k] <= stamps[last] < SLIP + 2.0
+
+
+def test_ranges_are_less_probable_along_a_torn_path_and_rays_beside_their_walls():
+    sound, task, _ = walked()
+    displaced = torn(sound, task, np.array([3.0, 0.0, 0.0]))
+    assert range_evidence(displaced, task) < range_evidence(sound, task)
+    clouds, poses = sound.lidar.clouds, sound.graph.poses
+    i = np.arange(0, 40, 4)
+    at = se2.between(poses[i], poses[i + 1])
+    rays, points = _registration(sound, task), pair_points(clouds, i + 1, 150)
+    right, wrong = (rays.log_likelihood(i, points, pose) for pose in (at, se2.compose(at, np.array([0.5, 0.5, 0.0]))))
+    assert np.all(right > wrong)
+    assert rays.log_likelihood(i[:0], points, at[:0]).shape == (0,)

@@ -1,0 +1,181 @@
+"""Never worse than its parts: where ranges and odometry deny a step of the lidar's path, the map without that step competes.
+
+A step of the path that scan matching has broken tears the map, and ranges along it look like anchors that were moved together.
+Both explanations are scored on one set of measurements, with associations made anew for either: the evidence of all ranges with
+the anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on
+the surfaces and in the free space of the other. The problem with the step left to wheels and radio is solved from the estimate,
+and replaces it only where it is the more probable one: ranges that are wrong together do not outweigh what both sides saw.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Ints
+from ..findings import Finding, doubt
+from ..graph.pose_edges import OdometryEdges, ScanEdges
+from ..lidar.registration import Registration, matched_by_chance
+from ..lidar.scan_matching import pair_points
+from ..lidar.visibility import nearest_by_bearing
+from ..odometry.slips import log_densities, with_slips
+from . import lidar_stages, surface_adjustment
+from .anchor_places import BreakPolicy, BrokenStep, broken_steps, decide_places, range_evidence
+from .estimate import Estimate, Task
+from .radio_stages import rough, with_range_noise
+
+_SUDDEN = 5.0
+"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
+_NOISE_ROUNDS = 2
+"""Number of solutions before clouds are matched anew; each begins with an estimate of the ranges' noise."""
+_AROUND = 2.0
+"""Time within which steps that contradict the odometry are one slip, s: twice as long as one lasts on the mean, or less."""
+
+
+def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
+    said = [finding.kind for finding in task.stages.findings if finding.kind in _SYMPTOMS]
+    if said in ([], ["moved-anchor"]):
+        return estimate
+    if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
+        return estimate
+    wheels, found = estimate.odometry, list[Finding]()
+    while len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
+        stretch = _stretch(estimate, task, step.begin)
+        other = _released(estimate, task, step, stretch)
+        gain = _gain(other, estimate, wheels, task, step) + float(np.log(BreakPolicy.broken))
+        task.stages.end("broken stretch", begin=round(float(task.recordings.stamps[stretch[0]]), 2), gain=round(gain, 1))
+        if gain <= 0.0:
+            break
+        found.append(_finding(estimate, other, step, stretch, task))
+        estimate = other
+    if not found:
+        return estimate
+    _explain(task)
+    task.stages.findings += found
+    estimate = lidar_stages.solve_by_own_errors(decide_places(estimate, task), task)
+    return surface_adjustment.adjust_surfaces(estimate, task)
+
+
+def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
+    """Return the broken step that explains the ranges best; None where anchors that move explain them better, or none move."""
+    steps = broken_steps(estimate, task, _suspects(estimate, task))
+    gain, step = max(steps, key=lambda each: each[0], default=(0.0, None))
+    return step if gain > 0.0 else None
+
+
+def _explain(task: Task) -> None:
+    """Name the cause of what was said of anchors that seemed to move along the broken path."""
+    for k, finding in enumerate(task.stages.findings):
+        if finding.kind in _SYMPTOMS:
+            task.stages.findings[k] = replace(finding, explained_by=("worse-than-parts",))
+
+
+_SYMPTOMS = ("moved-anchor", "path-displaced")
+"""Kinds of what is said of ranges along a broken path; one anchor alone that moves is no symptom."""
+
+
+def _off(estimate: Estimate) -> Bools:
+    """Return which steps (e,) of the odometry contradict the path."""
+    return np.asarray(np.abs(estimate.odometry.residuals(estimate.graph)).max(axis=1) > _SUDDEN)
+
+
+def _suspects(estimate: Estimate, task: Task) -> Ints:
+    """Return the keyframe at which each stretch that contradicts the odometry begins."""
+    ends = estimate.odometry.j[_off(estimate)]
+    later = np.diff(task.recordings.stamps[ends], prepend=-np.inf) > _AROUND
+    return np.asarray(ends[later], dtype=np.intp)
+
+
+def _stretch(estimate: Estimate, task: Task, begin: int) -> tuple[int, int]:
+    """Return the first and last keyframe of the steps that contradict around a broken one, which ends at a keyframe."""
+    stamps, of = task.recordings.stamps, task.recordings.of_keyframe
+    ends = np.append(estimate.odometry.j[_off(estimate)], begin)
+    ends = np.unique(ends[of[ends] == of[begin]])
+    group = np.cumsum(np.diff(stamps[ends], prepend=stamps[ends[0]]) > _AROUND)
+    own = ends[group == group[np.searchsorted(ends, begin)]]
+    return int(own[0]) - 1, int(own[-1])
+
+
+def _displaced(estimate: Estimate, step: BrokenStep) -> Bools:
+    """Return which keyframes (k,) lie on the far side of a broken step."""
+    number = np.arange(len(estimate.graph.poses))
+    return (number >= step.begin) & (number < step.end)
+
+
+def _released(estimate: Estimate, task: Task, step: BrokenStep, stretch: tuple[int, int]) -> Estimate:
+    """Return the estimate with a stretch left to wheels that slip and ranges, and all clouds matched anew from there."""
+    assert estimate.joint is not None
+    far, (first, last) = _displaced(estimate, step), stretch
+    graph = replace(estimate.graph, poses=step.displaced(estimate.graph.poses), anchors=step.places(estimate.graph.anchors))
+    slips = (estimate.odometry.i >= first) & (estimate.odometry.j <= last)
+    wheels = with_slips(estimate.odometry, slips.astype(np.float64))
+    lidar = estimate.joint.rows(_kept(estimate.joint, far, first, last))
+    other = replace(estimate, graph=graph, joint=lidar, steps=None, surfaces=None, odometry=wheels)
+    for _ in range(_NOISE_ROUNDS):
+        other = lidar_stages.solved(with_range_noise(other, task.config), rough(task.config.solver))
+    other = lidar_stages.refine_jointly(replace(other, joint=None), task)
+    edges = other.closures.edges
+    agrees = np.abs(edges.residuals(other.graph)).max(axis=1, initial=0.0) <= _SUDDEN
+    reasons = ["leads across a broken step of the path"] * len(edges)
+    return replace(other, closures=other.closures.without(agrees, "contradicts-graph", reasons))
+
+
+def _kept(edges: ScanEdges, far: Bools, first: int, last: int) -> Bools:
+    """Return which scan edges (e,) neither begin nor end within a stretch, nor lead across the broken step."""
+    inside = [(first < end) & (end < last) for end in (edges.i, edges.j)]
+    return ~(inside[0] | inside[1]) & (far[edges.i] == far[edges.j])
+
+
+def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task, step: BrokenStep) -> float:
+    """Return by how much the log likelihood of all measurements is greater along another path, all associations made anew.
+
+    Parameters
+    ----------
+    wheels : the odometry with the noise that it is judged by.
+    """
+    assert estimate.joint is not None
+    assert other.joint is not None
+    far = _displaced(estimate, step)
+    i, j = (np.concatenate([getattr(e.joint, end) for e in (estimate, other)]) for end in ("i", "j"))
+    i, j = np.unique(np.stack([i, j])[:, far[i] != far[j]], axis=1)
+    points = pair_points(estimate.lidar.clouds, j, task.config.scan_to_scan.points)
+    seen = _registration(estimate, task)
+    # The points of a cloud are the same in all of its pairs.
+    share = 1.0 / np.bincount(j, minlength=len(far))[j]
+    scores = []
+    for graph, ranges in ((e.graph, range_evidence(e, task)) for e in (other, estimate)):
+        rays = seen.log_likelihood(i, points, se2.between(graph.poses[i], graph.poses[j]))
+        scores.append(ranges + float(np.sum(log_densities(wheels, graph))) + float(rays @ share))
+    return scores[0] - scores[1]
+
+
+def _registration(estimate: Estimate, task: Task) -> Registration:
+    """Return the likelihood of rays, with the share that matches by chance as neighbouring clouds show it."""
+    clouds, raster, config = estimate.lidar.clouds, estimate.lidar.raster, task.config.scan_to_scan
+    i, j, poses = estimate.odometry.i, estimate.odometry.j, estimate.graph.poses
+    chance = matched_by_chance(clouds, raster, i, pair_points(clouds, j, config.points), se2.between(poses[i], poses[j]))
+    return Registration(clouds, raster, nearest_by_bearing(clouds), config.sigma, chance)
+
+
+def _finding(
+    estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task
+) -> Finding:
+    """Return what the user is told of a stretch that was replaced."""
+    stamps, start = task.recordings.stamps, float(step.recording.log.odometry.stamps[0])
+    begin, end = (float(stamps[k]) for k in stretch)
+    before, after = (se2.between(*e.graph.poses[list(stretch)]) for e in (estimate, other))
+    off = float(np.hypot(*(after - before)[:2]))
+    turned = float(np.rad2deg(abs(se2.wrap_angle(after[2] - before[2]))))
+    told = doubt(
+        "worse-than-parts",
+        f"from t = {begin - start:.0f} to {end - start:.0f} s the lidar is not understood: with its matches there left out and "
+        f"all scans matched anew, the robot moves {off:.1f} m and {turned:.0f} deg differently, and ranges, wheels and rays "
+        "together are more probable; the map follows that",
+        off=off, turned=turned,
+    )  # fmt: skip
+    cure = (
+        f"`uwblite convert run.log before.log --end {begin - start:.0f}` gives the part that is supported best; map that, or "
+        "`uwblite map run.log --without lidar` for what wheels and ranges alone say"
+    )
+    return replace(told, sensor="lidar", recording=step.recording.number + 1, stretches=((begin, end),), cure=cure)
