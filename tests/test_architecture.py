@@ -198,7 +198,7 @@ def test_no_mutable_state_at_module_level(module):
     assert not [n for n in nodes_of(module) if isinstance(n, ast.Global)], f"{module} rebinds a global"
 
 
-def run_python(*words, cwd=None, path=None):
+def run_python(*words, cwd=None, path=PACKAGE.parent):
     environment = {"PATH": "/usr/bin:/bin", "PYTHONDONTWRITEBYTECODE": "1"}
     if path:
         environment["PYTHONPATH"] = str(path)
