@@ -178,7 +178,7 @@ def test_a_port_has_one_owner(bench, tmp_path):
 def test_absent_and_silent_devices_are_named(tmp_path):
     master, slave = os.openpty()
     arguments = ["--uwb", os.ttyname(slave), "--lidar", str(tmp_path / "nothing")]
-    code, _, err = finish(record(arguments, tmp_path / "run.log", "--duration", "4"))
+    code, _, err = finish(record(arguments, tmp_path / "run.log", "--duration", "4", "--wait"))
     os.close(master)
     os.close(slave)
     assert code == 3

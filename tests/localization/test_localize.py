@@ -72,7 +72,10 @@ def test_anchors_of_the_map_that_are_not_heard_change_nothing(log, earlier):
     heard = known_map(tuple(more), None).anchors
     wide = dataclasses.replace(
         known.anchors, ids=heard.ids + known.anchors.ids,
-        **{f: np.concatenate([getattr(heard, f), getattr(known.anchors, f)]) for f in ("positions", "bias", "rise", "sigma")},
+        **{
+            name: np.concatenate([getattr(heard, name), getattr(known.anchors, name)])
+            for name in ("positions", "bias", "rise", "sigma", "bias_sigma")
+        },
     )  # fmt: skip
     one, other = (localize(part(log), dataclasses.replace(known, anchors=some)) for some in (known.anchors, wide))
     np.testing.assert_array_equal(one.trajectory, other.trajectory)

@@ -16,12 +16,13 @@ from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
-from ..odometry.wheels import reestimate_wheel_noise
+from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
 from .registration import Placed, Prior, Registration, RegistrationConfig, matched_by_chance
 from .scan_matching import match, measured, pair_points
+from .step_search import StepSearch
 from .visibility import nearest_by_bearing
 
 
@@ -33,6 +34,10 @@ class TrackingConfig:
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     good_share: ClassVar[float] = 0.75
     """Neighbours that share at least this part of their points are certain of their step, wherever the odometry put it."""
+    distance: float = 0.4
+    """Half-width of the search beyond twice the motion by the odometry, m: wheels may count backwards as forwards."""
+    angle: float = 0.45
+    """Half-width of the search in heading beyond half the turn by the odometry, rad."""
     gate: ClassVar[float] = 0.15
     """Farthest match at the end, m."""
     points: ClassVar[int] = 150
@@ -50,7 +55,9 @@ class ScanOdometry:
     """Steps between neighbouring keyframes."""
 
     steps: RelativePoseEdges
-    """Those that were measured."""
+    """Those that were measured, as wheels that do not slip allow."""
+    with_slips: RelativePoseEdges
+    """The same, with those over which the wheels slipped where their clouds lie."""
     wheels: OdometryEdges
     """With the noise learnt from the measured steps, as if they had not slipped."""
     slipped: OdometryEdges
@@ -71,12 +78,24 @@ class Steps:
 
     i: Ints
     """(e,) keyframes at which they begin, increasing."""
+    guess: Floats
+    """(e, 3)."""
     pose: Floats
     """(e, 3) where descent ended."""
     share: Floats
     """(e,) share of the points looked up that match there."""
     enough: Bools
     """(e,) whether the clouds have enough points to measure a step."""
+
+    def contradicted(self, config: TrackingConfig) -> Bools:
+        """Return which steps (e,) the clouds contradict: few points match, or they fit at another pose."""
+        off = se2.between(self.guess, self.pose)
+        elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
+        return self.enough & ((self.share < config.good_share) | elsewhere)
+
+
+_ELSEWHERE = 0.12
+"""m or rad; an error that a step of faultless odometry never has."""
 
 
 def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float, config: TrackingConfig) -> Steps:
@@ -88,7 +107,7 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
     """
     points = pair_points(clouds, i + 1, config.points)
     aligned = align_pairs(clouds, raster, i, guess, points, gate, min(config.gate, gate))
-    return Steps(i, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
+    return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
 def follow(
@@ -115,12 +134,35 @@ def follow(
     found = registration.register(i, i + 1, points, prior, steps.pose)
     slips = posterior(found.log_odds, wheels.duration)
     placed = found.chosen(slips)
-    seen = np.flatnonzero((placed.factors.matched >= _FEWEST) & (placed.evidence > np.log(RegistrationConfig.useless)))
-    edges = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
+    edges, learnt, searched = _measured_near(clouds, raster, wheels, graph, steps, certain, tight, config)
+    lasting = (slips > 0.5) & (placed.factors.matched >= _FEWEST)
+    lasting &= placed.evidence > np.log(RegistrationConfig.useless)
+    seen, others = np.flatnonzero(lasting), ~np.isin(edges.i, i[slips > 0.5])
+    slid = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
+    both = edges.rows(np.flatnonzero(others)).followed_by(slid)
     miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
-        edges, noise, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving
+        edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
+        float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving,
     )
+
+
+def _measured_near(
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, certain: RelativePoseEdges,
+    gate: float, config: TrackingConfig,
+) -> tuple[RelativePoseEdges, OdometryEdges, int]:
+    """Return the steps as wheels that do not slip allow, the wheels with the noise that these show, and how many were searched.
+
+    Neighbours that share few points are searched for in the local sub-map of the keyframes before; where that finds nothing, or
+    two equally good places, the step is left to the odometry.
+    """
+    good = steps.enough & (steps.share >= config.good_share)
+    pose, lost, searched = _searched(clouds, steps.i, steps, steps.enough & ~good, config)
+    further = steps.enough & ~lost & ~good
+    measured_steps = certain.followed_by(_edges(clouds, raster, steps.i[further], pose[further], gate, config)[0])
+    measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
+    learnt = reestimate_wheel_noise(wheels, measured_steps, graph)
+    return measured_steps, with_uncounted_ways(learnt, measured_steps, graph), searched
 
 
 _FEWEST = 6
@@ -190,6 +232,46 @@ _LONGEST_RUN = 3
 def _lines_of(clouds: Clouds) -> Ints:
     """Return the number (k,) of points with a normal of each cloud."""
     return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
+
+
+def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools, int]:
+    """Search for doubtful steps (e,), each against the sub-map of those before it.
+
+    With noise of decimetres, foliage or few beams, every step has few matches. Where these are enough to measure the step, and
+    no surface stands in free space, no search is needed.
+
+    Returns
+    -------
+    Poses of all steps (e, 3), which were not found (e,), and how many were searched for.
+    """
+    pose, lost, searched = steps.pose.copy(), np.zeros(len(i), dtype=bool), 0
+    searching = StepSearch(clouds, config.distance, config.angle)
+    chain = np.zeros((len(clouds), 3))
+    chain[i] = pose
+    # Sub-maps begin after the last step that was not measured.
+    blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
+    first = 0
+    for row in np.flatnonzero(doubtful).tolist():
+        k, before = int(i[row]), blind[blind < i[row]]
+        first = max(first, int(before[-1]) + 1 if len(before) else 0)
+        guess, ended = steps.guess[row], steps.pose[row]
+        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _MOST_THROUGH:
+            continue
+        searched += 1
+        found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
+        # Where no search is clear, descent near the odometry's guess still measures the directions that the surfaces determine.
+        lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
+        if found.clear:
+            chain[k] = pose[row] = found.pose
+        elif lost[row]:
+            first = k + 1
+    return pose, lost, searched
+
+
+_LEAST_SHARE = 0.4
+"""Share of matching points from which on descent from the odometry's guess measures a step."""
+_MOST_THROUGH = 0.04
+"""Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Ints
 from ..graph.calibration import LASER, RADIO, TURNING, optimize_with_heights, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
@@ -45,6 +45,12 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     the replaced ones in memory.
     """
     estimate, steps = _descended(make_clouds(estimate, task), task)
+    # With ranges, which judge the path, slips are told later; a step that the clouds contradict is else cut at once.
+    doubtful = steps.contradicted(task.config.scan_to_scan) & (estimate.ranges is None)
+    cut = _with_keyframes_where(estimate, doubtful, task)
+    if cut is not None:
+        estimate, task = cut, task.following(cut)
+        steps = _steps(estimate, task)
     track = _followed(estimate, steps, task)
     estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     corrected = np.inf
@@ -73,15 +79,16 @@ def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate
     """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
+    Without ranges nothing judges them afterwards, and the steps as measured stay.
     """
-    if not np.any(track.slips > _LIKELY):
+    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
         return estimate
     track = _followed(estimate, _steps(estimate, task), task)
-    cut = _with_keyframes_where_slipped(replace(estimate, odometry=track.slipped), track.slips, task)
+    cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task), task)
-    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -149,19 +156,19 @@ def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
     )
 
 
-def _with_keyframes_where_slipped(estimate: Estimate, slips: Floats, task: Task) -> Estimate | None:
-    """Cut the steps of the odometry in which it slipped, with a probability (e,), at the scans within them.
+def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
+    """Cut doubtful steps of the odometry (e,) at the scans within them: it slipped there, or the clouds contradict it.
 
     Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud. None is returned
     where no scans are within them.
     """
     before = task.recordings
-    slipped = estimate.odometry.i[slips > _LIKELY]
-    after = denser(before, slipped, _CUTS)
+    steps = estimate.odometry.i[doubtful]
+    after = denser(before, steps, _CUTS)
     if len(after.stamps) == len(before.stamps):
         return None
     scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
-    task.stages.end("keyframes added", steps=len(slipped), keyframes=len(after.stamps))
+    task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
     return replace(with_keyframes(estimate, before, after), scans=scans)
 
 
@@ -170,7 +177,7 @@ _LIKELY = 0.5
 
 
 _CUTS = 4
-"""Keyframes added within a step that slipped, at most."""
+"""Keyframes added within a doubtful step, at most."""
 _SAME_STEPS = 0.015
 """Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
 _RETIMINGS = 4
