@@ -1,9 +1,9 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
 Neighbouring clouds are aligned from the odometry's guess, all at once; that shows the calibration and the noise of the wheels.
-Each step is then registered with what the wheels count as its prior, and with the possibility that they slipped. A slip lasts:
-the evidence of all steps together decides (see slips). Where the wheels slipped, their edges get the uncertainty of that; where
-they did not, no match takes a step far from them.
+A pair that then shares few points is searched for in the local sub-map of the keyframes before. Each step is also registered
+with the possibility that the wheels slipped. A slip lasts: the evidence of all steps together decides (see slips). Where the
+wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
 """
 
 from dataclasses import dataclass
