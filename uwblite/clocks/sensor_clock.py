@@ -1,19 +1,20 @@
-"""A sensor's clock against the odometry's: where either jumps while both continue, the sensor's stamps are shifted by the
-jump."""
+"""A sensor's clock against the odometry's: where either was reset while both continue, the sensor's stamps are shifted by as
+much."""
 
 from collections.abc import Callable
+from math import inf, isfinite
 from typing import Generic, TypeVar
 
-import numpy as np
+from .clock_map import ClockMap
 
 T = TypeVar("T")
 
 JUMP = 0.5
-"""s by which a stamp, or a lead, must differ from its usual value for a jump; messages are late by less."""
+"""s by which a stamp, or a delay, must differ from its usual value for a reset; messages are late by less."""
 _CONFIRMED = 4
-"""Measurements, each after another odometry, that show that a jump lasts."""
-_LEARNT = 0.1
-"""Share of a new lead in the usual one."""
+"""Measurements, each after another odometry, that show that a reset lasts."""
+_WINDOW, _BUCKET = 5.0, 0.5
+"""s that the clock map looks back, and of one minimum: a link that becomes slower is a usual one after that time."""
 _LONGEST = 5.0
 """s; steps of a sensor that are longer were silences."""
 
@@ -21,9 +22,9 @@ _LONGEST = 5.0
 class SensorClock(Generic[T]):
     """From a sensor's stamps to those of the odometry's clock.
 
-    When measurements arrive, their lead over the odometry is nearly constant. It changes slowly where a
-    device is silent or its messages become late; where a stamp jumps, the sensor's or the odometry's, and the
-    lead has another value from then on, a clock has jumped. Until that is clear, measurements wait.
+    When a measurement arrives, the odometry has reached a time that differs from its stamp by the link's delay. That delay
+    changes slowly where a device is silent or its messages become late; where a stamp jumps, the sensor's or the
+    odometry's, and the delay has another value from then on, a clock was reset. Until that is clear, measurements wait.
 
     Parameters
     ----------
@@ -31,12 +32,13 @@ class SensorClock(Generic[T]):
     """
 
     def __init__(self, on_time: Callable[[float], float]) -> None:
-        self._on_time = on_time
-        self._shift, self._lead = 0.0, np.nan
-        self._last = self._now = -np.inf
+        self._on_time, self._shift = on_time, 0.0
+        self._map: ClockMap | None = None
+        """From the sensor's time, with the shift, to the odometry's."""
+        self._last = self._now = -inf
         self._longest, self._silences = 0.0, 0
         self._pending: list[tuple[float, float, float, T]] = []
-        """Stamp, lead, last odometry and measurement."""
+        """Stamp, difference from the usual delay, last odometry and measurement."""
 
     def take(self, stamp: float, now: float, silences: int, what: T) -> list[tuple[float, T]]:
         """Return the measurements that may be used, each with its time on the odometry's clock, s.
@@ -46,24 +48,26 @@ class SensorClock(Generic[T]):
         stamp : s, of the measurement. now : s, of the last odometry. silences : how often the odometry's stamps have leapt.
         """
         at = self._time(stamp)
-        lead = at - now
-        if not np.isfinite(lead):
+        if not isfinite(at - now):
             return [(at, what)]
+        if self._map is None:
+            self._map = ClockMap(_WINDOW, _BUCKET)
+            self._map.add(at, now)
         leapt = silences != self._silences or not -JUMP <= at - self._last <= self._longest + JUMP
-        self._pending.append((stamp, lead, now, what))
-        if abs(lead - self._lead) > JUMP and (leapt or len(self._pending) > 1):
-            leads, nows = np.array([(h[1], h[2]) for h in self._pending]).T
-            if np.ptp(leads) <= JUMP:
-                if len(np.unique(nows)) < _CONFIRMED:
+        late = now - self._map.host(at)
+        self._pending.append((stamp, late, now, what))
+        if abs(late) > JUMP and (leapt or len(self._pending) > 1):
+            lates = [entry[1] for entry in self._pending]
+            if max(lates) - min(lates) <= JUMP:
+                if len({entry[2] for entry in self._pending}) < _CONFIRMED:
                     return []
-                self._shift -= float(np.median(leads)) - self._lead
-        elif np.isnan(self._lead):
-            self._lead = lead
-        elif now > self._now:
-            self._lead += _LEARNT * (lead - self._lead)
-        free, self._pending = [(self._time(h[0]), h[3]) for h in self._pending], []
-        self._longest = max(0.9 * self._longest, min(free[-1][0] - self._last, _LONGEST) if np.isfinite(self._last) else 0.0)
-        self._last, self._now, self._silences = free[-1][0], now, silences
+                self._shift += min(lates)
+        free, self._pending = [(self._time(entry[0]), entry[3]) for entry in self._pending], []
+        last = free[-1][0]
+        if now > self._now:  # while the odometry is silent its clock stands
+            self._map.add(last, now)
+        self._longest = max(0.9 * self._longest, min(last - self._last, _LONGEST) if isfinite(self._last) else 0.0)
+        self._last, self._now, self._silences = last, now, silences
         return free
 
     def _time(self, stamp: float) -> float:
