@@ -34,6 +34,7 @@ from .carmen_readings import Block
 from .carmen_stamps import LineClock, judged
 from .carmen_writer import write_log
 from .log_parts import parts_of
+from .readings import ranges_of
 from .source import OVERLONG_LINE, open_source
 
 __all__ = ["read_log", "write_log"]
@@ -298,20 +299,16 @@ class LogReader:
             return None
         rows = np.array(self.uwb).reshape(-1, 6)
         rows[:, 0] = clock.sound(rows[:, 5].astype(np.intp), rows[:, 0], "UWB", warnings)
-        names = [name.decode() for name in self.uwb_ids]
-        ids = sorted(names)
-        place = {name: i for i, name in enumerate(ids)}
-        rank = np.array([place[name] for name in names], dtype=np.intp)
-        order = time_order(rows[:, 0], "UWB", warnings, self.set_back)
-        rows = rows[order]
+        rows = rows[time_order(rows[:, 0], "UWB", warnings, self.set_back)]
         tag = rows[:, 4].astype(np.intp)
         self.tags = int(tag.max()) + 1
         silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.gives_tag(k + 1)]
         if silent:
             name = f"uwb{silent[0]}_tag_offset_x"
             warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")
-        anchor = rank[rows[:, 1].astype(np.intp)]
-        return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)
+        names = [name.decode() for name in self.uwb_ids]
+        anchor = rows[:, 1].astype(np.intp)
+        return ranges_of(rows[:, 0], anchor, names, rows[:, 2], rows[:, 3], tag if self.tags > 1 else None)
 
 
 def _sorted_odometry(rows: Floats) -> Odometry:

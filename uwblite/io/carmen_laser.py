@@ -16,7 +16,7 @@ from .carmen_messages import BrokenLine, numbers, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
 from .carmen_stamps import LineClock
-from .scan_geometry import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
+from .readings import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""

@@ -32,7 +32,7 @@ from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, Sensor
 from .carmen_stamps import false_stamps, placed
 from .files import replacing
 from .folders import refuse_foreign, replacing_folder, unmarked
-from .scan_geometry import largest_reading, without_reach
+from .readings import largest_reading, ranges_of, without_reach
 from .settings_toml import to_toml
 from .source import finite, open_source
 
@@ -271,12 +271,9 @@ def _read_ranges(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> Uw
         anchors.append(place)
     if not cells:
         return None
-    ids = tuple(sorted({one_word(name) for name in names}))
-    index = np.array([ids.index(one_word(name)) for name in names], dtype=np.intp)
     table = np.array(cells).reshape(-1, 3)
-    table[:, 0] = _sound(table[:, 0], "range", warnings)
-    order = np.argsort(table[:, 0], kind="stable")
-    return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)
+    stamps = _sound(table[:, 0], "range", warnings)
+    return ranges_of(stamps, np.array(anchors), [one_word(name) for name in names], table[:, 1], table[:, 2])
 
 
 def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash", warnings: list[str]) -> LaserScans | None:
