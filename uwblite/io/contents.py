@@ -5,7 +5,7 @@ import os
 import re
 import zlib
 
-from .carmen_messages import is_message_name
+from .carmen_words import is_message_name
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
 _RAWLOGS = (b"CObservation", b"CSensoryFrame", b"CActionCollection")

@@ -9,7 +9,7 @@ from .. import se2
 from ..arrays import Floats
 from ..map_result import MapResult
 from ..sensor_log import SensorLog
-from .carmen_laser_words import HEAD, split_tail
+from .carmen_words import HEAD, split_tail
 from .files import replacing
 from .log_parts import parts_of
 from .source import open_source

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import FormatError
-from .carmen_messages import numbers, stamp_of
+from .carmen_words import numbers, stamp_of
 from .growing_file import GrowingFile
 from .source import MAX_LINE_BYTES
 
