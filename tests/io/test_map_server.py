@@ -253,8 +253,7 @@ def test_the_header_of_a_picture_bounds_what_is_read(tmp_path):
     tracemalloc.stop()
 
 
-def test_a_text_picture_is_read_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("uwblite.io.map_server._TEXT_BYTES", 7)
+def test_a_text_picture_is_that_of_its_bytes(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (30, 20))
     text = b"P2\n# a comment\n20 30\n255\n" + "\n".join(" ".join(map(str, row)) for row in pixels.tolist()).encode()
     grid = read_map(mapped(tmp_path / "map", text))
