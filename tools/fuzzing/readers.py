@@ -28,9 +28,8 @@ from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
-from uwblite.io.tum import read_relations
 from uwblite.io.settings_toml import to_toml
-from uwblite.io.tum import read_tum
+from uwblite.io.tum import read_relations, read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
 from uwblite.server.live import watch_status

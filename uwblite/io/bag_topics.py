@@ -8,8 +8,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from .bag_motion import did_you_mean
-from .uwb_mapping import MissingField, UwbMapping, fitting, readings_of, short_type
-from .uwb_messages import KNOWN
+from .uwb_mapping import KNOWN, MissingField, UwbMapping, fitting, readings_of, short_type
 from .uwb_suggestions import as_toml, suggested
 
 ODOMETRY, SCAN, TRANSFORMS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"

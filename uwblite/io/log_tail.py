@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import FormatError
 from .carmen_words import numbers, stamp_of
-from .growing_file import GrowingFile
+from .log_parts import GrowingFile
 from .source import MAX_LINE_BYTES
 
 WINDOW = 10.0

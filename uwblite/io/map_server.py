@@ -263,10 +263,9 @@ def _decode_pgm(start: bytes, rest: BinaryIO, path: str) -> Image:
     start, count = start[header.end() :], width * height
     if header[1] == b"P2":
         text = start + rest.read(_TEXT_BYTES * count)
-        values = (
-            np.fromstring(text, dtype=np.float32, sep=" ")[:count] if re.fullmatch(rb"[\d\s]*", text) else np.array([256.0])
-        )
-        if values.max(initial=0.0) > 255.0:
+        plain = re.fullmatch(rb"[\d\s]*", text) is not None and text.strip() != b""
+        values = np.fromstring(text, dtype=np.float32, sep=" ")[:count] if plain else np.zeros(0)
+        if (text.strip() and not plain) or values.max(initial=0.0) > 255.0:
             raise FormatError("the PGM's pixels are damaged", path)
         pixels = values.astype(np.uint8)
     else:
