@@ -85,6 +85,14 @@ def test_maps_that_are_made_at_a_time_share_the_memory_but_not_the_addresses(sys
     assert memory.shortage(400.0, maps=4) is None
 
 
+def test_a_group_that_does_not_hold_the_libraries_is_refused_before_they_are_loaded(system, short_log, capsys):
+    system("proc/self/cgroup", "0::/\n")
+    system("cgroup/memory.max", "48000000\n")
+    assert main(["check", str(short_log)]) == 1
+    line = "uwblite: error: out of memory; numpy and scipy alone need 76 MB; the limit of this control group is 48 MB\n"
+    assert capsys.readouterr().err == line
+
+
 def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeypatch):
     monkeypatch.setattr(memory, "address_space", lambda: 300_000_000)
     system("proc/self/statm", "61000 1000 3 4\n")
@@ -101,6 +109,7 @@ def test_a_system_of_32_bits_addresses_so_much(system, monkeypatch):
 
 def limited(monkeypatch, size):
     monkeypatch.setattr(memory, "limits", lambda: [memory.Limit("the limit of this test", size)])
+    monkeypatch.setattr(memory, "_RESIDENT", 0)
 
 
 def test_a_map_that_will_not_fit_is_refused_before_it_begins(short_log, tmp_path, monkeypatch, capsys):

@@ -9,6 +9,8 @@ _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
 _LIBRARIES = 300_000_000
 """Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
 matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own."""
+_RESIDENT = 76_000_000
+"""Bytes of memory that Python, numpy, scipy and this package take before anything is read."""
 _ADDRESSES = 1 << 31
 """Bytes that a process of a 32-bit system has at least."""
 _NO_LIMIT = 1 << 60
@@ -25,7 +27,7 @@ class Limit(NamedTuple):
 
 
 class NoRoom(MemoryError):
-    """The address space does not even hold the libraries."""
+    """There is no room even for the libraries."""
 
 
 class Shortage(NamedTuple):
@@ -82,14 +84,18 @@ def address_space() -> int:
 
 
 def load_libraries() -> None:
-    """Where the address space is limited, load numpy and scipy, and let OpenBLAS map its buffers while there is room.
+    """Refuse to begin where numpy and scipy do not fit; let OpenBLAS map its buffers while there is room.
 
-    OpenBLAS tries for ever where it cannot map them.
+    OpenBLAS tries for ever where it cannot map them, and a control group's process is killed without a word.
 
     Raises
     ------
     NoRoom : they do not fit.
     """
+    for limit in limits():
+        if not limit.of_addresses and limit.bytes < _RESIDENT:
+            need = f"numpy and scipy alone need {_RESIDENT / 1e6:.0f} MB"
+            raise NoRoom(f"{need}; {limit.name} is {limit.bytes / 1e6:.0f} MB")
     if not address_space():
         return
     import mmap
