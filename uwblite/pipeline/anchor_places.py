@@ -17,13 +17,13 @@ from scipy.optimize import least_squares
 from .. import se2
 from ..arrays import Floats, Ints
 from ..graph.optimizer import Optimizer
-from ..radio import prior_selection
+from ..problem.solution import rough
 from ..radio.place_intervals import Explanation, MovePolicy, PlaceModel, Track, explain, intervals_of
 from ..radio.range_noise import short_term_sigma
 from ..sensor_log.anchor_names import place_name, radio_name
 from .estimate import Estimate, Task
 from .lidar_stages import solved
-from .radio_stages import rough, with_range_noise
+from .radio_stages import with_range_noise, with_selected_priors
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +87,7 @@ def _reoptimised(estimate: Estimate, task: Task) -> Estimate:
     """Return the optimum with other places; its path follows the ranges, and so do their noise and the radios' priors."""
     config, optimizer = task.config, Optimizer()
     estimate = solved(with_range_noise(estimate, config), rough(config.solver), optimizer)
-    estimate = with_range_noise(estimate, config)
-    measured = estimate.problem.edges[len(estimate.graph.edges) :]
-    estimate = replace(estimate, graph=prior_selection.select_priors(estimate.graph, measured, config.calibration))
-    return solved(estimate, config.solver, optimizer)
+    return solved(with_selected_priors(with_range_noise(estimate, config), config), config.solver, optimizer)
 
 
 def _radios(estimate: Estimate, task: Task) -> list[_Radio]:

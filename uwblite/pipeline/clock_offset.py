@@ -9,8 +9,8 @@ from ..graph.solver import optimize
 from ..problem.constancy import log_odds_of_constant, without_prior
 from ..problem.evidence import prior_sigma
 from ..problem.parts import stretch
+from ..problem.solution import rough
 from .estimate import Estimate, Task
-from .radio_stages import rough
 
 TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""

@@ -6,40 +6,43 @@ and its covariance does not contain the other side. So wherever the trajectory c
 on the other side once, and the same problem is solved from there; and again from each optimum found in this way.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, rms_length, runs_of
-from ..errors import SolverError
+from ..arrays import Bools, Floats, runs_of
 from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
+from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, explanations
+from ..problem.evidence import log_density
 from .estimate import Estimate, Task
 
-_ACROSS, _SHARE = 1.0, 0.2
-"""Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
-_LEAST = 5
-"""Number of anchors from which on one of them may be off the line of the others."""
-_NEAR = 0.7
-"""Distance from the line up to which a trajectory may have changed sides, m."""
-_ENDS = 3
-"""Poses at either end of a trajectory within which no change of sides is tried."""
-_MOST = 4
-"""Most optima from which the search is continued."""
-_SAME = 0.1
-"""Optima nearer to each other than this, m rms, count as one."""
-_WORSE = 40.0
-"""Difference of chi2 to the best from which on the search is not continued from an optimum."""
+
+@dataclass(frozen=True, slots=True)
+class LinePolicy:
+    """When anchors stand on a line, and when it matters on which side of it a robot drove."""
+
+    across: ClassVar[float] = 1.0
+    share: ClassVar[float] = 0.2
+    """Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
+    all_but_one: ClassVar[int] = 5
+    """Number of anchors from which on one of them may be off the line of the others."""
+    near: ClassVar[float] = 0.7
+    """m from the line up to which a trajectory may have changed sides."""
+    ends: ClassVar[int] = 3
+    """Poses at either end of a trajectory within which no change of sides is tried."""
+    elsewhere: ClassVar[float] = 0.4
+    """m rms between two trajectories from which on it matters which of them is true."""
 
 
 def at_best(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
-    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
-    best, *others = minima(problem, estimate.placed, task.config.solver)
-    return replace(estimate.with_estimates_of(best), other_minimum=others[0]) if others else estimate
+    best, *others = sides(estimate.problem, estimate.placed, task.config.solver)
+    return replace(estimate.with_estimates_of(best.graph), other_minimum=others[0].graph) if others else estimate
 
 
 def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
@@ -48,47 +51,32 @@ def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
     if task.recordings.have_scans or len(task.recordings) > 1:
         return
     known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
-    starts = (graph.with_estimates_of(other),) if other is not None and known else ()
-    for there in minima(graph, estimate.placed, task.config.solver, starts):
-        more, off = there.chi2() - graph.chi2(), apart(there, graph)
-        if more < _AS_WELL and off > _ELSEWHERE:
+    further = graph.with_estimates_of(other) if other is not None and known else None
+    for there in sides(graph, estimate.placed, task.config.solver, further):
+        off = apart(there.graph, graph)
+        if there.log_odds > -EvidencePolicy.very_strong and off > LinePolicy.elsewhere:
             text = (
                 f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
-                f"{off:.1f} m (rms) away (chi2 {more:+.1f}): place an anchor off that line, or give the places of the anchors"
+                f"{off:.1f} m (rms) away (odds {np.exp(there.log_odds):.2g}): place an anchor off that line, or give the "
+                "places of the anchors"
             )
-            yield doubt("other-side", text, apart=off, chi2=more)
+            yield doubt("other-side", text, apart=off, log_odds=there.log_odds)
             return
 
 
-_AS_WELL, _ELSEWHERE = 4.0, 0.4
-"""Difference of chi2 up to which an optimum is not excluded, two standard deviations, and rms distance, m, from which on it
-matters which of two is true."""
-
-
-def minima(graph: Graph, placed: Bools, config: SolverConfig, starts: Sequence[Graph] = ()) -> list[Graph]:
-    """Return the optima that are found from a first one, the graph, which is among them, the best first.
+def sides(graph: Graph, placed: Bools, config: SolverConfig, further: Graph | None = None) -> list[Explanation]:
+    """Return the explanations by other sides of the line of anchors, the likeliest first; the present one is among them.
 
     Parameters
     ----------
-    graph : of one recording, optimised. placed : (a,) anchors that have a position. starts : where to search as well.
+    graph : of one recording, optimised. placed : (a,) anchors that have a position. further : where to search as well.
     """
-    found, waiting = [graph], [graph]
-    begin = list(starts)
-    for _ in range(_MOST):
-        if not waiting:
-            break
-        for start in [*begin, *mirrored_tails(waiting.pop(0), placed)]:
-            try:
-                there = optimize(start, config)[0]
-            except SolverError:
-                continue
-            if all(apart(there, other) > _SAME for other in found):
-                found.append(there)
-                waiting.append(there)
-        begin = []
-        found.sort(key=Graph.chi2)
-        waiting = sorted((other for other in waiting if other.chi2() < found[0].chi2() + _WORSE), key=Graph.chi2)
-    return found
+
+    def propose(at: Graph) -> list[Alternative]:
+        starts = [further] if further is not None and at is graph else []
+        return [Alternative(start) for start in (*starts, *mirrored_tails(at, placed))]
+
+    return explanations(graph, propose, lambda start: optimize(start, config)[0], log_density)
 
 
 def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
@@ -102,13 +90,13 @@ def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
         return []
     places, (middle, across) = graph.poses[:, :2], line
     off = (places - middle) @ across
-    near = np.abs(off) < _NEAR
+    near = np.abs(off) < LinePolicy.near
     # A change of sides between two poses is near, too.
     near[1:] |= off[1:] * off[:-1] < 0.0
     times = [first + int(np.argmin(np.abs(off[first:last]))) for first, last in runs_of(near)]
     starts = []
     for k in times:
-        if _ENDS <= k < len(off) - _ENDS:
+        if LinePolicy.ends <= k < len(off) - LinePolicy.ends:
             image = places[k:] - 2.0 * off[k:, None] * across
             poses = graph.poses.copy()
             poses[k:] = se2.compose(se2.align(places[k:], image), poses[k:])
@@ -119,16 +107,10 @@ def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
 def _line(anchors: Floats) -> tuple[Floats, Floats] | None:
     """Return the middle (2,) of the line on which the anchors (a, 2) stand, or all but one, and the direction across it."""
     every = np.arange(len(anchors))
-    for some in [every, *(every[every != k] for k in every if len(every) >= _LEAST)]:
+    for some in [every, *(every[every != k] for k in every if len(every) >= LinePolicy.all_but_one)]:
         own = anchors[some]
         variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 1 else (np.ones(2), np.eye(2))
         across, along = np.sqrt(np.maximum(variances, 0.0))
-        if across < min(_ACROSS, _SHARE * along):
+        if across < min(LinePolicy.across, LinePolicy.share * along):
             return own.mean(axis=0), axes[:, 0]
     return None
-
-
-def apart(one: Graph, other: Graph) -> float:
-    """Return the rms distance of the poses of two graphs after alignment, m."""
-    here, there = one.poses[:, :2], other.poses[:, :2]
-    return rms_length(se2.transform(se2.align(there, here), there) - here)
