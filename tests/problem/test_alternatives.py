@@ -91,6 +91,10 @@ def test_an_optimum_that_is_known_is_no_other_and_one_that_is_open_is_none():
     moved = replace(start, poses=se2.compose(np.array([3.0, -1.0, 0.4]), start.poses))
     again = explanations(start, lambda at: [Alternative(moved)], lambda graph: graph, log_density)
     assert [each.graph for each in again] == [start]
+    # An anchor at another place beside the same path is one.
+    beside = replace(start, anchors=np.array([[0.0, 2.0]]), fixed_anchors=np.zeros(1, dtype=bool))
+    image = replace(beside, anchors=np.array([[0.0, -2.0]]))
+    assert len(explanations(beside, lambda at: [Alternative(image)], lambda graph: graph, log_density)) == 2
     # The same path by another problem is another explanation.
     other = replace(moved, edges=())
     assert (

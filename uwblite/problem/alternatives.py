@@ -31,8 +31,9 @@ class EvidencePolicy:
     """From here on, against the likeliest, an explanation leads to no others: a further change would have to undo as much."""
     searched: ClassVar[int] = 4
     """Explanations from which the search for others is continued, the likeliest first."""
-    same: ClassVar[float] = 0.1
-    """m rms between two optima of one problem that are one."""
+    same_path: ClassVar[float] = 0.1
+    same_anchor: ClassVar[float] = 0.5
+    """m rms between the paths of two optima of one problem that are one, and between the places of an anchor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,12 +87,21 @@ def explanations(
                 odds = alternative.log_odds + evidence(graph) - usual
             except SolverError:
                 continue
-            if not any(graph.edges == other.graph.edges and apart(graph, other.graph) < EvidencePolicy.same for other in found):
+            if not any(_same(graph, other.graph) for other in found):
                 waiting.append(Explanation(graph, odds))
                 found.append(waiting[-1])
         for each in (found, waiting):
             each.sort(key=lambda explanation: -explanation.log_odds)
     return found
+
+
+def _same(one: Graph, other: Graph) -> bool:
+    """Return whether two graphs are one optimum of one problem."""
+    if one.edges != other.edges or apart(one, other) > EvidencePolicy.same_path:
+        return False
+    motion = se2.align(other.poses[:, :2], one.poses[:, :2])
+    between = (se2.transform(motion, other.anchors) - one.anchors)[~one.fixed_anchors]
+    return bool(np.hypot(*between.T).max(initial=0.0) < EvidencePolicy.same_anchor)
 
 
 def apart(one: Graph, other: Graph) -> float:
