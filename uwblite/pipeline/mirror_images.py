@@ -87,7 +87,7 @@ def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, 
         bend = np.hypot(*(each.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
         held = task.recordings.have_scans and bend < MirrorPolicy.bends
         apart = np.hypot(*(each.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
-        if each.log_odds > -EvidencePolicy.very_strong and apart and not held:
+        if each.open and apart and not held:
             return np.asarray(each.graph.anchors[k])
     return None
 

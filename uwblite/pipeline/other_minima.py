@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats, runs_of
 from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
-from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, explanations
+from ..problem.alternatives import Alternative, Explanation, apart, explanations
 from ..problem.evidence import log_density
 from .estimate import Estimate, Task
 
@@ -54,7 +54,7 @@ def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
     further = graph.with_estimates_of(other) if other is not None and known else None
     for there in sides(graph, estimate.placed, task.config.solver, further):
         off = apart(there.graph, graph)
-        if there.log_odds > -EvidencePolicy.very_strong and off > LinePolicy.elsewhere:
+        if there.open and off > LinePolicy.elsewhere:
             text = (
                 f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
                 f"{off:.1f} m (rms) away (odds {np.exp(there.log_odds):.2g}): place an anchor off that line, or give the "

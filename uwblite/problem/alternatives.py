@@ -54,9 +54,10 @@ class Explanation:
     log_odds: float
     """Logarithm of its posterior odds against the problem as it stood."""
 
-    def refuted_by(self, other: "Explanation") -> bool:
-        """Return whether there is very strong evidence for another explanation in place of this one."""
-        return other.log_odds - self.log_odds > EvidencePolicy.very_strong
+    @property
+    def open(self) -> bool:
+        """Whether there is no very strong evidence for the problem as it stood in place of this."""
+        return self.log_odds > -EvidencePolicy.very_strong
 
 
 def explanations(
