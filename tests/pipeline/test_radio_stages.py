@@ -123,7 +123,7 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
     made.clear()
     # Without a lidar, once more where another optimum was better.
     seen.have_scans = False
-    monkeypatch.setattr(radio_stages.other_minima, "at_best", lambda e, task: made.append("other") or replace(e))
+    monkeypatch.setattr(radio_stages.line_sides, "with_likeliest_side", lambda e, task: made.append("other") or replace(e))
     radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
     assert made[-7:-1] == [(name, 3, 3), "other", "noise", "priors", "free", "solve"]
     # Recordings that were joined have been optimised alone; what a lidar refines is not done again.

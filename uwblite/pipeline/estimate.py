@@ -88,7 +88,7 @@ class Estimate:
     """Between neighbouring clouds; None before scan-to-scan matching."""
     closures: Closures = field(default_factory=no_closures)
     other_heights: OtherHeights | None = None
-    other_minimum: Graph | None = None
+    other_side: Graph | None = None
     """Of a recording without lidar: another optimum of odometry and ranges; None where none was found."""
     recordings: Recordings | None = None
     """With the keyframes of the graph's poses; None while these are the task's."""

@@ -25,7 +25,7 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from . import anchor_heights, joining, map_frame, other_minima
+from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -129,7 +129,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     for lap in laps:
         estimate, result = _lap(estimate, lap, task, optimizer)
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
-    found = estimate if have_scans or estimate.alone else other_minima.at_best(estimate, task)
+    found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
         estimate, result = _lap(found, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))

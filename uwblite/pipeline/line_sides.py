@@ -1,4 +1,4 @@
-"""Search for a better optimum than that of the bootstrap: without a lidar, a trajectory may end in a poor local minimum.
+"""Sides of a line of anchors: without a lidar, a trajectory may end in a poor local minimum.
 
 Along a line of anchors, ranges do not show on which side of it a robot drives: each pass along a corridor fits on either side,
 and only the odometry between the passes decides. An optimisation that started with one of them on the wrong side stays there,
@@ -39,15 +39,15 @@ class LinePolicy:
     """m rms between two trajectories from which on it matters which of them is true."""
 
 
-def at_best(estimate: Estimate, task: Task) -> Estimate:
+def with_likeliest_side(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
     best, *others = sides(estimate.problem, estimate.placed, task.config.solver)
-    return replace(estimate.with_estimates_of(best.graph), other_minimum=others[0].graph) if others else estimate
+    return replace(estimate.with_estimates_of(best.graph), other_side=others[0].graph) if others else estimate
 
 
-def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
+def check_other_side(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
-    graph, other = estimate.graph, estimate.other_minimum
+    graph, other = estimate.graph, estimate.other_side
     if task.recordings.have_scans or len(task.recordings) > 1:
         return
     known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
