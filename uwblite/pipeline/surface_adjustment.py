@@ -44,9 +44,10 @@ step; half as much in each that follows (graduated non-convexity: A. Blake and A
 _LEAST = 0.03
 """Least weight of a point in pairs of clouds."""
 _PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
-"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm and a surface's 12 mm,
-see lidar/surface_errors.py), and radius, m. Those of turn and place must not even constrain the heading of the whole map: four
-surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the first pose to 0.01 rad."""
+"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm by data sheets, a
+surface's 12 mm by colour and material: L. Kneip et al., ICRA 2009), and radius, m. Those of turn and place must not even
+constrain the heading of the whole map: four surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the
+first pose to 0.01 rad."""
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
