@@ -60,26 +60,28 @@ class _Moments:
 
     def __init__(self, points: Floats, ahead: Floats, sigma: Floats) -> None:
         (x, y), (u, v) = points.T, (sigma[:, None] * ahead).T
-        columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y, u * u, u * v, v * v], axis=1)
-        self._sums = np.concatenate([np.zeros((1, 9)), np.cumsum(columns, axis=0)])
+        self._places, self._noise = (
+            np.concatenate([np.zeros((len(rows), 1)), np.cumsum(np.stack(rows), axis=1)], axis=1)
+            for rows in ((x, y, x * x, x * y, y * y), (u * u, u * v, v * v))
+        )
 
     def _central(self, first: Ints, last: Ints) -> tuple[Floats, ...]:
-        n, x, y, xx, xy, yy, uu, uv, vv = (self._sums[last] - self._sums[first]).T
-        n = np.maximum(n, 1.0)
-        x, y = x / n, y / n
-        return n, x, y, xx / n - x * x, xy / n - x * y, yy / n - y * y, uu / n, uv / n, vv / n
+        n = np.maximum(last - first, 1)
+        x, y, xx, xy, yy = (self._places.take(last, axis=1) - self._places.take(first, axis=1)) / n
+        return x, y, xx - x * x, xy - x * y, yy - y * y
 
     def squares(self, first: Ints, last: Ints) -> Floats:
         """Return the sum of squared distances (k,) of the points from first to before last, (k,), from their line."""
-        n, _, _, a, b, c, *_ = self._central(first, last)
-        return np.asarray(n * np.maximum(0.5 * (a + c - np.hypot(a - c, 2.0 * b)), 0.0))
+        _, _, a, b, c = self._central(first, last)
+        return np.asarray((last - first) * np.maximum(0.5 * (a + c - np.hypot(a - c, 2.0 * b)), 0.0))
 
     def lines(self, first: Ints, last: Ints) -> tuple[Floats, Floats, Floats, Floats]:
         """Return centre (k, 2), normal (k, 2), length (k,) as of evenly spread points, and rms noise across it (k,), m."""
-        _, x, y, a, b, c, uu, uv, vv = self._central(first, last)
+        x, y, a, b, c = self._central(first, last)
         angle = 0.5 * np.arctan2(2.0 * b, a - c)
         length = np.sqrt(6.0 * (a + c + np.hypot(a - c, 2.0 * b)))
         nx, ny = -np.sin(angle), np.cos(angle)
+        uu, uv, vv = (self._noise.take(last, axis=1) - self._noise.take(first, axis=1)) / np.maximum(last - first, 1)
         noise = np.sqrt(np.maximum(nx * nx * uu + 2.0 * nx * ny * uv + ny * ny * vv, 0.0))
         return np.stack([x, y], axis=1), np.stack([nx, ny], axis=1), length, noise
 
@@ -152,10 +154,10 @@ def _straight(moments: _Moments, begins: Bools, config: PieceConfig) -> tuple[In
 
 def _best_split(moments: _Moments, first: Ints, last: Ints, half: int) -> tuple[Ints, Floats]:
     """Return where (k,) two lines fit runs of at least two halves best, and the sum of squares (k,) that they leave."""
-    count = last - first
-    run, begin = np.repeat(np.arange(len(count)), count), np.cumsum(count) - count
-    at = first[run] + np.arange(len(run)) - begin[run]
-    inner = (at >= first[run] + half) & (at <= last[run] - half)
-    cost = np.where(inner, moments.squares(first[run], at) + moments.squares(at, last[run]), np.inf)
-    order = np.lexsort((at, cost, run))
-    return at[order[begin]], cost[order[begin]]
+    count = last - first + 1 - 2 * half
+    begin = np.cumsum(count) - count
+    at = np.arange(count.sum()) + np.repeat(first + half - begin, count)
+    cost = moments.squares(np.repeat(first, count), at) + moments.squares(at, np.repeat(last, count))
+    least = np.minimum.reduceat(cost, begin) if len(cost) else cost
+    best = np.flatnonzero(cost == np.repeat(least, count))
+    return at[best[np.searchsorted(best, begin)]], least
