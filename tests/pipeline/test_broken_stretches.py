@@ -74,7 +74,7 @@ def torn(estimate, task, by):
         one, one + 1, se2.between(poses[one], poses[one + 1]), np.diag([100.0, 100.0, 300.0])[None], none, none,
         scan_indices(estimate.graph.calibration), kernel=joint.kernel,
     )  # fmt: skip
-    joint = replace(joint, by_surface=None).followed_by(step)
+    joint = joint.followed_by(step)
     graph = replace(estimate.graph, poses=poses)
     return with_range_noise(replace(estimate, graph=graph, joint=joint), task.config)
 
