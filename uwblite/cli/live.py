@@ -226,7 +226,7 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
 
     file = GrowingFile(path)
     if file.skipped:
-        console.note(f"uwblite: {file.skipped / 1e6:.0f} MB of {path} lie further back and are not read")
+        console.note(f"uwblite: {file.skipped / 1e6:.1f} MB of {path} lie further back and are not read")
     quiet = 0.0
     try:
         while not stopping():
