@@ -125,7 +125,7 @@ def _write(path: Path, header: str, rows: Iterable[str]) -> None:
 
 def _range_rows(ranges: UwbRanges) -> Iterator[str]:
     names = [csv_field(name) for name in ranges.anchor_ids]
-    columns = (ranges.stamps.tolist(), ranges.anchor.tolist(), ranges.ranges.tolist(), ranges.quality.tolist())
+    columns = (column.tolist() for column in (ranges.stamps, ranges.anchor, ranges.ranges, ranges.quality))
     for stamp, anchor, distance, quality in zip(*columns, strict=True):
         yield f"{stamp:.6f},{names[anchor]},{distance:.4f},{quality:g}"
 
