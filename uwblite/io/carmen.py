@@ -1,21 +1,10 @@
-"""CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds.
+"""CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds; docs/formats.md lists the messages.
 
-``NAME contents ipc_timestamp ipc_hostname logger_timestamp``, with the messages
-
-| message | contents |
-|---|---|
-| PARAM | name value |
-| ODOM | x y theta tv rv accel |
-| ROBOTLASER1 | laser_type start_angle fov angular_resolution maximum_range accuracy remission_mode num_readings [readings] num_remissions [remissions] laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety side_safety turn_axis |
-| RAWLASER1 | as ROBOTLASER1 up to the remissions |
-| FLASER | num_readings [readings] x y theta odom_x odom_y odom_theta |
-| GYRO | heading turn_rate |
-| UWB | anchor_id range quality(0..100); UWB2 ... UWB9 = by the robot's second ... ninth tag |
-
-UWB and GYRO are uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
-and some published logs leave out ipc_timestamp: both are accepted, and then the logger's time counts.
-A reading at or above the maximum range saw nothing (+inf); a reading below range_min is an error code (nan).
-"""  # noqa: E501
+``NAME contents ipc_timestamp ipc_hostname logger_timestamp``. UWB and GYRO are uwblite's own; other CARMEN readers skip them.
+ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp: both are
+accepted, and then the logger's time counts. A reading at or above the maximum range saw nothing (+inf); one below range_min is
+an error code (nan).
+"""
 
 import hashlib
 import os

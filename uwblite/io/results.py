@@ -1,17 +1,4 @@
-"""The folder that `uwblite map` writes: which files, in which formats, and all of them or none.
-
-| file | what |
-|---|---|
-| trajectory.tum | pose at every odometry stamp, map frame; trajectory_2.tum ... for further recordings |
-| trajectory_covariance.csv | stamp, covariance, recording and trust of every keyframe |
-| anchors.csv | anchors with sigmas, biases, shares of ranges used |
-| range_errors.csv | by how much each range was wrong, and where |
-| map.pgm, map.yaml | the map for map_server and nav2 |
-| map.png | picture of the map with path, anchors, closures |
-| graph.g2o, graph.pyfg | the optimised pose graph; graph_stamps.csv has the time and the recording of each pose |
-| config.toml | the settings that were in force |
-| report.html | everything on one page |
-| report.json | the same for programs; hashes of the other files |
+"""The folder that `uwblite map` writes, all of its files or none; docs/formats.md lists them.
 
 A result is replaced as a whole, see folders.py: a full disk or a crash leaves the previous one. report.json holds the
 hash of every other file.
