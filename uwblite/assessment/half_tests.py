@@ -6,7 +6,7 @@ estimated once more, each with a calibration of its own, from the joint estimate
 scan to scan, such a change is seen directly (screening/wheel_motion.py).
 
 Turns whose sign changed (wheels swapped, a gyro turned over) are not near the joint estimate. There each half is
-bootstrapped on its own: their anchors are then mirror images of each other.
+bootstrapped on its own: their anchors are then mirror images of each other, and seem to have been moved.
 """
 
 from collections.abc import Iterator
@@ -101,7 +101,8 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
     """Doubt where anchors by either half alone are mirror images of each other."""
     stamps = recording.frames.stamps
     middle = float(stamps[len(stamps) // 2])
-    one, other = (_anchors_alone(recording, *ends, task) for ends in ((-np.inf, middle), (middle, np.inf)))
+    halves = (_anchors_alone(recording, *ends, task) for ends in ((-np.inf, middle), (middle, np.inf)))
+    one, other = (_radios_at_one_place(anchors) for anchors in halves)
     both = sorted(one.keys() & other.keys())
     if len(both) < _TRIANGLE:
         return
@@ -113,6 +114,12 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
             f"apart, {mirrored:.1f} m when mirrored): the odometry's turns are wrong in one of the halves"
         )
         yield doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
+
+
+def _radios_at_one_place(anchors: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the places (2,) of the radios that have one place, from those of anchors, by the name of the radio."""
+    names = [radio_name(name) for name in anchors]
+    return {name: place for name, place in zip(names, anchors.values(), strict=True) if names.count(name) == 1}
 
 
 def _with_places(recording: Recording, estimate: Estimate) -> Recording:
