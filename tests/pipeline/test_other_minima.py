@@ -1,6 +1,5 @@
 """Trajectories caught on the wrong side of a line of anchors, and when another side is a doubt."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -71,18 +70,3 @@ def test_anchors_on_both_sides_leave_no_other_side():
     assert not other_minima.mirrored_tails(graph, estimate.placed)
     assert other_minima.minima(graph, estimate.placed, task.config.solver) == [graph]
     assert estimate.other_minimum is None
-
-
-@pytest.mark.parametrize(
-    ("more", "off", "lidar", "doubts"),
-    [(3.9, 0.41, False, 1), (-9.0, 0.41, False, 1), (4.1, 0.41, False, 0), (3.9, 0.39, False, 0), (3.9, 0.41, True, 0)],
-)
-def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, more, off, lidar, doubts):
-    here, there = (SimpleNamespace(chi2=lambda c=c: 100.0 + c) for c in (0.0, more))
-    monkeypatch.setattr(other_minima, "minima", lambda *_: [here, there])
-    monkeypatch.setattr(other_minima, "apart", lambda one, other: off * (one is not other))
-    stages = Stages(None, None)
-    recordings = type("One", (), {"have_scans": lidar, "__len__": lambda _: 1})()
-    task = SimpleNamespace(recordings=recordings, stages=stages, config=MappingConfig())
-    stages.findings.extend(other_minima.check_other_minimum(SimpleNamespace(graph=here, other_minimum=None, placed=None), task))
-    assert [d.kind for d in stages.doubts] == ["other-side"] * doubts

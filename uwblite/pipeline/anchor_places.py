@@ -178,8 +178,8 @@ class _Told:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.moves: list[tuple[str, dict[str, object]]] = []
-        self.broken: dict[int, tuple[str, dict[str, object]]] = {}
+        self.moves: list[dict[str, object]] = []
+        self.broken: dict[int, dict[str, object]] = {}
 
     def add(self, place: Ints, found: Explanation, names: Sequence[str], stamps: Floats, recording: Ints) -> None:
         """Note each change of place (m,) of a radio with ranges at stamps (m,), s, in recordings (m,) 0, 1, ..."""
@@ -189,23 +189,21 @@ class _Told:
             number, way = int(recording[first]), first - last - 1
             name, now = names[place[last]], names[place[first]]
             distance = float(np.hypot(*(found.places[place[first]] - found.places[place[last]])))
-            figures = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now}
-            text = f"anchor {name} was moved: in recording {number + 1} it stands {distance:.2f} m away, and is called {now}"
+            figures: dict[str, object] = {
+                "anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now,
+            }  # fmt: skip
             if recording[last] == number:
                 start = self.task.recordings.each[number].log.odometry.stamps[0]
-                begin, end = (float(stamps[row] - start) for row in (last + 1, first))
-                when = f"between t = {begin:.0f} and {end:.0f} s" if way else f"at about t = {end:.0f} s"
-                less = f" (its {way} ranges meanwhile were left out)" if way else ""
-                where = f"recording {number + 1}: " if len(self.task.recordings) > 1 else ""
-                text = f"{where}anchor {name} was moved by {distance:.1f} m {when}{less}; from then on it is called {now}"
-            self.moves.append((text, figures))
+                between = [float(stamps[row] - start) for row in (last + 1, first)]
+                figures |= {"between": between, "way": way, "several": len(self.task.recordings) > 1}
+            self.moves.append(figures)
 
     def report(self) -> None:
-        """Warn of moves, and doubt a path with displaced stretches."""
-        for text, figures in self.moves:
-            self.task.stages.warn("moved-anchor", text, **figures)
-        for text, figures in self.broken.values():
-            self.task.stages.doubt("path-displaced", text, **figures)
+        """Note moves, and the stretches of a path that seem to be displaced."""
+        for figures in self.moves:
+            self.task.stages.note("moved-anchor", **figures)
+        for figures in self.broken.values():
+            self.task.stages.note("path-displaced", **figures)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -419,18 +417,16 @@ class BrokenStep:
         """
         return replace(self.estimate.graph, poses=poses).with_edges(self.estimate.closures.edges).chi2()
 
-    def told(self) -> tuple[str, dict[str, object]]:
-        """Return what the user is told, and its figures."""
+    def told(self) -> dict[str, object]:
+        """Return the figures that the user is told."""
         stamps, start = self.recording.frames.stamps, float(self.recording.log.odometry.stamps[0])
         begin, end = (float(stamps[k - self.recording.first]) for k in (self.begin, self.end - 1))
-        names = ", ".join(sorted({self.radios[move.radio].name for move in self.moves}))
+        names = sorted({self.radios[move.radio].name for move in self.moves})
         off, turned = float(np.hypot(*self.motion[:2])), float(np.rad2deg(abs(self.motion[2])))
-        text = (
-            f"from t = {begin - start:.0f} to {end - start:.0f} s the ranges to {names} fit a path that lies {off:.1f} m and "
-            f"{turned:.0f} deg from the map's: a step is broken at the beginning, by slip or a wrong match of scans; drive "
-            "there again, or map the parts before and after separately"
-        )
-        return text, {"recording": self.recording.number + 1, "begin": begin, "end": end, "apart": off}
+        return {
+            "recording": self.recording.number + 1, "stretch": (begin, end), "start": start, "anchors": names, "apart": off,
+            "turned": turned,
+        }  # fmt: skip
 
 
 _SIGMA, _LOSS = 0.1, 2.5

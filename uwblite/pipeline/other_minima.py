@@ -6,7 +6,7 @@ and its covariance does not contain the other side. So wherever the trajectory c
 on the other side once, and the same problem is solved from there; and again from each optimum found in this way.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,6 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, rms_length, runs_of
 from ..errors import SolverError
-from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
 from .estimate import Estimate, Task
@@ -40,29 +39,6 @@ def at_best(estimate: Estimate, task: Task) -> Estimate:
     problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     best, *others = minima(problem, estimate.placed, task.config.solver)
     return replace(estimate.with_estimates_of(best), other_minimum=others[0]) if others else estimate
-
-
-def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
-    graph, other = estimate.graph, estimate.other_minimum
-    if task.recordings.have_scans or len(task.recordings) > 1:
-        return
-    known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
-    starts = (graph.with_estimates_of(other),) if other is not None and known else ()
-    for there in minima(graph, estimate.placed, task.config.solver, starts):
-        more, off = there.chi2() - graph.chi2(), apart(there, graph)
-        if more < _AS_WELL and off > _ELSEWHERE:
-            text = (
-                f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
-                f"{off:.1f} m (rms) away (chi2 {more:+.1f}): place an anchor off that line, or give the places of the anchors"
-            )
-            yield doubt("other-side", text, apart=off, chi2=more)
-            return
-
-
-_AS_WELL, _ELSEWHERE = 4.0, 0.4
-"""Difference of chi2 up to which an optimum is not excluded, two standard deviations, and rms distance, m, from which on it
-matters which of two is true."""
 
 
 def minima(graph: Graph, placed: Bools, config: SolverConfig, starts: Sequence[Graph] = ()) -> list[Graph]:
