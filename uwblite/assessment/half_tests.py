@@ -6,7 +6,8 @@ estimated once more, each with a calibration of its own, from the joint estimate
 scan to scan, such a change is seen directly (screening/wheel_motion.py).
 
 Turns whose sign changed (wheels swapped, a gyro turned over) are not near the joint estimate. There each half is
-bootstrapped on its own: their anchors are then mirror images of each other, and seem to have been moved.
+bootstrapped on its own: their anchors are then mirror images of each other, and seem to have been moved. A half that fits its
+own mirror image about as well, as along a straight way past all anchors, says nothing.
 """
 
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.mirror_images import mirrored_whole
 from ..pipeline.progress import Stages
 from ..pipeline.radio_stages import bootstrapped, dead_reckoning
 from ..pipeline.recordings import Recording, gather
@@ -155,7 +157,11 @@ def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -
     if found.ranges is None or spread[1] < _WIDE * spread[0]:
         return {}
     often = np.bincount(found.ranges.anchor, found.ranges.alive, minlength=len(found.anchor_ids)) >= _FEW
-    return {found.anchor_ids[k]: found.graph.anchors[k] for k in np.flatnonzero(found.placed & often)}
+    shown = found.placed & often
+    best = optimize(found.problem, task.config.solver)[0]
+    if mirrored_whole(best, found.ranges, shown & ~best.fixed_anchors, task.config.solver) is not None:
+        return {}
+    return {found.anchor_ids[k]: found.graph.anchors[k] for k in np.flatnonzero(shown)}
 
 
 def _misfit(p: Floats, q: Floats) -> float:
