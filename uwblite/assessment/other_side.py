@@ -2,29 +2,28 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from ..findings import Finding, doubt
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.other_minima import apart, minima
+from ..pipeline.line_sides import LinePolicy, sides
+from ..problem.alternatives import apart
 
 
-def check_other_minimum(estimate: Estimate, task: Task) -> Iterator[Finding]:
+def check_other_side(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
-    graph, other = estimate.graph, estimate.other_minimum
+    graph, other = estimate.graph, estimate.other_side
     if task.recordings.have_scans or len(task.recordings) > 1:
         return
     known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
-    starts = (graph.with_estimates_of(other),) if other is not None and known else ()
-    for there in minima(graph, estimate.placed, task.config.solver, starts):
-        more, off = there.chi2() - graph.chi2(), apart(there, graph)
-        if more < _AS_WELL and off > _ELSEWHERE:
+    further = graph.with_estimates_of(other) if other is not None and known else None
+    for there in sides(graph, estimate.placed, task.config.solver, further):
+        off = apart(there.graph, graph)
+        if there.open and off > LinePolicy.elsewhere:
             text = (
                 f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
-                f"{off:.1f} m (rms) away (chi2 {more:+.1f}): place an anchor off that line, or give the places of the anchors"
+                f"{off:.1f} m (rms) away (odds {np.exp(there.log_odds):.2g}): place an anchor off that line, or give the "
+                "places of the anchors"
             )
-            yield doubt("other-side", text, apart=off, chi2=more)
+            yield doubt("other-side", text, apart=off, log_odds=there.log_odds)
             return
-
-
-_AS_WELL, _ELSEWHERE = 4.0, 0.4
-"""Difference of chi2 up to which an optimum is not excluded, two standard deviations, and rms distance, m, from which on it
-matters which of two is true."""

@@ -22,7 +22,7 @@ from .decisions import RULES
 from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
-from .other_side import check_other_minimum
+from .other_side import check_other_side
 from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
@@ -75,7 +75,7 @@ def judge(
         lambda: check_drifts(estimate, task),
         lambda: check_untied_parts(estimate, task),
         lambda: check_untied_recordings(estimate, task),
-        lambda: check_other_minimum(estimate, task),
+        lambda: check_other_side(estimate, task),
         lambda: check_handedness(estimate, task),
         lambda: check_turn_scales(estimate, task),
         lambda: check_fit(task),
