@@ -222,7 +222,7 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
     """Yield what a log holds and what is added to it, and nothing where nothing is."""
     import time
 
-    from ..io.growing_file import GrowingFile
+    from ..io.log_parts import GrowingFile
 
     file = GrowingFile(path)
     if file.skipped:
