@@ -22,21 +22,28 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 # A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("once", settings.get_profile("uwblite"), max_examples=10)
 settings.load_profile("uwblite")
 
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the slow tests too")
+    text = "run each test with the first of its parameters and few random examples: for other versions of numpy and scipy"
+    parser.addoption("--once", action="store_true", help=text)
 
 
 def pytest_collection_modifyitems(config, items):
-    if not config.getoption("--slow"):
-        slow = [item for item in items if "slow" in item.keywords]
-        items[:] = [item for item in items if "slow" not in item.keywords]
-        config.hook.pytest_deselected(items=slow)
+    chosen = [item for item in items if config.getoption("--slow") or "slow" not in item.keywords]
+    if config.getoption("--once"):
+        chosen = list({item.nodeid.partition("[")[0]: item for item in reversed(chosen)}.values())[::-1]
+    kept = set(map(id, chosen))
+    config.hook.pytest_deselected(items=[item for item in items if id(item) not in kept])
+    items[:] = chosen
 
 
 def pytest_configure(config):
+    if config.getoption("--once"):
+        settings.load_profile("once")
     if "PYTEST_XDIST_WORKER" not in os.environ:
         config.pluginmanager.register(Remaining(config))
 

@@ -170,3 +170,13 @@ def test_arrays_are_found_by_their_annotations():
     assert issubclass(found["anchor"][0], np.integer)
     assert found["tag"][1]
     assert not found["ranges"][1]
+
+
+def test_indices_wider_than_addresses_are_narrowed_where_they_fit():
+    """As random integers are on 32-bit machines, whose indices are int32 there."""
+    wide = np.array([0, 7], dtype=np.int64)
+    assert as_array(wide, "pose", np.int32).dtype == np.int32
+    assert as_array(wide, "pose", np.int64) is wide
+    assert as_array(wide.astype(np.int16), "pose", np.int32).dtype == np.int16
+    with pytest.raises(DataError, match="pose holds 8589934592, which does not fit into int32"):
+        as_array(wide + (1 << 33), "pose", np.int32)

@@ -27,8 +27,7 @@ from uwblite.evaluation.relations import Relations, evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
-from uwblite.io.relations_file import read_relations
-from uwblite.io.tum import read_tum
+from uwblite.io.tum import read_relations, read_tum
 from uwblite.lidar.columns import Landmarks, find_columns
 from uwblite.map_result import MapResult
 from uwblite.sensor_log import SensorLog

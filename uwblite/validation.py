@@ -23,7 +23,8 @@ def as_array(values: ArrayLike, name: str, kind: Any = np.float64) -> NDArray[An
 
     Parameters
     ----------
-    name : of the argument, for the message. kind : numpy type; an array of integers keeps its own width.
+    name : of the argument, for the message. kind : numpy type; an array of integers keeps its own width where that is less,
+    because numpy takes no indices wider than addresses.
 
     Raises
     ------
@@ -37,7 +38,14 @@ def as_array(values: ArrayLike, name: str, kind: Any = np.float64) -> NDArray[An
     if array.size and array.dtype.kind not in _TAKEN[family]:
         example = repr(array.flat[0])[:40]
         raise DataError(f"{name} must hold {_WANTED[family]}, not {array.dtype.name} such as {example}")
-    return array if family is np.integer and array.dtype.kind in "iu" else array.astype(kind, copy=False)
+    if family is not np.integer or array.dtype.kind not in "iu":
+        return array.astype(kind, copy=False)
+    if array.dtype.itemsize <= np.dtype(kind).itemsize:
+        return array
+    narrow = array.astype(kind)
+    if (narrow != array).any():
+        raise DataError(f"{name} holds {array[narrow != array].flat[0]}, which does not fit into {np.dtype(kind).name}")
+    return narrow
 
 
 def require_shape(array: NDArray[Any], name: str, shape: Shape, known: dict[str, tuple[int, str]] | None = None) -> None:

@@ -15,7 +15,7 @@ import pytest
 from conftest import ROOT
 from helpers.results import contents
 
-from uwblite.cli import batch, console, main
+from uwblite.cli import batch, console, main, memory
 from uwblite.cli.options import name_recordings_once
 from uwblite.errors import ConfigError
 from uwblite.io.carmen import read_log, write_log
@@ -97,6 +97,15 @@ def test_a_table_of_another_s_is_not_replaced(recordings, tmp_path, capsys):
     assert main(["batch", *recordings[:1], "--out", str(tmp_path), "--force"]) == 1
     assert "was not written by uwblite" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["batch.csv"]
+
+
+def test_maps_at_a_time_that_may_not_fit_are_named(recordings, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(memory, "limits", lambda: [memory.Limit("the limit of this test", 400_000_000)])
+    words = ["batch", *recordings[:1], "--out", str(tmp_path / "maps"), "--without", "lidar", "--jobs", "4"]
+    assert main(words) in (0, 3)
+    said = capsys.readouterr().err
+    assert f"{recordings[0]}: 4 such maps at a time need about" in said
+    assert "fewer --jobs" in said
 
 
 def test_a_process_that_is_killed_costs_its_own_recording_alone(recordings, tmp_path, monkeypatch):

@@ -37,6 +37,14 @@ def test_an_error_is_one_line(capsys):
     assert capsys.readouterr().err == "uwblite: error: first second\n"
 
 
+def test_what_ascii_cannot_write_does_no_harm(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", stream)
+    console.say("sal\u00f3n: x 12.31 \u00b10.04 m")
+    stream.flush()
+    assert stream.buffer.getvalue() == b"sal?n: x 12.31 +-0.04 m\n"
+
+
 def test_progress_is_silent_off_a_terminal():
     stream = io.StringIO()
     progress = console.Progress(stream)

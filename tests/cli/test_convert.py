@@ -155,13 +155,11 @@ def test_json_is_one_object(tmp_path, room_log, target, capsys):
 
 
 def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):
-    from helpers.results import small_log, small_result
+    from helpers.results import small_folder
 
     from uwblite.io.nav2_bundle import FILES
-    from uwblite.io.result_text import RunRecord
-    from uwblite.io.results import write_result
 
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     words = ["convert", str(tmp_path / "map"), str(tmp_path / "nav2"), "--to", "nav2"]
     assert main(words) == 0
     assert {p.name for p in (tmp_path / "nav2").iterdir()} == set(FILES)

@@ -142,11 +142,6 @@ def test_a_reader_that_leaves_early_does_not_disturb():
     assert done.stdout.count("\n") == 1
 
 
-def test_names_that_ascii_cannot_write_do_no_harm(short_log):
-    done = run("check", str(short_log), env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
-    assert done.returncode == 0, done.stderr
-
-
 def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
     assert main(["config", "--set", "grid.resolution=0.02"]) == 0
     text = capsys.readouterr().out

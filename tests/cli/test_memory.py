@@ -72,6 +72,27 @@ def test_the_tightest_limit_is_named_and_twice_as_much_is_hopeless(system):
     assert "control group is 500 MB" in few.text
 
 
+def test_maps_that_are_made_at_a_time_share_the_memory_but_not_the_addresses(system, monkeypatch):
+    system("proc/meminfo", "MemTotal: 1000000 kB\nSwapTotal: 0 kB\n")
+    assert memory.shortage(400.0, maps=2) is None
+    four = memory.shortage(400.0, maps=4)
+    assert "4 such maps at a time need about 1600 MB" in four.text
+    assert "--jobs" in four.text
+    assert not four.hopeless, "each of them would fit alone"
+    monkeypatch.setattr(memory, "address_space", lambda: 500_000_000)
+    assert "4 such maps" in memory.shortage(400.0, maps=4).text
+    system("proc/meminfo", "")
+    assert memory.shortage(400.0, maps=4) is None
+
+
+def test_a_group_that_does_not_hold_the_libraries_is_refused_before_they_are_loaded(system, short_log, capsys):
+    system("proc/self/cgroup", "0::/\n")
+    system("cgroup/memory.max", "48000000\n")
+    assert main(["check", str(short_log)]) == 1
+    line = "uwblite: error: out of memory; numpy and scipy alone need 76 MB; the limit of this control group is 48 MB\n"
+    assert capsys.readouterr().err == line
+
+
 def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeypatch):
     monkeypatch.setattr(memory, "address_space", lambda: 300_000_000)
     system("proc/self/statm", "61000 1000 3 4\n")
@@ -88,6 +109,7 @@ def test_a_system_of_32_bits_addresses_so_much(system, monkeypatch):
 
 def limited(monkeypatch, size):
     monkeypatch.setattr(memory, "limits", lambda: [memory.Limit("the limit of this test", size)])
+    monkeypatch.setattr(memory, "_RESIDENT", 0)
 
 
 def test_a_map_that_will_not_fit_is_refused_before_it_begins(short_log, tmp_path, monkeypatch, capsys):
@@ -137,6 +159,6 @@ def test_with_too_little_address_space_the_end_comes_soon_and_in_one_line(megaby
         [sys.executable, "-c", LIMITED, *words], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 1, done.stdout + done.stderr
-    assert done.stderr.startswith("uwblite: error: out of memory")
+    assert done.stderr.startswith("uwblite: error: out of memory; numpy and scipy alone need 300 MB of addresses")
     assert f"{megabytes} MB (ulimit -v)" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -7,13 +7,11 @@ import re
 import numpy as np
 import pytest
 from helpers.planning_worlds import grid_of
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
 from uwblite.cli import main
 from uwblite.io.map_server import write_map
 from uwblite.io.png import decode_png
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 
 
 @pytest.fixture
@@ -61,7 +59,7 @@ def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_
 
 def test_a_result_of_map_is_planned_in_with_its_anchors(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     words = ["plan", "--map", "map", "--radius", "0", "--from", "0,0", "--to", "1,-3.2", "--unknown", "price"]
     assert main(words) in (0, 1)
     assert "internal" not in capsys.readouterr().err

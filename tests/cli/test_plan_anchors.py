@@ -4,17 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
 from uwblite.cli import main
 from uwblite.io.png import decode_png
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 
 
 @pytest.fixture
 def mapped(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     return tmp_path
 
 

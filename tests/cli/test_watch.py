@@ -10,12 +10,10 @@ import urllib.request
 import numpy as np
 import pytest
 from helpers.browser import CHROMIUM, Browser
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 from helpers.served import PATIENCE, Served
 
 from uwblite.cli import main, watch
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.server.live import LivePage
 
 
@@ -63,7 +61,7 @@ def watched(tmp_path, monkeypatch):
 
 def make_map(folder):
     shutil.rmtree(folder, ignore_errors=True)
-    write_result(folder, [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(folder)
 
 
 def test_a_round_is_begun_shown_and_followed_by_the_next(watched):

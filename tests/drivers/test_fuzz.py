@@ -125,7 +125,7 @@ def test_many_bytes(name, kind):
     def count(_frame, event, _arg):
         calls[0] += event in ("call", "c_call")
 
-    while fed < 300_000:
+    while fed < 100_000:
         if kind == "noise":
             piece = rng.randbytes(rng.randrange(1, 2000))
         else:

@@ -1,6 +1,8 @@
 """A small, complete map result made by hand, for tests of what is done with results, and what its folder holds."""
 
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, StageSummary
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
@@ -26,6 +30,20 @@ EVIL = "<script>alert('x')</script>&\"\u202e"
 def contents(folder):
     """Return the bytes of every file of a folder by name."""
     return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
+
+
+def small_folder(folder, *, evil="", command="uwblite map x", settings=""):
+    """Write that result of `small_log` to a folder, drawn and packed once."""
+    folder.mkdir(parents=True)
+    for name, data in _small_files(evil, command, settings).items():
+        (folder / name).write_bytes(data)
+
+
+@cache
+def _small_files(evil, command, settings):
+    with TemporaryDirectory() as place:
+        write_result(Path(place) / "map", [small_log()], small_result(evil=evil), RunRecord(command, settings))
+        return contents(Path(place) / "map")
 
 
 def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: float = 0.0) -> MapResult:

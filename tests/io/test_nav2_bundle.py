@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers.results import EVIL, small_log, small_result
+from helpers.results import EVIL, small_folder
 
 from uwblite.errors import ConfigError
 from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from uwblite.io.map_server import read_map
 from uwblite.io.nav2_bundle import FILES, write_nav2_bundle
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 
 yaml = pytest.importorskip("yaml")
@@ -17,7 +15,7 @@ yaml = pytest.importorskip("yaml")
 
 @pytest.fixture
 def bundle(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     result = read_result(tmp_path / "map")
     assert write_nav2_bundle(tmp_path / "nav2", result) == FILES
     return tmp_path / "nav2", result
@@ -87,14 +85,14 @@ def test_anchors_keep_their_names_and_covariances(bundle):
 
 
 def test_names_out_of_a_recording_are_text(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(evil=EVIL), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map", evil=EVIL, command="uwblite map x", settings="")
     result = read_result(tmp_path / "map")
     write_nav2_bundle(tmp_path / "nav2", result)
     assert [a["id"] for a in read(tmp_path / "nav2", "anchors.yaml")["anchors"]] == [a.id for a in result.anchors]
 
 
 def test_without_a_grid_there_is_no_bundle(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     (tmp_path / "map" / "map.yaml").unlink()
     with pytest.raises(ConfigError, match="nav2 needs a map"):
         write_nav2_bundle(tmp_path / "nav2", read_result(tmp_path / "map"))

@@ -2,12 +2,10 @@
 
 import pytest
 from helpers.bags import odometry, stamped, write_bag_of
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
 from uwblite.errors import ConfigError
 from uwblite.io.bag_topics import BagTopics, plan_topics
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.rosbag import plan_bag, read_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
 from uwblite.io.uwb_suggestions import as_toml, suggested
@@ -156,7 +154,7 @@ def test_check_reports_where_the_ranges_may_be(tmp_path, capsys):
 def test_topics_of_what_is_no_bag_are_refused(tmp_path, capsys, verb, room_log):
     from uwblite.cli import main
 
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map run.log", ""))
+    small_folder(tmp_path / "map", command="uwblite map run.log")
     more = {"map": ["--out", f"{tmp_path}/m"], "localize": ["--map", f"{tmp_path}/map", "--out", f"{tmp_path}/l"], "check": []}
     words = more.get(verb, [f"{tmp_path}/x.log"])
     for option, why in (("--odometry-topic", "is no ROS bag"), ("--scan-topic", "scans are not read from '/scan'; choose")):

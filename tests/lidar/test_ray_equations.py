@@ -40,7 +40,7 @@ def test_derivatives_are_those_of_the_residuals():
 def test_packed_rays_say_the_same_to_some_micrometres():
     rays = rays_that_end(0.01)
     whole, packed = (linearized(r, SURFACES, POSES, POSES) for r in (rays, rays.packed()))
-    assert sum(getattr(rays.packed(), f.name).nbytes for f in fields(rays)) == 36 * len(rays.keyframe)
+    assert sum(getattr(rays.packed(), f.name).nbytes for f in fields(rays)) <= 36 * len(rays.keyframe)
     for name in ("residual", "by_pose", "by_surface"):
         scale = np.abs(getattr(whole, name)).max()
         np.testing.assert_allclose(getattr(packed, name), getattr(whole, name), atol=max(5e-6 / 0.01, 1e-6 * scale))

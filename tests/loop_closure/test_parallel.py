@@ -45,7 +45,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("several", [False, True])
-def test_a_map_is_the_same_for_any_number_of_jobs(minutes, tmp_path, several):
+def test_a_map_is_the_same_bytes_for_any_number_of_jobs(minutes, tmp_path, several):
     written = []
     for jobs in (1, 3):
         out = tmp_path / f"jobs{jobs}"
@@ -66,7 +66,7 @@ def same_map(one, other) -> bool:
 
 
 @pytest.mark.parametrize("method", [pytest.param("search", marks=pytest.mark.slow), "icp"])
-def test_closures_and_rays_do_not_depend_on_the_executor(minutes, method):
+def test_closures_and_rays_are_the_same_bytes_whatever_the_executor(minutes, method):
     log = read_log(minutes[0])
     config = MappingConfig()
     if method == "icp":
@@ -76,7 +76,7 @@ def test_closures_and_rays_do_not_depend_on_the_executor(minutes, method):
         assert same_map(alone, build_map(log, config, executor=executor))
 
 
-def test_a_cluster_makes_the_same_map(minutes):
+def test_a_cluster_makes_the_same_bytes(minutes):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed (extra: dev)")
     log = read_log(minutes[0])
     with (

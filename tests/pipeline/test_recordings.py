@@ -23,7 +23,7 @@ ROOM = box(14, 11)
 LEVEL = SensorMounting(anchor_height=0.0)
 
 
-def drive(seed, places=PLACES, *, lidar=True, start=0.0, turn=0.0, length=40.0, mounting=LEVEL):
+def drive(seed, places=PLACES, *, lidar=True, start=0.0, turn=0.0, length=30.0, mounting=LEVEL):
     """A recording of the room and its truth; its odometry begins in a frame of its own."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, length)
@@ -225,7 +225,7 @@ def test_two_recordings_through_a_simulated_hall(tmp_path):
     logs, truths, single = [], [], []
     for seed in (31, 32):
         folder = tmp_path / str(seed)
-        logfile.write(simulate(Settings(world="hall", minutes=5.0, seed=seed, scan_rate=5.0)), folder)
+        logfile.write(simulate(Settings(world="hall", minutes=3.0, seed=seed, scan_rate=5.0)), folder)
         logs.append(read_log(folder / "run.log"))
         stamps, poses = read_tum(folder / "truth.tum")
         truths.append(se2.interpolate_trajectory(stamps, poses, logs[-1].odometry.stamps))

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.advice import SensorState, advice
 
@@ -17,7 +15,7 @@ FINE = {"odometry": SensorState(900, 20.0, 0.0), "lidar": SensorState(450, 10.0,
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("advice") / "map"
-    write_result(folder, [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(folder)
     found = read_result(folder)
     good = tuple(replace(a, covariance=np.eye(2) * 1e-4, status="ok") for a in found.anchors)
     calm = np.tile(np.eye(3) * 1e-6, (len(found.keyframe_stamps), 1, 1))

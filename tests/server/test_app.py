@@ -4,11 +4,9 @@ import json
 import shutil
 
 import pytest
-from helpers.results import EVIL, small_log, small_result
+from helpers.results import EVIL, small_folder
 
 from uwblite.io.constraints_file import parse_constraints
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.app import app_of
 
@@ -31,7 +29,7 @@ class Work:
 @pytest.fixture
 def app(tmp_path):
     folder = tmp_path / "map"
-    write_result(folder, [small_log()], small_result(evil=EVIL), RunRecord("uwblite map run.log --laser-flipped", "x = 1"))
+    small_folder(folder, evil=EVIL, command="uwblite map run.log --laser-flipped", settings="x = 1")
     recording = tmp_path / "run.log"
     app = app_of([read_result(folder)], {"ab" * 32: recording}, tmp_path / "c.toml", Work)
     app.host = HOST

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.results import EVIL, small_log, small_result
+from helpers.results import EVIL, small_folder
 
 from uwblite.io.log_tail import LogTail
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.live import LivePage, watch_status
 
@@ -18,7 +16,7 @@ HOST = {"host": "127.0.0.1:8000"}
 
 @pytest.fixture
 def stored(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     return read_result(tmp_path / "map")
 
 

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
 from uwblite.constraints import Constraints
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.shown_results import described, shown_result
 
@@ -17,7 +15,7 @@ from uwblite.server.shown_results import described, shown_result
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shown") / "hall"
-    write_result(folder, [small_log()], small_result(), RunRecord("uwblite map run.log", "x = 1"))
+    small_folder(folder, command="uwblite map run.log", settings="x = 1")
     return read_result(folder)
 
 

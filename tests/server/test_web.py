@@ -7,10 +7,8 @@ import socket
 import threading
 
 import pytest
-from helpers.results import small_log, small_result
+from helpers.results import small_folder
 
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.app import app_of
 from uwblite.server.live import LivePage
@@ -19,7 +17,7 @@ from uwblite.server.web import server_for
 
 @pytest.fixture
 def served(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    small_folder(tmp_path / "map")
     app = app_of([read_result(tmp_path / "map")], {}, tmp_path / "c.toml", lambda words: None)
     server = server_for(app)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)

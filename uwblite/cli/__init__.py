@@ -36,7 +36,7 @@ examples:
   uwblite evaluate map/ --truth t.tum   compare with the truth
 """
 
-_OUT_OF_MEMORY = "out of memory; a coarser --resolution, --crop or a shorter recording needs less"
+_LESS_MEMORY = "a coarser --resolution, --crop or a shorter recording needs less"
 
 _EXIT_CODES = """\
 exit codes:
@@ -214,7 +214,7 @@ def failure(error: BaseException) -> tuple[int, str]:
     unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
     if isinstance(error, MemoryError) or unfit:
         limited = f"; the shell allows {size / 1e6:.0f} MB (ulimit -v)" if (size := memory.address_space()) else ""
-        return 1, _OUT_OF_MEMORY + limited
+        return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY}{limited}"
     if isinstance(error, OSError):
         return 1, console.os_error_text(error)
     if isinstance(error, ImportError):

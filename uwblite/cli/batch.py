@@ -48,14 +48,14 @@ class Outcome(NamedTuple):
     code: int
     """Exit code as of `uwblite map`."""
     error: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from pathlib import Path
 
-    from ..io.folders import refuse_foreign, unmarked
-    from ..io.locks import sole_writer
+    from ..io.folders import refuse_foreign, sole_writer, unmarked
     from ..report.batch import table_csv
     from . import console
     from .options import name_recordings_once
@@ -130,6 +130,8 @@ def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "lis
     for k, outcome in _outcomes({k: task for k, task in enumerate(tasks) if k not in finished}, args):
         rows[k] = _row(args.logs[k], tasks[k], outcome)
         _write_table(args.out, rows)
+        for text in outcome.notes:
+            console.note(text.replace("uwblite: ", f"uwblite: {args.logs[k]}: ", 1))
         if not args.json:
             console.say(f"{len(rows)} of {len(tasks)}: {_line(rows[k])}")
     return [rows[k] for k in range(len(tasks))]
@@ -177,22 +179,24 @@ def map_one(task: argparse.Namespace) -> Outcome:
     import time
     import warnings
 
-    from ..io.locks import sole_writer
+    from ..io.folders import sole_writer
     from ..io.results import check_target
     from . import failure
     from .making import make, read_logs
 
+    notes: list[str] = []
     try:
         with warnings.catch_warnings(), sole_writer(task.out):
             warnings.simplefilter("ignore", RuntimeWarning)
             check_target(task.out, force=task.force)
             began = time.perf_counter()
             logs = read_logs(task)
-            made = make(task, logs, time.perf_counter() - began)
+            maps = 1 if task.scheduler else task.jobs
+            made = make(task, logs, time.perf_counter() - began, note=notes.append, maps=maps)
     except Exception as error:
         code, text = failure(error)
         return Outcome(code, text)
-    return Outcome(3 if made.result.doubts else 0)
+    return Outcome(3 if made.result.doubts else 0, notes=tuple(notes))
 
 
 def _outcomes(tasks: dict[int, argparse.Namespace], args: argparse.Namespace) -> Iterator[tuple[int, Outcome]]:

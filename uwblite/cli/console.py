@@ -121,7 +121,8 @@ def write(stream: TextIO, text: str) -> None:
     try:
         stream.write(text)
     except UnicodeEncodeError:
-        stream.write(text.encode(stream.encoding or "ascii", "replace").decode(stream.encoding or "ascii"))
+        encoding = stream.encoding or "ascii"
+        stream.write(text.replace("\u00b1", "+-").encode(encoding, "replace").decode(encoding))
     except OSError as error:
         _drop(stream, error)
 

@@ -46,6 +46,7 @@ def make(
     progress: "Progress | None" = None,
     executor: "Executor | None" = None,
     note: Callable[[str], None] | None = None,
+    maps: int = 1,
 ) -> Made:
     """Map recordings and write the result; say nothing but notes.
 
@@ -54,6 +55,7 @@ def make(
     logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
     reading : time that it took to read them, s.
     note : is told beforehand where memory will be short.
+    maps : how many maps are made at a time, each in a process.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def make(
 
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
-    _check_memory(kept, config, args.ignore_memory, note)
+    _check_memory(kept, config, args.ignore_memory, note, maps)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
     record = RunRecord(
@@ -94,14 +96,14 @@ def make(
 
 
 def _check_memory(
-    logs: "list[SensorLog]", config: "MappingConfig", ignore: bool, note: Callable[[str], None] | None
+    logs: "list[SensorLog]", config: "MappingConfig", ignore: bool, note: Callable[[str], None] | None, maps: int
 ) -> None:
     """Refuse a map that will not fit in memory, or note that it may not."""
     from ..errors import ConfigError
     from .cost import expected_cost, together
     from .memory import shortage
 
-    found = shortage(together([expected_cost(log, config) for log in logs])["megabytes"])
+    found = shortage(together([expected_cost(log, config) for log in logs])["megabytes"], maps)
     if found is None:
         return
     if found.hopeless and not ignore:

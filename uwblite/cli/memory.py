@@ -9,6 +9,8 @@ _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
 _LIBRARIES = 300_000_000
 """Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
 matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own."""
+_RESIDENT = 76_000_000
+"""Bytes of memory that Python, numpy, scipy and this package take before anything is read."""
 _ADDRESSES = 1 << 31
 """Bytes that a process of a 32-bit system has at least."""
 _NO_LIMIT = 1 << 60
@@ -24,6 +26,10 @@ class Limit(NamedTuple):
     """It counts what is mapped, used or not, libraries too."""
 
 
+class NoRoom(MemoryError):
+    """There is no room even for the libraries."""
+
+
 class Shortage(NamedTuple):
     """A map that needs more memory than there is."""
 
@@ -32,14 +38,21 @@ class Shortage(NamedTuple):
     """It needs more than twice as much: the estimate is not as wrong as that."""
 
 
-def shortage(megabytes: float) -> Shortage | None:
-    """Compare the memory that a map is expected to need with the limits of this process; None where it suffices."""
-    worst = max(((_needed(megabytes, limit) / limit.bytes, limit) for limit in limits()), default=None)
-    if worst is None or worst[0] <= 1.0:
+def shortage(megabytes: float, maps: int = 1) -> Shortage | None:
+    """Compare the memory that a map is expected to need with the limits of this process; None where it suffices.
+
+    Parameters
+    ----------
+    maps : how many of that size are made at a time, each in a process: addresses are limited for each, memory for all.
+    """
+    shares = [(_needed(megabytes, limit) / limit.bytes, limit) for limit in limits()]
+    worst, limit = max(((one * (1 if limit.of_addresses else maps), limit) for one, limit in shares), default=(0.0, None))
+    if limit is None or worst <= 1.0:
         return None
-    share, limit = worst
-    text = f"this map needs about {share * limit.bytes / 1e6:.0f} MB of memory; {limit.name} is {limit.bytes / 1e6:.0f} MB"
-    return Shortage(f"{text}: a larger --resolution, --every-nth-scan or a part of the recording needs less", share > 2.0)
+    who = "this map needs" if maps == 1 or limit.of_addresses else f"{maps} such maps at a time need"
+    text = f"{who} about {worst * limit.bytes / 1e6:.0f} MB of memory; {limit.name} is {limit.bytes / 1e6:.0f} MB"
+    cure = f"{'' if maps == 1 else 'fewer --jobs, '}a larger --resolution, --every-nth-scan or a part of the recording"
+    return Shortage(f"{text}: {cure} {'needs' if maps == 1 else 'need'} less", max(one for one, _ in shares) > 2.0)
 
 
 def _needed(megabytes: float, limit: Limit) -> float:
@@ -71,14 +84,18 @@ def address_space() -> int:
 
 
 def load_libraries() -> None:
-    """Where the address space is limited, load numpy and scipy, and let OpenBLAS map its buffers while there is room.
+    """Refuse to begin where numpy and scipy do not fit; let OpenBLAS map its buffers while there is room.
 
-    OpenBLAS tries for ever where it cannot map them.
+    OpenBLAS tries for ever where it cannot map them, and a control group's process is killed without a word.
 
     Raises
     ------
-    MemoryError : there is no room.
+    NoRoom : they do not fit.
     """
+    for limit in limits():
+        if not limit.of_addresses and limit.bytes < _RESIDENT:
+            need = f"numpy and scipy alone need {_RESIDENT / 1e6:.0f} MB"
+            raise NoRoom(f"{need}; {limit.name} is {limit.bytes / 1e6:.0f} MB")
     if not address_space():
         return
     import mmap
@@ -86,7 +103,7 @@ def load_libraries() -> None:
     try:
         mmap.mmap(-1, _LIBRARIES).close()
     except OSError as error:
-        raise MemoryError(str(error)) from error
+        raise NoRoom(f"numpy and scipy alone need {_LIBRARIES / 1e6:.0f} MB of addresses") from error
     import numpy as np
     from scipy.linalg import blas
 

@@ -43,10 +43,10 @@ def duration(seconds: float) -> str:
 def sigma_text(sigma: float, digits: int) -> str:
     """Return a standard deviation with so many decimals, or more where it would show less than two digits of itself.
 
-    What is not finite is a dash, and 0 is "0": it was given, not estimated.
+    What is not finite is "?", and 0 is "0": it was given, not estimated.
     """
     if not math.isfinite(sigma):
-        return "\u2013"
+        return "?"
     if sigma <= 0.0:
         return "0"
     return f"{sigma:.{max(digits, min(1 - math.floor(math.log10(sigma)), _MOST_DIGITS))}f}"
