@@ -38,7 +38,7 @@ _CONFIG = WallConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Walls:
+class StraightWalls:
     """Straight walls (w) of a map."""
 
     of_piece: Ints
@@ -49,7 +49,7 @@ class Walls:
     """(w, 2) unit, towards the robot."""
 
 
-def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _CONFIG) -> Walls:
+def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _CONFIG) -> StraightWalls:
     """Join those of some pieces (s,) that lie on each other, at poses (k, 3) of the keyframes, to walls."""
     piece, at, normal = _places(pieces, poses, config.every)
     kept = np.flatnonzero(some[piece])
@@ -63,7 +63,7 @@ def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = 
     good &= _rms(number, _across(normal, facing[number]) / np.hypot(deviation, _TURNED), len(centre)) < config.turned
     of_piece = np.full(len(some), -1)
     of_piece[piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
-    return Walls(of_piece, centre[good], facing[good])
+    return StraightWalls(of_piece, centre[good], facing[good])
 
 
 def _places(pieces: Pieces, poses: Floats, every: float) -> tuple[Ints, Floats, Floats]:
