@@ -103,13 +103,8 @@ def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
 
 
 def check_heights(estimate: Estimate, task: Task) -> None:
-    """Doubt a map without lidar where the ranges do not decide how high the anchors are, and the map depends on it."""
+    """Note where the ranges do not decide how high the anchors are, and a map without lidar depends on it."""
     other = estimate.other_heights
     if other is None or task.recordings.have_scans or other.apart < HeightPolicy.elsewhere:
         return
-    taken, instead = ("high", "low") if other.taken else ("low", "high")
-    text = (
-        f"the ranges fit anchors {other.high:.1f} m above the tag about as well as low ones: taken as {taken}; if they are "
-        f"{instead}, the trajectory differs by {other.apart:.1f} m (rms); give the anchors' heights (--anchor-height)"
-    )
-    task.stages.doubt("anchor-heights", text, height=other.high, taken=taken, apart=other.apart)
+    task.stages.note("anchor-heights", height=other.high, taken=other.taken, apart=other.apart)
