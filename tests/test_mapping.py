@@ -408,7 +408,7 @@ def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
     """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three recordings."""
     fused, alone = [], []
     for seed in (1, 2, 3):
-        log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=8.0, speed=0.4)
+        log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=5.0, speed=0.4)
         alone.append(ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth))
         fused.append(ate(build_map(log), truth))
     assert np.mean(fused) < 1.05 * np.mean(alone)
@@ -416,10 +416,9 @@ def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_ranges_through_walls_move_no_anchor(tmp_path, seed):
+def test_ranges_through_walls_move_no_anchor(tmp_path):
     """Through the block of a corridor ranges are 0.3 m late, always in the same directions; the map shows which they are."""
-    log, truth = simulated(tmp_path, world="corridor", minutes=10.0, seed=seed)
+    log, truth = simulated(tmp_path, world="corridor", minutes=10.0, seed=1)
     result = build_map(log)
     laid = evaluate_trajectory(result.stamps, result.trajectory, *truth).T_truth_map
     rows = [row.split(",") for row in (tmp_path / "truth_anchors.csv").read_text().split()[1:]]
