@@ -19,7 +19,7 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 FLOORS = (
     ("errors", "arrays", "findings"),
     ("validation", "field_docs"),
-    ("se2", "config"),
+    ("se2", "config", "clocks"),
     ("sensor_log", "graph", "drivers"),
     ("problem",),
     ("constraints", "odometry", "grid"),

@@ -21,7 +21,6 @@ from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
 from uwblite.lidar.joint_refinement import with_fewer_pairs
-from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Task
@@ -58,7 +57,7 @@ def ate(result, truth) -> float:
 
 def test_anchors_covariances_contain_the_correlated_errors_of_their_ranges(result):
     stated = with_noise_shown(with_fewer_pairs(result.graph))
-    whole = marginals(stated, common_range_errors(stated)).covariances.anchors
+    whole = marginals(stated).covariances.anchors
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
     alike = anchors_with_correlated_errors(at_given_poses(result.graph), ranges, whole, MappingConfig().ranges)
     assert all(np.abs(own).max() > 1e-4 for own in alike - whole)

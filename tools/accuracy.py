@@ -44,8 +44,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.io.carmen import read_log
-from uwblite.io.relations_file import read_relations
-from uwblite.io.tum import read_tum
+from uwblite.io.tum import read_relations, read_tum
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog

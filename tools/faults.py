@@ -39,7 +39,7 @@ from uwblite import se2
 from uwblite.checks.recording import diagnose
 from uwblite.errors import UwbliteError
 from uwblite.io.carmen import read_log
-from uwblite.io.carmen_messages import time_order
+from uwblite.io.carmen_words import time_order
 from uwblite.map_result import AnchorEstimate, MapResult
 from uwblite.mapping import build_map
 from uwblite.sensor_log import Odometry, SensorLog, UwbRanges

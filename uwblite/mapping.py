@@ -82,7 +82,7 @@ def build_map(
     for stage in _stages(task):
         estimate = stage(estimate, task)
         task = task.following(estimate)
-    estimate, covariance = final_stages.without_range_errors(estimate, task)
+    covariance = final_stages.covariances_of(estimate, task)
     stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, covariance, grid, task)

@@ -12,7 +12,7 @@ from helpers.results import FILES, contents
 from uwblite import se2
 from uwblite.cli import main
 from uwblite.io.carmen import read_log, write_log
-from uwblite.io.locks import sole_writer
+from uwblite.io.folders import sole_writer
 from uwblite.io.tum import read_tum
 from uwblite.sensor_log import SensorMounting
 

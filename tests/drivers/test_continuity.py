@@ -5,12 +5,14 @@ import random
 from itertools import islice
 
 import pytest
+from emulators.scip_device import ScipDevice
+from emulators.simulated_time import of_kind, simulate
 from emulators.uwb_boards import BOARDS, slots
-from emulators.world import RoomWorld
+from emulators.world import RoomWorld, WorldClock
 
 from uwblite.drivers.continuity import MOST_GAP, SPEED, SPREAD, Continuity, LinkHealth, RangeGuard
 from uwblite.drivers.devices import open_device
-from uwblite.drivers.events import Corrupt, RangeEpoch, RangeReading
+from uwblite.drivers.events import Corrupt, LaserScan, Lost, RangeEpoch, RangeReading
 
 CLEAN_ROUNDS, ROUNDS = 20, 300
 NUMBERED = ("makerfabs-at", "bu01", "bu03", "linktrack")
@@ -122,3 +124,24 @@ def test_a_series_that_begins_again_is_followed():
     series = Continuity(lambda before, after: abs(after - before) < 2)
     taken = [series.take(item, 1) for item in (1, 2, 50, 3, 80, 81, 82)]
     assert taken == [([], []), ([1, 2], []), ([], []), ([3], [50]), ([], []), ([80, 81], []), ([82], [])]
+
+
+def test_a_reading_that_was_late_passes_with_the_next_that_goes_on_from_both():
+    series = Continuity(lambda before, after: abs(after - before) < 2)
+    series.take(0, 0)
+    assert series.take(2.5, 1) == ([], [])
+    assert series.take(1.0, 1) == ([2.5, 1.0], [])
+
+
+@pytest.mark.parametrize("pause", [0.2, 0.3, 0.4, 0.6])
+@pytest.mark.parametrize("kind", ["pause", "stop"])
+def test_no_scan_is_lost_to_a_short_pause(kind, pause):
+    sent = []
+    clock = WorldClock()
+    clock.start(1000.0)
+    device = ScipDevice(RoomWorld().scans(), clock, on_scan=lambda t, values: sent.append(t))
+    actions, _ = simulate(open_device("lidar", "scip:port")[0], device, 8.0, **{kind: (5.0, pause)})
+    got = of_kind(actions, LaserScan)
+    assert len(got) == len([t for t in sent if got[0].stamp - 0.05 < t < got[-1].stamp + 0.05])
+    assert not of_kind(actions, Lost)
+    assert not of_kind(actions, Corrupt)

@@ -1,7 +1,5 @@
 """Calibration: names, priors and the tables that say which edge uses which unknown."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,17 +8,13 @@ from uwblite.graph.calibration import (
     block,
     indices,
     odometry_indices,
-    optimize_with_heights,
     prior_edges,
     range_indices,
     scan_indices,
     unknowns,
     with_free,
-    with_nonnegative_heights,
 )
 from uwblite.graph.graph import Calibration, Graph
-from uwblite.graph.range_edges import RangeEdges
-from uwblite.graph.solver import SolverConfig
 
 IDS = ("1E05", "5C0B", "91A3")
 GIVEN = np.array([False, True, False])
@@ -138,62 +132,6 @@ def test_no_anchors_no_range_table():
     calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
     assert all(key.anchor is None for key in calibration.keys)
     assert range_indices(calibration, np.zeros(0, dtype=np.intp), ()).shape == (0, 6)
-
-
-def test_heights_below_zero_are_fixed_there_and_nothing_else_changes():
-    calibration = block(unknowns(CalibrationConfig(), IDS, GIVEN))
-    low, high = calibration.index("height2", "1E05"), calibration.index("height2", "91A3")
-    bias = calibration.index("bias", "1E05")
-    values = np.zeros(len(calibration.values))
-    values[[low, high, bias]] = -0.3, 0.4, -0.2
-    before = np.arange(len(values)) == bias
-    graph = Graph(np.zeros((1, 3)), np.zeros((3, 2)), (), calibration, fixed_calibration=before)
-    graph = with_nonnegative_heights(graph.updated(graph.poses, graph.anchors, values))
-    values[low] = 0.0
-    np.testing.assert_array_equal(graph.calibration.values, values)
-    assert np.flatnonzero(graph.fixed_calibration).tolist() == sorted([low, bias])
-
-
-def ranges_shortened_near_the_anchors(rng):
-    """Return a graph of fixed poses around three anchors as high as the tag; near them ranges are too short."""
-    listed = [u for u in unknowns(CalibrationConfig(), IDS, np.zeros(3, dtype=bool)) if u.key.kind in ("bias", "height2")]
-    calibration, anchors = block(tuple(listed)), np.array([[1.0, 1.0], [6.0, 2.0], [3.0, 5.0]])
-    poses = np.column_stack([rng.uniform(-1.0, 8.0, (60, 2)), np.zeros(60)])
-    pose, anchor = np.repeat(np.arange(60), 3), np.tile(np.arange(3), 60)
-    way = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
-    measured = way - np.array([0.8, 0.5, 0.0])[anchor] / way + rng.normal(0.0, 0.05, len(way))
-    none, table = np.zeros(len(way)), range_indices(calibration, anchor, IDS)
-    plane = np.zeros((len(way), 2))
-    edges = RangeEdges(pose, anchor, measured, none + 0.05, plane, none, plane, np.zeros(2), none, table)
-    graph = Graph(poses, anchors + 0.3, (prior_edges(tuple(listed)), edges), calibration)
-    return replace(graph, fixed_poses=np.ones(60, dtype=bool), fixed_calibration=np.zeros(len(listed), dtype=bool))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_heights_put_back_to_zero_leave_everything_else_at_the_optimum(seed):
-    """The derivative of the cost along all that is free is 0, by differences; along heights at 0 the cost falls below only."""
-    graph = ranges_shortened_near_the_anchors(np.random.default_rng(seed))
-    graph, _ = optimize_with_heights(graph, SolverConfig(relative_decrease=1e-12))
-    heights = np.flatnonzero(graph.calibration.of_kinds("height2"))
-    assert graph.fixed_calibration[heights[:2]].all()
-    assert (graph.calibration.values[heights] >= 0.0).all()
-
-    def slope(x, value):
-        """Return the derivative of the cost along a value, and the value's standard deviation where all else is fixed."""
-        costs = []
-        for step in (-1e-4, 0.0, 1e-4):
-            x[value] += step
-            costs.append(graph.updated(graph.poses, anchors, calibration).chi2())
-            x[value] -= step
-        return (costs[2] - costs[0]) / 2e-4, 1.0 / np.sqrt(0.5 * (costs[2] - 2.0 * costs[1] + costs[0]) / 1e-8)
-
-    anchors, calibration = graph.anchors.copy(), graph.calibration.values.copy()
-    for value in np.ndindex(anchors.shape):
-        derivative, sigma = slope(anchors, value)
-        assert abs(derivative) * sigma < 1e-2
-    for value, fixed in enumerate(graph.fixed_calibration):
-        derivative, sigma = slope(calibration, value)
-        assert derivative > 0.0 if fixed else abs(derivative) * sigma < 1e-2
 
 
 def test_each_tag_has_its_place_and_each_anchor_its_error_from_it():

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from uwblite.errors import FormatError
-from uwblite.io.growing_file import HEAD_BYTES, TAIL_BYTES, GrowingFile
+from uwblite.io.log_parts import HEAD_BYTES, TAIL_BYTES, GrowingFile
 
 
 def test_what_is_added_is_read(tmp_path):

@@ -16,8 +16,8 @@ from uwblite import se2
 from uwblite.cli import main
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
+from uwblite.io.corrected_log import write_graph_with_scans
 from uwblite.io.g2o import read_g2o, write_g2o
-from uwblite.io.graph_scans import write_graph_with_scans
 from uwblite.io.pyfg import write_pyfg
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result

@@ -11,8 +11,7 @@ import pytest
 import uwblite
 from uwblite.errors import ConfigError
 from uwblite.io import folders
-from uwblite.io.folders import replacing_folder
-from uwblite.io.locks import sole_writer
+from uwblite.io.folders import replacing_folder, sole_writer
 
 
 def test_a_second_run_is_reported_at_once(tmp_path):
@@ -26,7 +25,7 @@ def test_a_second_run_is_reported_at_once(tmp_path):
 
 
 def test_a_killed_run_leaves_no_lock(tmp_path):
-    program = "import os, sys\nfrom uwblite.io.locks import sole_writer\nwith sole_writer(sys.argv[1]):\n    os._exit(9)"
+    program = "import os, sys\nfrom uwblite.io.folders import sole_writer\nwith sole_writer(sys.argv[1]):\n    os._exit(9)"
     environment = os.environ | {"PYTHONPATH": str(Path(uwblite.__file__).parents[1])}
     assert subprocess.run([sys.executable, "-c", program, tmp_path / "map"], env=environment, check=False).returncode == 9
     with sole_writer(tmp_path / "map"):

@@ -253,8 +253,7 @@ def test_the_header_of_a_picture_bounds_what_is_read(tmp_path):
     tracemalloc.stop()
 
 
-def test_a_text_picture_is_read_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("uwblite.io.map_server._TEXT_BYTES", 7)
+def test_a_text_picture_is_that_of_its_bytes(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (30, 20))
     text = b"P2\n# a comment\n20 30\n255\n" + "\n".join(" ".join(map(str, row)) for row in pixels.tolist()).encode()
     grid = read_map(mapped(tmp_path / "map", text))
@@ -296,24 +295,49 @@ def test_evo_draws_a_path_on_the_map(tmp_path):
 
 
 USUAL = "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+GREYS = np.array([[0, 254, 205, 255], [205, 0, 254, 128], [40, 230, 254, 0]], dtype=np.uint8)
+"""Besides the three usual greys those of cartographer: 128 is unknown, others are shades of a probability."""
+
+
+def binary(head, pixels):
+    return b"P5\n" + head + b"%d %d\n255\n" % pixels.shape[::-1] + pixels.tobytes()
+
+
+def text_of_gimp(pixels):
+    """One number a line, as GIMP exports a picture as ASCII."""
+    numbers = b"".join(b"%d\n" % v for v in pixels.ravel().tolist())
+    return b"P2\n# Created by GIMP version 2.10.34 PNM plug-in\n%d %d\n255\n" % pixels.shape[::-1] + numbers
+
+
+def transparent(pixels):
+    """What was unknown is made transparent; colours under it mean nothing."""
+    alpha = np.where(pixels == 205, 0, 255).astype(np.uint8)
+    shown = np.where(pixels == 205, 0, pixels)
+    return encode_png(np.stack([shown, shown, shown, alpha], axis=-1))
+
+
 WRITERS = {
-    "nav2": (b"# CREATOR: map_saver.cpp 0.050 m/pix\n", "mode: trinary\n" + USUAL.replace("0.196", "0.25")),
-    "slam_toolbox": (b"", "mode: trinary\n" + USUAL),
-    "cartographer": (b"# Cartographer map; 0.050000 m per pixel\n", USUAL),
-    "hector": (b"# CREATOR: Map_generator.cpp 0.050 m/pix\n", USUAL),
-    "GIMP": (b"# Created by GIMP version 2.10.34 PNM plug-in\n", USUAL),
+    "nav2": ("m.pgm", lambda g: binary(b"", g), "mode: trinary\n" + USUAL.replace("0.196", "0.25")),
+    "map_server": ("m.pgm", lambda g: binary(b"# CREATOR: map_saver.cpp 0.050 m/pix\n", g), USUAL + "\n"),
+    "slam_toolbox": ("m.pgm", lambda g: binary(b"", g), "mode: trinary\n" + USUAL.replace("0.196", "0.25")),
+    "cartographer": ("m.pgm", lambda g: binary(b"# Cartographer map; 0.050000 m/pixel\n", g), USUAL),
+    "hector": ("m.pgm", lambda g: binary(b"# CREATOR: Map_generator.cpp 0.050 m/pix\n", g), USUAL),
+    "GIMP": ("m.pgm", lambda g: binary(b"# Created by GIMP version 2.10.34 PNM plug-in\n", g), USUAL),
+    "GIMP, as text": ("m.pgm", text_of_gimp, USUAL),
+    "GIMP, with alpha": ("m.png", transparent, USUAL),
 }
-"""Beginning of the picture and end of the YAML file, in the form of each program."""
+"""Name and content of the picture, and end of the YAML file, in the form of each program."""
 
 
 @pytest.mark.parametrize("writer", WRITERS)
 @pytest.mark.parametrize("ends", ["\n", "\r\n"])
 def test_maps_of_each_program_have_their_three_states(tmp_path, writer, ends):
-    head, settings = WRITERS[writer]
-    (tmp_path / "m.pgm").write_bytes(b"P5\n" + head + b"4 3\n255\n" + PIXELS.astype(np.uint8).tobytes())
-    text = "image: m.pgm\nresolution: 0.050000\norigin: [-1.000000, -2.000000, 0.000000]\n" + settings
+    name, picture, settings = WRITERS[writer]
+    (tmp_path / name).write_bytes(picture(GREYS))
+    text = f"image: {name}\nresolution: 0.050000\norigin: [-1.000000, -2.000000, 0.000000]\n{settings}"
     (tmp_path / "m.yaml").write_bytes(text.replace("\n", ends).encode())
-    expected = np.full(PIXELS.shape, FREE)
-    expected[PIXELS == 0] = OCCUPIED
-    expected[(PIXELS == 205) | (PIXELS == 100)] = UNKNOWN
-    np.testing.assert_array_equal(read_map(tmp_path / "m.yaml").states(), expected[::-1])
+    occupied, unknown = GREYS < 0.35 * 255, (GREYS == 205) | (GREYS == 128)
+    expected = np.where(occupied, OCCUPIED, np.where(unknown, UNKNOWN, FREE))
+    grid = read_map(tmp_path / "m.yaml")
+    np.testing.assert_array_equal(grid.states(), expected[::-1])
+    np.testing.assert_allclose(grid.geometry.origin, [-1.0, -2.0])

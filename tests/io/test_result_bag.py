@@ -96,8 +96,8 @@ def test_another_recording_is_refused(mapped, tmp_path):
 
 
 def test_the_graph_carries_the_scan_of_each_keyframe(mapped, tmp_path):
+    from uwblite.io.corrected_log import write_graph_with_scans
     from uwblite.io.g2o import read_g2o
-    from uwblite.io.graph_scans import write_graph_with_scans
 
     result, log = mapped
     count = write_graph_with_scans(tmp_path / "x.g2o", result, [log])

@@ -14,8 +14,7 @@ from conftest import ROOT
 from helpers.bags import odometry, stamped, write_bag_of
 
 from uwblite.io.rosbag import read_bag
-from uwblite.io.uwb_mapping import fitting, parse_mappings, short_type
-from uwblite.io.uwb_messages import KNOWN
+from uwblite.io.uwb_mapping import KNOWN, fitting, parse_mappings, short_type
 
 pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
 

@@ -14,13 +14,14 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.scan_matching import pair_points
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import scan_clouds
-from uwblite.pipeline.anchor_places import broken_steps, range_evidence
+from uwblite.pipeline.broken_steps import broken_steps
 from uwblite.pipeline.broken_stretches import _registration, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
+from uwblite.pipeline.radio_tracks import range_evidence
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog
@@ -73,7 +74,7 @@ def torn(estimate, task, by):
         one, one + 1, se2.between(poses[one], poses[one + 1]), np.diag([100.0, 100.0, 300.0])[None], none, none,
         scan_indices(estimate.graph.calibration), kernel=joint.kernel,
     )  # fmt: skip
-    joint = replace(joint, by_surface=None).followed_by(step)
+    joint = joint.followed_by(step)
     graph = replace(estimate.graph, poses=poses)
     return with_range_noise(replace(estimate, graph=graph, joint=joint), task.config)
 

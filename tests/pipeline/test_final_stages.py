@@ -99,8 +99,7 @@ def test_correlated_range_errors_count_for_all_or_for_anchors_at_given_poses_whe
     ranges = graph.edges[2]
     estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
     none = SimpleNamespace(have_scans=False)
-    found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config, recordings=none))
-    assert found is estimate
+    covariance = final_stages.covariances_of(estimate, SimpleNamespace(config=config, recordings=none))
     found = [(a[0].covariances is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all]
     assert found == [(True, True, True)] * (not lidar)
     assert [(a[1] is ranges, a[3] is config.ranges) for a in of_anchors] == [(True, True)] * lidar

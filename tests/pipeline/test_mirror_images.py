@@ -160,7 +160,8 @@ def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best
     found = Bootstrap(
         np.array([True, True, False, True]), np.array([False, True, False, True]), ((), (second, second), (), (second,))
     )
-    images = _images(Estimate(graph, ranges, found, found.placed), ranges)
+    images, straight = _images(Estimate(graph, ranges, found, found.placed), ranges)
+    assert straight.tolist() == [True, True, False, True]
     np.testing.assert_array_equal(images[[1, 2]], [[7.0, 7.0], places[2]])
     for k in (0, 3):
         own = tags[(anchor == k) & alive]
@@ -189,4 +190,4 @@ def test_costs_are_those_of_the_ranges_and_of_the_priors_of_bias_and_height():
         squared[2:5].sum() + of_priors[[1, 2]].sum(),
         squared[5] + of_priors[1],
     ]
-    np.testing.assert_allclose(_costs(graph, ranges, worth), expected)
+    np.testing.assert_allclose(_costs(graph, replace(ranges, weights=worth)), expected)

@@ -15,6 +15,7 @@ from uwblite.arrays import spread
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
+from uwblite.pipeline import estimate as estimate_module
 from uwblite.pipeline import radio_stages
 from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.lidar_stages import refine_jointly
@@ -31,8 +32,9 @@ def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(mo
     estimate = Estimate(graph, graph.edges[0], None, ())
     assert select_range_priors(estimate, None) is estimate
     monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config, steady: made.append(f"noise {steady}") or e)
-    solving = SimpleNamespace(optimize=lambda problem, solver: made.append(f"solve {solver.max_iterations}") or (graph, None))
-    monkeypatch.setattr(radio_stages, "Optimizer", lambda: solving)
+    monkeypatch.setattr(
+        estimate_module, "solve", lambda g, solver, by: made.append(f"solve {solver.max_iterations}") or (g, None)
+    )
     monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *rest: made.append("priors") or graph)
     gone = iter([False, True])
     monkeypatch.setattr(radio_stages, "_let_go", lambda held, weak: next(gone))
@@ -106,7 +108,7 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
     bootstrap = SimpleNamespace(placed=np.array([True, False, True]))
     estimate = Estimate(graph, graph.edges[0], graph.edges[2], ("A", "B", "C"), bootstrap)
     monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config: made.append("noise") or e)
-    monkeypatch.setattr(radio_stages, "optimize_with_heights", lambda *given: made.append("solve") or (graph, "result"))
+    monkeypatch.setattr(estimate_module, "solve", lambda *given: made.append("solve") or (graph, "result"))
     monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *given: made.append("priors") or graph)
     monkeypatch.setattr(radio_stages, "with_free", lambda graph, *kinds: made.append("free") or graph)
     monkeypatch.setattr(radio_stages, "solver_figures", lambda result: {"chi2": 1.0})
@@ -121,7 +123,7 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
     made.clear()
     # Without a lidar, once more where another optimum was better.
     seen.have_scans = False
-    monkeypatch.setattr(radio_stages.other_minima, "at_best", lambda e, task: made.append("other") or replace(e))
+    monkeypatch.setattr(radio_stages.line_sides, "with_likeliest_side", lambda e, task: made.append("other") or replace(e))
     radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
     assert made[-7:-1] == [(name, 3, 3), "other", "noise", "priors", "free", "solve"]
     # Recordings that were joined have been optimised alone; what a lidar refines is not done again.

@@ -19,7 +19,6 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
-from uwblite.pipeline.surface_search import FoundSurfaces
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +128,7 @@ def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, m
     """What stands before is a rough one."""
     before = around["before"]
     measured = around["after"].surfaces
-    nothing = FoundSurfaces(replace(measured, rays=measured.rays.rows(slice(0))), None, None, measured.rays.rows(slice(0)))
+    nothing = replace(measured, rays=measured.rays.rows(slice(0)))
     monkeypatch.setattr(surface_adjustment, "find_surfaces", lambda *_: nothing)
     found = adjust_surfaces(before, around["task"])
     assert found.surfaces is None
@@ -137,10 +136,10 @@ def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, m
 
 
 def test_where_all_surfaces_turn_out_to_be_none_pairs_are_left_alone(around, monkeypatch):
-    def nothing(first, measured, *_):
-        return replace(measured, rays=measured.rays.rows(slice(0))).shown(), first.kind
+    def nothing(measured, *_):
+        return replace(measured, rays=measured.rays.rows(slice(0))).shown()
 
-    monkeypatch.setattr(FoundSurfaces, "revised", nothing)
+    monkeypatch.setattr(surface_adjustment, "with_round_columns", nothing)
     found = adjust_surfaces(around["before"], around["task"])
     assert found.surfaces is None
     np.testing.assert_array_equal(found.joint.T_i_j, around["before"].joint.T_i_j)

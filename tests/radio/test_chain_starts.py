@@ -14,7 +14,7 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.distance_edges import PointDistanceEdges
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
-from uwblite.io.graph_chains import chained_poses
+from uwblite.io.graph_file import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
 from uwblite.radio import chain_starts
 from uwblite.radio.chain_starts import _BEND, _converged, _places, place_chains

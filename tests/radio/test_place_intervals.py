@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from uwblite.radio.place_intervals import Track, _best_run, _times, explain, intervals_of
+from uwblite.radio.place_evidence import PlaceModel, Track, intervals_of
+from uwblite.radio.place_intervals import _best_run, _times, explain
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 
@@ -24,7 +25,7 @@ def measured(seed, before, after=None, moment=100, share=0.1):
 
 def explained(path, ranges, recording=None, heights=(0.0,)):
     recording = np.zeros(len(ranges), dtype=np.int64) if recording is None else recording
-    return explain(Track(path, ranges, recording, SIGMA, heights), TrilaterationConfig(), RangeNoiseConfig())
+    return explain(PlaceModel(Track(path, ranges, recording, SIGMA, heights), TrilaterationConfig(), RangeNoiseConfig()))
 
 
 def changes(found):

@@ -28,14 +28,13 @@ from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
-from uwblite.io.relations_file import read_relations
 from uwblite.io.settings_toml import to_toml
-from uwblite.io.tum import read_tum
+from uwblite.io.tum import read_relations, read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
 from uwblite.server.live import watch_status
 
-from .small_files import ANCHORS, CORRECTED, G2O, ISAM, KNOWN, LIBRSF, LOG, MAPPING, PYFG, RELATIONS, TABLE, TORO, TUM
+from .small_files import ANCHORS, CORRECTED, G2O, ISAM, KNOWN, LIBRSF, LOG, MAPPING, OTHERS, PYFG, RELATIONS, TABLE, TORO, TUM
 from .wires_and_pages import DEVICE_OPTIONS, RESULT, ask, listen, open_named, result_of, show, wire
 
 Read = Callable[[Path], object]
@@ -96,6 +95,11 @@ def _map_folder(folder: Path) -> None:
     text = (folder / "map.yaml").read_text()
     (folder / "map_raw.yaml").write_text(text.replace("trinary", "raw").replace("free_thresh: 0.196", "free_thresh: 0.25"))
     (folder / "map_turned.yaml").write_text(text.replace(", 0]", ", 0.6]").replace("free_thresh: 0.196", "free_thresh: 0.25"))
+    rows, cols = _grid().log_odds.shape
+    pixels = (folder / "map.pgm").read_bytes()[-rows * cols :]
+    grey = (b"%d%s" % (v, b" " if k % 20 else b"\n") for k, v in enumerate(pixels))
+    (folder / "map_text.pgm").write_bytes(b"P2\n# drawn\n%d %d\n255\n" % (cols, rows) + b"".join(grey))
+    (folder / "map_text.yaml").write_text(text.replace("map.pgm", "map_text.pgm"))
     for yaml in folder.glob("*.yaml"):
         yaml.write_text("# a map\n" + yaml.read_text() + "# width: 60, height: 40, drawn on Monday\n" * 8)
     (folder / "anchors.csv").write_bytes(ANCHORS)
@@ -259,6 +263,8 @@ def cases() -> dict[str, Case]:
         "log tail": _file("x.log", _log(20), _followed),
         "librsf": _file("x.txt", LIBRSF, read_librsf),
         "corrected log": _file("x.log", CORRECTED, read_log),
+        "graph with scans": _file("x.g2o", G2O + LOG[LOG.index(b"ROBOTLASER1") :], lambda path: read_recording(str(path))),
+        "other programs": _file("x.log", OTHERS + LOG, lambda path: read_recording(str(path))),
         "told by content": _file("x.txt", LIBRSF + CORRECTED[:900] + ISAM + TORO, _told),
     }
     for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
@@ -269,7 +275,7 @@ def cases() -> dict[str, Case]:
     for name in RESULT:
         found[f"page of {name}"] = Case(name, show, result_of(_log()), 10)
     found["requests"] = Case("requests", ask, result_of(_log()), 20)
-    for name in ("map.yaml", "map.pgm", "map_scale.yaml", "map_scale.png"):
+    for name in ("map.yaml", "map.pgm", "map_text.pgm", "map_scale.yaml", "map_scale.png"):
         found[name] = Case(name, lambda path: read_map(path.with_suffix(".yaml")), _map_folder)
     for name in ("map_raw.yaml", "map_turned.yaml"):
         found[name] = Case(name, read_map, _map_folder)
@@ -285,13 +291,31 @@ def cases() -> dict[str, Case]:
         ),
         "convert": _verb("x.log", log, "convert", "{}/x.log", "{}/out.log", "-q", "--force", cost=5),
         "localize": _verb(
-            "x.log", _log(80), "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared,
-            cost=100, prepare=_map_folder,
+            "x.log",
+            _log(80),
+            "localize",
+            "{}/x.log",
+            "--map",
+            "{}",
+            "--out",
+            "{}/out.tum",
+            *shared,
+            cost=100,
+            prepare=_map_folder,
         ),
         **{
             f"localize in {name}": _verb(
-                name, b"", "localize", "{}/long.log", "--map", "{}", "--out", "{}/out.tum", *shared,
-                cost=100, prepare=_map_and_log,
+                name,
+                b"",
+                "localize",
+                "{}/long.log",
+                "--map",
+                "{}",
+                "--out",
+                "{}/out.tum",
+                *shared,
+                cost=100,
+                prepare=_map_and_log,
             )
             for name in ("map.yaml", "map.pgm", "anchors.csv")
         },
@@ -300,12 +324,36 @@ def cases() -> dict[str, Case]:
             "report.json", b"", "convert", "{}", "{}/out.tum", "--to", "tum", *shared, cost=20, prepare=result_of(log)
         ),
         "settings of map": _verb(
-            "x.toml", to_toml(MappingConfig()).encode()[:2500].rpartition(b"\n")[0],
-            "map", "{}/good.log", "--out", "{}/out", "--config", "{}/x.toml", *shared, cost=100,
+            "x.toml",
+            to_toml(MappingConfig()).encode()[:2500].rpartition(b"\n")[0],
+            "map",
+            "{}/good.log",
+            "--out",
+            "{}/out",
+            "--config",
+            "{}/x.toml",
+            *shared,
+            cost=100,
         ),
         "plan": _verb(
-            "map.pgm", b"", "plan", "--map", "{}/map.yaml", "--from", "0,-0.88", "--to", "1,-0.88", "--radius", "0",
-            "--unknown", "price", "--out", "{}/out", *shared, cost=20, prepare=_map_folder,
+            "map.pgm",
+            b"",
+            "plan",
+            "--map",
+            "{}/map.yaml",
+            "--from",
+            "0,-0.88",
+            "--to",
+            "1,-0.88",
+            "--radius",
+            "0",
+            "--unknown",
+            "price",
+            "--out",
+            "{}/out",
+            *shared,
+            cost=20,
+            prepare=_map_folder,
         ),
         "optimize g2o": _verb("x.g2o", G2O, "optimize", "{}/x.g2o", "--out", "{}/out.pyfg", *shared, cost=10),
         "optimize toro": _verb("x.graph", TORO, "optimize", "{}/x.graph", "--out", "{}/out.g2o", *shared, cost=10),

@@ -48,14 +48,14 @@ distance = 3.0
 stamps = [1, 2]
 recordings = [1, 2]
 """
-MAPPING = b'''[[uwb]]
+MAPPING = b"""[[uwb]]
 topic = "/r/*"
 readings = "ranges"
 anchor = "id"
 unit = 0.001
 anchor_format = "{:04X}"
 only = { tag = 3 }
-'''
+"""
 TABLE = b'name,x,y,radius,neighbours\nC1,2.1,1.7,0.15,"C2 C3"\n# remark\nC2,4.9,2.4,0.2,\n'
 ANCHORS = b"id,x,y,sigma_x,sigma_y,status\n5C0B,3,4,0.1,0.1,ok\n91A3,3,6,,,ok\n0D27,6,-3,0.1,0.1,ok\n"
 RELATIONS = b"# stamp1 stamp2 x y z roll pitch yaw\n1 2 1 0 0 0 0 0.1\n1.5 3 1.5 0.1 0 0 0 0\n"
@@ -65,8 +65,13 @@ LIBRSF = b"".join(
 )
 CORRECTED = b"".join(
     b"ODOM %.2f 0 0 0 0 0 1.01893e+09 h 1.01893e+09\nFLASER 3 1 2 3 %.2f 0 0 %.2f 0 0 %s h 0\n"
-    b"ODOM %.2f 0 0 0 0 0 -5.77 h -5.77\n"
-    % (0.3 * k - 0.1, 0.3 * k, 0.3 * k, b"%.1f" % k if k % 5 else b"0", 0.3 * k)
+    b"ODOM %.2f 0 0 0 0 0 -5.77 h -5.77\n" % (0.3 * k - 0.1, 0.3 * k, 0.3 * k, b"%.1f" % k if k % 5 else b"0", 0.3 * k)
     for k in range(30)
 )
 ISAM = b"ODOMETRY 0 1 1 0 0 3 0 0 3 0 5\nLANDMARK 1 100 1 0.5 4 0 4\n"
+OTHERS = b"""## Player version 2.1.0
+LaserOdometryLog
+@SENS 21-12-97 12:34:56.123456
+LASER_READING 2 1.00 1.00 0 0 0 1.2e9
+LASER-RANGE 9 1 0 2 180.0: 12.0 13.0
+"""

@@ -171,8 +171,7 @@ _REQUESTS = b"".join(
         b"GET /0/..%2f..%2fetc/passwd HTTP/1.1\r\n" + _HEAD + b"\r\n",
         b"POST /closure HTTP/1.1\r\n" + _HEAD + b"X-Token: TOKEN\r\nContent-Type: application/json\r\n",
         b"Content-Length: %d\r\n\r\n" % len(_JSON) + _JSON,
-        b"POST /map HTTP/1.1\r\n" + _HEAD + b"Transfer-Encoding: chunked\r\n\r\n5\r\n{\"a\":\r\n0\r\n\r\n",
+        b"POST /map HTTP/1.1\r\n" + _HEAD + b'Transfer-Encoding: chunked\r\n\r\n5\r\n{"a":\r\n0\r\n\r\n',
         b"GET /state HTTP/1.1\r\n" + _HEAD + b"Connection: close\r\n\r\n",
     ]
 )
-

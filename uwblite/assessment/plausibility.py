@@ -14,7 +14,7 @@ from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.other_minima import check_other_minimum
+from ..pipeline.line_sides import check_other_side
 from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
@@ -70,7 +70,7 @@ def judge(
         lambda: check_drifts(estimate, task),
         lambda: check_untied_parts(estimate, task),
         lambda: check_untied_recordings(estimate, task),
-        lambda: check_other_minimum(estimate, task),
+        lambda: check_other_side(estimate, task),
         lambda: check_handedness(estimate, task),
         lambda: check_turn_scales(estimate, task),
         lambda: check_fit(task),

@@ -55,8 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from pathlib import Path
 
-    from ..io.folders import refuse_foreign, unmarked
-    from ..io.locks import sole_writer
+    from ..io.folders import refuse_foreign, sole_writer, unmarked
     from ..report.batch import table_csv
     from . import console
     from .options import name_recordings_once
@@ -180,7 +179,7 @@ def map_one(task: argparse.Namespace) -> Outcome:
     import time
     import warnings
 
-    from ..io.locks import sole_writer
+    from ..io.folders import sole_writer
     from ..io.results import check_target
     from . import failure
     from .making import make, read_logs

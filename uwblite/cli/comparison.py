@@ -15,10 +15,9 @@ from ..evaluation.relations import Relations, evaluate_relations
 from ..evaluation.trajectory import AnchorErrors, TrajectoryErrors, evaluate_anchors, evaluate_trajectory
 from ..io.csv_table import read_csv
 from ..io.map_server import read_map
-from ..io.relations_file import read_relations
 from ..io.results import repair_result
 from ..io.stored_result import read_result
-from ..io.tum import read_tum
+from ..io.tum import read_relations, read_tum
 from ..lidar.columns import Landmarks, find_columns
 from . import error_lines
 

@@ -127,7 +127,7 @@ def _convert_graph(args: argparse.Namespace) -> int:
 
 
 def _convert_map(args: argparse.Namespace, to: str) -> int:
-    from ..io.graph_scans import write_graph_with_scans
+    from ..io.corrected_log import write_graph_with_scans
     from ..io.result_bag import write_result_bag
     from ..io.stored_result import read_result
     from . import console

@@ -86,25 +86,32 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     if kind in _OTHERS:
         raise FormatError(_OTHERS[kind], path)
     from ..io.carmen import read_log
+    from ..io.contents import format_of_content
 
     try:
         return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
     except FormatError as error:
-        if kind in ("g2o", "pyfg"):
-            what = "is a pose graph without scans (ROBOTLASER1), no recording: uwblite optimize takes it"
-            raise FormatError(what, path) from error
-        raise
+        content = format_of_content(path)
+        what = _GRAPH_ALONE if kind in ("g2o", "pyfg") else _OTHERS.get(content, "")
+        raise FormatError(what, path) if what else error from None
 
 
+_GRAPH_ALONE = "is a pose graph without scans (ROBOTLASER1), no recording: pose graphs are for uwblite optimize"
+_TABLES = (
+    "a folder of tables is read, with odometry.csv (stamp,x,y,theta; m, rad; poses, not steps), scans.csv and ranges.csv"
+    " (docs/formats.md)"
+)
 _OTHERS = {
     "isam": "is a pose graph of iSAM, no recording: uwblite optimize says how to write it",
     "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ --to csv), to which"
     " ranges.csv (stamp,anchor,range,quality) and scans.csv may be added; uwblite evaluate compares with it",
     "kitti": "is a trajectory without times, no recording",
-    "rawlog": "is a binary rawlog of MRPT, which is not read: rawlog-edit exports odometry and scans as text, of which a folder"
-    " of tables can be made (docs/formats.md: odometry.csv, scans.csv, ranges.csv)",
-    "numbers": "is a table of numbers without names, as MRPT exports its rawlogs: a folder of tables is read, with odometry.csv"
-    " (stamp,x,y,theta; poses, not steps), scans.csv and ranges.csv (docs/formats.md)",
+    "rawlog": f"is a binary rawlog of MRPT, which is not read: rawlog-edit exports odometry and scans as text; {_TABLES}",
+    "numbers": f"is a table of numbers without names, as MRPT exports its rawlogs: {_TABLES}",
+    "player": f"is a log of Player (writelog), no CARMEN log: its position2d and laser lines hold what is needed; {_TABLES}",
+    "gfs": "is a trace of GMapping (.gfs), no CARMEN log: take the log that GMapping was given, or what gfs2log makes of it",
+    "rhino": f"is a log of RHINO or Beesoft, in centimetres and degrees, no CARMEN log; {_TABLES}",
+    "aria": f"is a laser log of ARIA (.2d), in millimetres and degrees, no CARMEN log; {_TABLES}",
 }
 """What is no recording, and the verb that takes it."""
 

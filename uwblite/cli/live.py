@@ -222,11 +222,11 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
     """Yield what a log holds and what is added to it, and nothing where nothing is."""
     import time
 
-    from ..io.growing_file import GrowingFile
+    from ..io.log_parts import GrowingFile
 
     file = GrowingFile(path)
     if file.skipped:
-        console.note(f"uwblite: {file.skipped / 1e6:.0f} MB of {path} lie further back and are not read")
+        console.note(f"uwblite: {file.skipped / 1e6:.1f} MB of {path} lie further back and are not read")
     quiet = 0.0
     try:
         while not stopping():

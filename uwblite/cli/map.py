@@ -90,7 +90,7 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..io.locks import sole_writer
+    from ..io.folders import sole_writer
     from ..io.results import check_target
     from .options import name_recordings_once
 

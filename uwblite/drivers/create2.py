@@ -14,7 +14,7 @@ import math
 import struct
 from dataclasses import dataclass
 
-from .clock_map import rhythm_map
+from ..clocks.clock_map import rhythm_map
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
 from .odometer import BaseDriver, WheelOdometer, way_of

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 from urllib.parse import parse_qsl, urlencode
 
+from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
-from .clock import DeviceClock
 from .create2 import Create2Driver
 from .device_options import BAUD, Options, Setup
 from .dwm1001_driver import Dwm1001Driver

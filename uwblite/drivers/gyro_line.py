@@ -2,8 +2,8 @@
 
 import math
 
+from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
-from .clock import DeviceClock
 from .events import Action, Corrupt, GyroHeading
 from .odometry_line import LEAP_TURN, LEAST_STEP, LineFormat, values_by
 from .text_lines import Line, LineDriver, LineProtocol

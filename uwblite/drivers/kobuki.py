@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 
-from .clock import BACKWARD, DeviceClock
+from ..clocks.device_clock import BACKWARD, DeviceClock
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
 from .framing import HeadedFrames

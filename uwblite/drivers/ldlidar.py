@@ -12,7 +12,7 @@ Sources: LD19 development manual 2.3 (its example packet is a test); the maker's
 import math
 import struct
 
-from .clock import DeviceClock
+from ..clocks.device_clock import DeviceClock
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt
 from .framing import FixedPackets

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
-from .clock import DeviceClock
 from .events import Action, Corrupt, Note, OdometryPose, Pose
 from .odometer import WheelOdometer, wrapped
 from .text_lines import Line, LineDriver, LineProtocol, columns_of, number_of

@@ -9,7 +9,7 @@ request and reply.
 import math
 from typing import Any
 
-from .clock import Reading
+from ..clocks.device_clock import Reading
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt, LaserScan, Lost, Note, Reopen, Send, SetBaud
 from .scip import TIME_MODULUS, Distances, Reply

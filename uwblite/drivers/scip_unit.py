@@ -7,8 +7,8 @@ others can hang it until its power is cycled.
 
 from typing import Any
 
+from ..clocks.device_clock import DeviceClock
 from ..errors import ProtocolError
-from .clock import DeviceClock
 from .events import Note, Param, Reopen, Send, SetBaud
 from .scip import TIME_MODULUS, WITH_LINES, Reply, ScipProtocol
 from .scip_codes import status_meaning

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from .clock import DeviceClock
-from .clock_map import rhythm_map
+from ..clocks.clock_map import rhythm_map
+from ..clocks.device_clock import DeviceClock
 from .events import Action, LaserScan, Lost, Reopen, SetDtr
 from .framing import FrameReader
 from .session import Driver, Identity, Script, Wait

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .clock import DeviceClock
+from ..clocks.device_clock import DeviceClock
 from .continuity import WITNESSES, Continuity, LinkHealth
 from .events import Action, Corrupt, Lost, corrupt
 from .line_reader import LineReader

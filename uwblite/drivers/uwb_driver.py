@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from .clock import DeviceClock
+from ..clocks.device_clock import DeviceClock
 from .continuity import RangeGuard
 from .events import Action, Corrupt, Lost, Note, RangeEpoch
 from .session import ByteProtocol, Identity

@@ -6,9 +6,6 @@ import numpy as np
 
 from ..arrays import Bools, Ints
 from .graph import Calibration, Graph, PriorEdges, UnknownKey
-from .optimizer import Optimizer
-from .solver import SolverConfig, SolverSummary
-from .unknowns import free_unknowns
 
 ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
 """Kinds of unknowns of the odometry."""
@@ -186,32 +183,3 @@ def scan_indices(calibration: Calibration) -> Ints:
 def with_free(graph: Graph, *kinds: str) -> Graph:
     """Return the graph with the calibration unknowns of these kinds set free."""
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))
-
-
-def optimize_with_heights(
-    graph: Graph, config: SolverConfig, optimizer: Optimizer | None = None
-) -> tuple[Graph, SolverSummary]:
-    """Return the graph at its optimum without a squared height below 0, and how the last search went; see solver.optimize.
-
-    Heights that come out negative are fixed at 0, and all other unknowns are solved again.
-
-    Parameters
-    ----------
-    optimizer : of graphs like this one.
-    """
-    optimizer = optimizer or Optimizer()
-    while True:
-        solved, summary = optimizer.optimize(graph, config)
-        graph = with_nonnegative_heights(solved)
-        anything_free = any(free.any() for free in free_unknowns(graph).values())
-        if not anything_free or np.array_equal(graph.calibration.values, solved.calibration.values):
-            return graph, summary
-
-
-def with_nonnegative_heights(graph: Graph) -> Graph:
-    """Return the graph with negative squared heights set to 0 and fixed."""
-    values = graph.calibration.values.copy()
-    below = graph.calibration.of_kinds(HEIGHT) & (values < 0.0)
-    values[below] = 0.0
-    graph = graph.updated(graph.poses, graph.anchors, values)
-    return replace(graph, fixed_calibration=graph.fixed_calibration | below)

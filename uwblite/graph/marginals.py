@@ -1,6 +1,6 @@
 """Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
@@ -18,13 +18,9 @@ from .eliminated import Blocks, WithBlocks
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
-from .unknowns import Unknowns, moved
+from .unknowns import Unknowns
 from .variance_components import variances_of_kinds
 
-_COMMON_AT_ONCE = 32
-"""Common errors that are solved for together; bounds the memory."""
-_MOST_KEPT = 1 << 23
-"""Most numbers of their solution that are kept; a larger solution is computed again when needed."""
 _MET_AT_ONCE = 1 << 14
 """Rows of a table of common errors in memory at once."""
 _AT_ONCE = 300
@@ -51,91 +47,43 @@ class CommonErrors:
 class Marginals:
     """The inverse of a graph's normal equations, and the covariances of its unknowns given all its measurements.
 
-    `solve`, `columns` and `relative` use the inverse alone, `covariances` contains the part of common errors. An undetermined
-    direction (a mirror image, a floating part of the graph) has a variance of about 1e12 in units of its curvature.
+    An undetermined direction (a mirror image, a floating part of the graph) has a variance of about 1e12 in units of its
+    curvature.
     """
 
     def __init__(
-        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = (),
-        further: Blocks | None = None,
+        self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None
     ) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal, further)
-        self._unseen, self._common = np.append(normal.diagonal <= 0, False), common
+        self._unseen = np.append(normal.diagonal <= 0, False)
         self._among = np.asarray(among, dtype=np.intp)
 
-    @property
-    def covariances(self) -> Covariances:
-        """Covariances of single unknowns, and among the chosen poses, including common errors."""
-        return self._described[0]
-
     @cached_property
-    def _described(self) -> tuple[Covariances, Floats]:
-        """The same, and the effect of the estimated common errors on the unknowns (size,)."""
-        blocks, correction = self._block_diagonal(), np.zeros(self.unknowns.size)
+    def covariances(self) -> Covariances:
+        """Covariances of single unknowns, and among the chosen poses."""
+        blocks = self._block_diagonal()
         chosen = self.unknowns.number["poses"][self._among].ravel()
         parts = [chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(chosen), 1), _COLUMNS_AT_ONCE)]
         among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
-        for errors in self._common:
-            self._add_common(errors, blocks, among, chosen, correction)
-        sigmas = np.sqrt(blocks["calibration"][:, 0, 0])
-        return Covariances(blocks["poses"], blocks["anchors"], sigmas, self._among, among), correction
-
-    def corrected(self) -> Graph:
-        """Return the optimised graph at the optimum with its common errors estimated together with all other unknowns.
-
-        To first order, which is enough for errors of a centimetre; common errors change no other weight. (Best linear
-        unbiased prediction: C. R. Henderson, Biometrics 31, 1975.)
-        """
-        return moved(self._graph, self.unknowns, self._described[1])
+        return Covariances(
+            blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among
+        )
 
     def estimated(self, common: CommonErrors) -> Floats:
-        """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns."""
-        return self._estimated(common)[1]
-
-    def _add_common(
-        self, common: CommonErrors, blocks: dict[str, Floats], among: Floats, chosen: Ints, correction: Floats
-    ) -> None:
-        """Add the effect of estimated common errors u: H^-1 J^T W S times u to the correction, times their covariance to the
-        block diagonal and to the covariance among chosen scalars."""
-        times, errors, covariance = self._estimated(common)
-        correction -= times(errors)
-        root = np.asarray(np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance))), dtype=np.float64)
-        for first in range(0, len(root), _COMMON_AT_ONCE):
-            moves = times(root[:, first : first + _COMMON_AT_ONCE])
-            moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
-            for name, number in self.unknowns.number.items():
-                own = moves[number]
-                blocks[name] += own @ own.transpose(0, 2, 1)
-            among += moves[chosen] @ moves[chosen].T
-
-    def _estimated(self, common: CommonErrors) -> tuple[Callable[[Floats], Floats], Floats, Floats]:
-        """Estimate errors that edges have in common: return H^-1 J^T W S as what multiplies by it, values (k,) and covariance
-        (k, k).
+        """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
 
         The errors u are unknowns with the prior N(0, G); the variance of each kind is learnt from the residuals, see
-        variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r.
+        variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r (best linear unbiased prediction:
+        C. R. Henderson, Biometrics 31, 1975).
         """
         slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
-        few = slopes.shape[0] * slopes.shape[1] <= _MOST_KEPT
-        kept = np.zeros(slopes.shape if few else (0, 0))
-        for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
-            some = slice(first, first + _COMMON_AT_ONCE)
-            moves = self._factor.solve(slopes[:, some].toarray())
-            seen[some] -= moves.T @ self._gradient
-            products[:, some] -= slopes.T @ moves
-            if few:
-                kept[:, some] = moves
-        variances = variances_of_kinds(seen, products, kind)[kind]
+        moves = self._factor.solve(slopes.toarray())
+        seen, products = seen - moves.T @ self._gradient, products - slopes.T @ moves
         # With products of roots of G: a variance near 0 has no inverse.
-        root = np.sqrt(variances)
-        inside = np.linalg.inv(root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root)))
-        covariance = root[:, None] * inside * root
-
-        def times(values: Floats) -> Floats:
-            return kept @ values if few else np.asarray(self._factor.solve(slopes @ values))
-
-        return times, -covariance @ seen, covariance
+        root = np.sqrt(variances_of_kinds(seen, products, kind)[kind])
+        inside = root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root))
+        return np.asarray(-root * np.linalg.solve(inside, root * seen))
 
     def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
         """Return S^T W r (k,) and S^T W S (k, k)."""
@@ -257,19 +205,16 @@ def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) ->
 
 
 def marginals(
-    graph: Graph, common: Sequence[CommonErrors] = (), among: ArrayLike = (),
-    further: Callable[[Unknowns], Blocks] | None = None,
+    graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None
 ) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
-
-    Those of single unknowns, and of the poses `among`, contain common errors.
 
     Parameters
     ----------
     further : gives measurements beside the graph's edges by the numbers of its unknowns, see graph/eliminated.py.
     """
     normal = filled(graph, subtrees=True)
-    return Marginals(graph, normal, common, among, None if further is None else further(normal.unknowns))
+    return Marginals(graph, normal, among, None if further is None else further(normal.unknowns))
 
 
 _COLUMNS_AT_ONCE = 16

@@ -218,7 +218,7 @@ class ScanEdges(EdgeTable):
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
     ROWS: ClassVar[Mapping[str, Shape]] = {
-        "T_i_j": (3,), "sqrt_information": (3, 3), "twist_i": (3,), "twist_j": (3,), "calibration": (4,), "by_surface": (4, 3),
+        "T_i_j": (3,), "sqrt_information": (3, 3), "twist_i": (3,), "twist_j": (3,), "calibration": (4,),
     }  # fmt: skip
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
@@ -238,9 +238,6 @@ class ScanEdges(EdgeTable):
     """Delay with which the clouds were made, s."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-    by_surface: Floats | None = None
-    """(e, 4, 3) change of e by an error of the ranges to surfaces that face each quarter of the map, m/m and rad/m; None = not
-    known. Counts where common errors are estimated, not in the residuals (lidar/surface_errors.py)."""
 
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""

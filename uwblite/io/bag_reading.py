@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FormatError, UwbliteError
-from .bag_mending import MCAP, ROS1, SQLITE, BagPath, mended
+from .bag_records import MCAP, ROS1, SQLITE, UnclosedBag
 from .bag_topics import BagTopic
 from .optional_packages import missing_package
 
@@ -231,22 +231,24 @@ def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
     if not (kind := _kind(path)):
         raise _no_bag(path)
     reader: Any = Reader1 if kind == ".bag" else Reader2
-    # Messages in a database need its own file, whatever it is called.
-    named: Any = path if path.suffix == kind else BagPath(path, kind)
+    named = _NamedPath(path)
+    named.suffix = kind
     if (log := path.with_name(path.name + "-wal")).exists() and log.stat().st_size:
         notes.append(f"the recording was not closed: {log.name} holds its end (sqlite3 {path.name} 'PRAGMA wal_checkpoint')")
     try:
         return stack.enter_context(reader(named))
     except Exception as error:
-        whole = mended(path)
-        if whole is None:
+        unclosed = None if kind == ".db3" else UnclosedBag(named)
+        if unclosed is None or not unclosed.message_count:
             raise _not_closed(path, kind, error) from None
-    try:
-        opened = stack.enter_context(reader(whole))
-    except Exception as error:
-        raise _not_closed(path, kind, error) from None
     notes.append(f"{path.name}: the recording was not closed (recorder killed, or power lost; {_repair(path, kind)} mends it)")
-    return opened
+    return unclosed
+
+
+class _NamedPath(type(Path())):  # type: ignore[misc]
+    """A path that ends as files of its kind do, whatever it is called."""
+
+    suffix = ""
 
 
 def _repair(path: Path, kind: str) -> str:

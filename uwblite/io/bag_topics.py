@@ -7,8 +7,8 @@ from difflib import get_close_matches
 from typing import Any
 
 from ..errors import ConfigError
-from .uwb_mapping import MissingField, UwbMapping, fitting, readings_of, short_type
-from .uwb_messages import KNOWN
+from .bag_motion import did_you_mean
+from .uwb_mapping import KNOWN, MissingField, UwbMapping, fitting, readings_of, short_type
 from .uwb_suggestions import as_toml, suggested
 
 ODOMETRY, SCAN, TRANSFORMS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
@@ -163,9 +163,7 @@ def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
     found = next((t for t in topics if t.name == name), None)
     if found is None:
         names = [t.name for t in topics]
-        near = get_close_matches(name, names, n=1)
-        hint = f"did you mean {near[0]}? " if near else ""
-        raise ConfigError(f"the bag has no topic {name}; {hint}it has {', '.join(names)}")
+        raise ConfigError(f"the bag has no topic {name}; {did_you_mean(name, names)}it has {', '.join(names)}")
     return found
 
 

@@ -28,12 +28,13 @@ from ..arrays import Floats
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
 from .carmen_laser import LaserMessages
-from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
 from .carmen_readings import Block
 from .carmen_stamps import LineClock, judged
+from .carmen_words import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_writer import write_log
 from .log_parts import parts_of
+from .readings import ranges_of
 from .source import OVERLONG_LINE, open_source
 
 __all__ = ["read_log", "write_log"]
@@ -98,18 +99,12 @@ class LogReader:
         self.path, self.max_broken_share, self.scan_message = path, max_broken_share, scan_message
         self.params = Params(int(scan_message[-1]) if scan_message[-1:].isdigit() else 1)
         self.laser = LaserMessages(every_nth_scan, scan_message)
-        self.odometry = array("d")
-        self.uwb = array("d")
-        self.number = 0
-        self.tags = 1
-        self.gyro = array("d")
-        self.uwb_ids: dict[bytes, int] = {}
-        self.skipped: dict[str, int] = {}
-        self.set_back: dict[str, float] = {}
-        self.lines = self.messages = self.broken = 0
+        self.odometry, self.uwb, self.gyro = (array("d") for _ in range(3))
+        self.number = self.lines = self.messages = self.broken = 0
+        self.tags, self.uwb_ids = 1, dict[bytes, int]()
+        self.skipped, self.set_back = dict[str, int](), dict[str, float]()
         self.broken_lines: list[tuple[int, str]] = []
-        self.ends_broken = False
-        self.has_ipc = False
+        self.ends_broken = self.has_ipc = False
         self.handlers: dict[bytes, Callable[[list[bytes]], None]] = {
             b"ODOM": self._odom,
             b"UWB": self._uwb,
@@ -276,7 +271,8 @@ class LogReader:
         What drove between two scans is then known by the poses that came with them, whatever the stamps say. A corrected log
         gives poses of another frame: these are farther from the odometry than from each other.
         """
-        odometry = _sorted_odometry(rows)
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        odometry = Odometry(rows[:, 0], rows[:, 1:])
         if not odometry_in_bursts(odometry):
             return np.zeros((0, 4))
         tied, _ = self.laser.robot_poses()
@@ -285,36 +281,27 @@ class LogReader:
         one_frame = len(step) > 0 and np.median(np.hypot(*off.T)) <= np.median(np.hypot(*step.T))
         return tied if one_frame else np.zeros((0, 4))
 
+    def _in_order(self, values: "array[float]", columns: int, what: str, clock: LineClock, warnings: list[str]) -> Floats:
+        """Return rows whose first column is the stamp and whose last the line, their stamps sound, in the order of time."""
+        rows = np.array(values).reshape(-1, columns)
+        rows[:, 0] = clock.sound(rows[:, -1].astype(np.intp), rows[:, 0], what, warnings)
+        return rows[time_order(rows[:, 0], what, warnings, self.set_back)]
+
     def _finish_gyro(self, clock: LineClock, warnings: list[str]) -> Gyro | None:
         if not self.gyro:
             return None
-        rows = np.array(self.gyro).reshape(-1, 3)
-        rows[:, 0] = clock.sound(rows[:, 2].astype(np.intp), rows[:, 0], "GYRO", warnings)
-        order = time_order(rows[:, 0], "gyro", warnings, self.set_back)
-        return Gyro(rows[order, 0], np.unwrap(rows[order, 1]))
+        rows = self._in_order(self.gyro, 3, "gyro", clock, warnings)
+        return Gyro(rows[:, 0].copy(), np.unwrap(rows[:, 1]))
 
     def _finish_ranges(self, clock: LineClock, warnings: list[str]) -> UwbRanges | None:
         if not self.uwb:
             return None
-        rows = np.array(self.uwb).reshape(-1, 6)
-        rows[:, 0] = clock.sound(rows[:, 5].astype(np.intp), rows[:, 0], "UWB", warnings)
-        names = [name.decode() for name in self.uwb_ids]
-        ids = sorted(names)
-        place = {name: i for i, name in enumerate(ids)}
-        rank = np.array([place[name] for name in names], dtype=np.intp)
-        order = time_order(rows[:, 0], "UWB", warnings, self.set_back)
-        rows = rows[order]
-        tag = rows[:, 4].astype(np.intp)
+        rows = self._in_order(self.uwb, 6, "UWB", clock, warnings)
+        anchor, tag = rows[:, [1, 4]].astype(np.intp).T
         self.tags = int(tag.max()) + 1
         silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.gives_tag(k + 1)]
         if silent:
             name = f"uwb{silent[0]}_tag_offset_x"
             warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")
-        anchor = rank[rows[:, 1].astype(np.intp)]
-        return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)
-
-
-def _sorted_odometry(rows: Floats) -> Odometry:
-    """Return the odometry of rows (n, 4) of stamp and pose."""
-    order = np.argsort(rows[:, 0], kind="stable")
-    return Odometry(rows[order, 0], rows[order, 1:])
+        names = [name.decode() for name in self.uwb_ids]
+        return ranges_of(rows[:, 0], anchor, names, rows[:, 2], rows[:, 3], tag if self.tags > 1 else None)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
-from .carmen_laser_words import HEAD, RANK, Layout, kinds_of, parse_head, split_tail
-from .carmen_messages import BrokenLine, numbers, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
 from .carmen_stamps import LineClock
-from .scan_geometry import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
+from .carmen_words import HEAD, RANK, BrokenLine, Layout, kinds_of, numbers, parse_head, split_tail, time_order
+from .readings import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""
@@ -33,7 +32,7 @@ class _Scans:
     """All scans of one layout."""
 
     ranges: "array[float]" = field(default_factory=lambda: array("f"))
-    """Readings of all scans, one behind the other; an array grows in place where blocks would have to be joined."""
+    """Readings of all scans, one behind the other."""
     stamps: "array[float]" = field(default_factory=lambda: array("d"))
     numbers: "array[int]" = field(default_factory=lambda: array("q"))
     """Line of each scan: layouts take turns in one log."""
@@ -100,9 +99,7 @@ class LaserMessages:
         self._queue(layout, Pending(number, 0, readings, stamp))
 
     def _queue(self, layout: Layout, pending: Pending) -> None:
-        scans = self._scans.get(layout)
-        if scans is None:
-            scans = self._scans[layout] = _Scans()
+        scans = self._scans.get(layout) or self._scans.setdefault(layout, _Scans())
         if scans.seen % self._every_nth == 0:
             scans.pending.append(pending)
         scans.seen += 1
@@ -165,12 +162,11 @@ class LaserMessages:
         order = as_written[time_order(stamps[as_written], what, warnings, set_back)]
         time_increment = params.get("laser_time_increment")
         if time_increment is None:
-            period = stamps[order] * 1.0
-            time_increment = _sweep_of_urg(kept.beams, geometry.angle_increment, range_max, period, self._every_nth)
+            time_increment = _sweep_of_urg(geometry, range_max, stamps[order], self._every_nth)
         if np.any(np.diff(order) != 1):
             ranges = ranges[order]
-        increment = geometry.angle_increment
-        laser = LaserScans(stamps[order], ranges, geometry.angle_min, increment, time_increment, range_min, range_max)
+        angles = geometry.angle_min, geometry.angle_increment
+        laser = LaserScans(stamps[order], ranges, *angles, time_increment, range_min, range_max)
         warnings.extend(_fence_posts(laser))
         return laser, self._mounting(what, warnings)
 
@@ -267,12 +263,13 @@ def _cleaned(readings: "array[float]", beams: int, range_min: float, range_max: 
     return ranges
 
 
-def _sweep_of_urg(beams: int, increment: float, range_max: float, stamps: Floats, every_nth: int) -> float:
+def _sweep_of_urg(geometry: ScanGeometry, range_max: float, stamps: Floats, every_nth: int) -> float:
     """Return the time between rays, s: that of a URG-04LX where the scans look like one's, otherwise 0 (snapshot).
 
     A URG-04LX turns once in 0.1 s, sees 240 degrees of it in up to 683 steps and reaches 5.6 m.
     """
-    fov = math.degrees(abs(increment) * max(beams - 1, 0))
+    beams = geometry.beams
+    fov = math.degrees(abs(geometry.angle_increment) * (beams - 1))
     if not (238.0 < fov < 242.0 and 680 <= beams <= 684 and range_max < 6.0 and len(stamps) > 1):
         return 0.0
     period = float(np.median(np.diff(stamps))) / every_nth

@@ -11,51 +11,49 @@ from .carmen_stamps import AS_WRITTEN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveOdometry:
-    """One pose of the base."""
+class Measured:
+    """One measurement of any kind."""
 
     stamp: float
-    pose: Floats
-    """(3,) m, m, rad; drifting frame."""
+    """s, of a scan that of its first ray."""
     order: float
     """s; when it is complete."""
 
 
-@dataclass(frozen=True, slots=True)
-class LiveRange:
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveOdometry(Measured):
+    """One pose of the base."""
+
+    pose: Floats
+    """(3,) m, m, rad; drifting frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveRange(Measured):
     """One range."""
 
-    stamp: float
     anchor_id: str
     range: float
     """m."""
     tag: int
     """Which of the robot's tags."""
-    order: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveScan:
+class LiveScan(Measured):
     """One scan."""
 
-    stamp: float
-    """s, of the first ray."""
     scans: LaserScans
     """The scan and its geometry: one row."""
-    order: float
 
 
-@dataclass(frozen=True, slots=True)
-class LiveGyro:
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveGyro(Measured):
     """One reading of a gyro."""
 
-    stamp: float
     heading: float
     """rad; from any zero, its bias in it."""
-    order: float
 
-
-Measured = LiveOdometry | LiveRange | LiveScan | LiveGyro
 
 _MOST_PENDING = 1 << 20
 """Bytes of a line without an end."""
@@ -95,15 +93,15 @@ class LiveReader:
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
         poses, turns = np.array(reader.odometry).reshape(-1, 5)[:, :4], np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
-        found: list[Measured] = [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in poses]
-        found += [*self._ranges(reader), *self._scans(reader), *(LiveGyro(t, heading, t) for t, heading in turns)]
+        found: list[Measured] = [LiveOdometry(float(row[0]), float(row[0]), row[1:]) for row in poses]
+        found += [*self._ranges(reader), *self._scans(reader), *(LiveGyro(t, t, heading) for t, heading in turns)]
         return sorted(found, key=lambda measured: measured.order)
 
     def _ranges(self, reader: LogReader) -> list[LiveRange]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}
         rows = np.array(reader.uwb).reshape(-1, 6)[:, :5].tolist()
         reader.tags = max([reader.tags, *(int(row[4]) + 1 for row in rows)])
-        return [LiveRange(t, names[int(anchor)], metres, int(tag), t) for t, anchor, metres, _, tag in rows]
+        return [LiveRange(t, t, names[int(anchor)], metres, int(tag)) for t, anchor, metres, _, tag in rows]
 
     def _scans(self, reader: LogReader) -> list[LiveScan]:
         scans, mounted = reader.laser.finish(reader.params, {}, [], {}, AS_WRITTEN)
@@ -112,12 +110,4 @@ class LiveReader:
         if self._T_base_laser is None:
             self._T_base_laser = mounted
         sweep = scans.time_increment * (scans.ranges.shape[1] - 1)
-        return [LiveScan(t, _row(scans, k), t + sweep) for k, t in enumerate(scans.stamps.tolist())]
-
-
-def _row(scans: LaserScans, k: int) -> LaserScans:
-    one = slice(k, k + 1)
-    return LaserScans(
-        scans.stamps[one], scans.ranges[one], scans.angle_min, scans.angle_increment, scans.time_increment, scans.range_min,
-        scans.range_max,
-    )  # fmt: skip
+        return [LiveScan(t, t + sweep, scans.rows(slice(k, k + 1))) for k, t in enumerate(scans.stamps.tolist())]

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..sensor_log import SensorMounting, fault_of_id
-from .carmen_messages import BrokenLine, numbers
+from .carmen_words import BrokenLine, numbers
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"
 _NUMBERS = frozenset((
@@ -60,10 +60,6 @@ class Params:
         """Return the first of these numbers that was given."""
         return next((self._numbers[name] for name in names if name in self._numbers), None)
 
-    def _tag(self, prefix: str) -> Floats:
-        """Return x, y, z of a tag on the base, m."""
-        return np.array([self._numbers.get(prefix + name, 0.0) for name in _TAG], dtype=np.float64)
-
     def gives_tag(self, number: int) -> bool:
         """Return whether the place of a further tag, 2 to 9, was given."""
         return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
@@ -81,18 +77,12 @@ class Params:
         if T_base_laser is None:
             offsets = ("robot_frontlaser_offset", "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset")
             T_base_laser = np.array([given.get(name, 0.0) for name in offsets])
+        prefixes = ("uwb_", *(f"uwb{k}_" for k in range(2, tags + 1)))
+        places = np.array([[given.get(prefix + name, 0.0) for name in _TAG] for prefix in prefixes])
+        heights = {name.removeprefix(_ANCHOR_HEIGHT): z for name, z in sorted(given.items()) if name.startswith(_ANCHOR_HEIGHT)}
+        height, is_base = given.get("uwb_anchor_height"), laser_is_base or self._laser_is_base
         return SensorMounting(
-            T_base_laser=T_base_laser,
-            laser_is_base=laser_is_base or self._laser_is_base,
-            laser_flipped=self._flipped,
-            tag_position=self._tag("uwb_"),
-            more_tags=np.array([self._tag(f"uwb{k}_") for k in range(2, tags + 1)]).reshape(-1, 3),
-            anchor_height=given.get("uwb_anchor_height"),
-            anchor_heights={
-                name.removeprefix(_ANCHOR_HEIGHT): height
-                for name, height in sorted(given.items())
-                if name.startswith(_ANCHOR_HEIGHT)
-            },
+            T_base_laser, self._flipped, places[0], height, heights, more_tags=places[1:], laser_is_base=is_base
         )
 
     def guess_scanner(self, beams: int) -> tuple[float, float]:

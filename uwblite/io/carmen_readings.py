@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, Ints
-from .carmen_messages import BrokenLine
+from .carmen_words import BrokenLine
 from .decimal_text import decode_equal_widths, decode_fixed_point
 
 

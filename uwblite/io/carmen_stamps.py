@@ -13,7 +13,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
 from ..screening.clocks import stand_still
-from .carmen_messages import CONFIRMED
+from .carmen_words import CONFIRMED
 
 _FAR = 10.0
 """s; no message waits so long for its line."""

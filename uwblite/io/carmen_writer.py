@@ -109,10 +109,14 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
         readings = encode_fixed_point(_without_signs(scans, part), 3)
         rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
         for text, l, r, stamp in rows:
-            yield head + text + (
-                f" 0 {l[0]:.9f} {l[1]:.9f} {l[2]:.9f} {r[0]:.6f} {r[1]:.6f} {r[2]:.6f} 0 0 0 0 0 "
-                f"{stamp:.6f} {HOST} {stamp:.6f}\n"
-            ).encode()
+            yield (
+                head
+                + text
+                + (
+                    f" 0 {l[0]:.9f} {l[1]:.9f} {l[2]:.9f} {r[0]:.6f} {r[1]:.6f} {r[2]:.6f} 0 0 0 0 0 "
+                    f"{stamp:.6f} {HOST} {stamp:.6f}\n"
+                ).encode()
+            )
 
 
 def _without_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:

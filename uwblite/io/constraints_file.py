@@ -22,15 +22,16 @@ from ..sensor_log import MOST_METRES, MOST_SECONDS
 from ..sensor_log.anchor_names import last_places
 from .csv_table import read_csv
 
-_TABLES: Mapping[str, tuple[type, str]] = {
-    "anchor": (GivenAnchor, "anchors"),
-    "pose": (GivenPose, "poses"),
-    "anchor_distance": (GivenDistance, "distances"),
-    "landmark": (GivenLandmark, "landmarks"),
-    "landmark_distance": (GivenLandmarkDistance, "landmark_distances"),
-    "closure": (GivenClosure, "closures"),
-    "forbidden_closure": (ForbiddenClosure, "forbidden"),
+_TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
+    "anchor": (GivenAnchor, "anchors", ("id", "position")),
+    "pose": (GivenPose, "poses", ("stamp", "pose")),
+    "anchor_distance": (GivenDistance, "distances", ("anchors", "distance")),
+    "landmark": (GivenLandmark, "landmarks", ("name", "position")),
+    "landmark_distance": (GivenLandmarkDistance, "landmark_distances", ("landmarks", "distance")),
+    "closure": (GivenClosure, "closures", ("stamps",)),
+    "forbidden_closure": (ForbiddenClosure, "forbidden", ("stamps",)),
 }
+"""Class, field of Constraints and needed fields of each table."""
 
 
 def parse_constraints(text: str, path: str = "") -> Constraints:
@@ -49,16 +50,16 @@ def parse_constraints(text: str, path: str = "") -> Constraints:
         if name not in _TABLES or not isinstance(tables, list):
             known = ", ".join(f"[[{k}]]" for k in _TABLES)
             raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {known}")
-        kind, field = _TABLES[name]
+        kind, field, needed = _TABLES[name]
         where = f"{path or 'constraints'}: [[{name}]] number"
-        found[field] = tuple(_entry(kind, table, f"{where} {k}") for k, table in enumerate(tables, 1))
+        found[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))
     return Constraints(**found)
 
 
-def _entry(kind: type, table: Any, where: str) -> Any:
+def _entry(kind: type, needed: tuple[str, ...], table: Any, where: str) -> Any:
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where} is not a table")
-    missing = [name for name in _REQUIRED[kind] if name not in table]
+    missing = [name for name in needed if name not in table]
     if missing:
         raise ConfigError(f"{where} needs {missing[0]}")
     for name, value in table.items():
@@ -69,17 +70,6 @@ def _entry(kind: type, table: Any, where: str) -> Any:
         return from_dict(kind, table)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-
-
-_REQUIRED: Mapping[type, tuple[str, ...]] = {
-    GivenAnchor: ("id", "position"),
-    GivenPose: ("stamp", "pose"),
-    GivenDistance: ("anchors", "distance"),
-    GivenLandmark: ("name", "position"),
-    GivenLandmarkDistance: ("landmarks", "distance"),
-    GivenClosure: ("stamps",),
-    ForbiddenClosure: ("stamps",),
-}
 
 
 def read_anchors(path: str | os.PathLike[str]) -> Constraints:

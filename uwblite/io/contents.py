@@ -5,7 +5,7 @@ import os
 import re
 import zlib
 
-from .carmen_messages import is_message_name
+from .carmen_words import is_message_name
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
 _RAWLOGS = (b"CObservation", b"CSensoryFrame", b"CActionCollection")
@@ -19,12 +19,16 @@ _LIBRSF = {b"range2", b"odom2diff", b"odom2", b"point2", b"gt2", b"range3", b"od
 _CARMEN = {b"ODOM", b"FLASER", b"PARAM", b"ROBOTLASER1", b"RAWLASER1", b"RLASER", b"UWB", b"SYNC"}
 _NAME_OF_PYFG = re.compile(rb"[A-Za-z]\d+$")
 _COLUMNS_OF_TUM = 8
+_OTHERS = {b"LASER_READING": "gfs", b"LaserOdometryLog": "aria", b"@SENS": "rhino", b"LASER-RANGE": "rhino"}
+"""First words of lines that only a log of another program has."""
+_PLAYER = b"## Player version"
 _LINES = 20
 """By which a table of numbers is told."""
 
 
 def format_of_content(path: str) -> str:
-    """Return 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'rawlog' or 'numbers' (a table without names) for a file.
+    """Return the format of a file: 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'numbers' (a table without names), or
+    'rawlog', 'player', 'gfs', 'aria', 'rhino', which are not read.
 
     '' of what is none of them, or cannot be read. TORO files are 'g2o', whose reader takes them.
     """
@@ -33,12 +37,16 @@ def format_of_content(path: str) -> str:
         return "bag"
     if any(name in start[:200] for name in _RAWLOGS):
         return "rawlog"
+    if start.startswith(_PLAYER):
+        return "player"
     lines = [line.split() for line in start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:-1]]
     lines = [words for words in lines if words and not words[0].startswith(b"#")]
     names = {words[0] for words in lines}
     if any(_GRAPH.match(name) for name in names):
         named = (words for words in lines if _GRAPH.match(words[0]))
         return "pyfg" if any(_NAME_OF_PYFG.match(word) for words in named for word in words[1:4]) else "g2o"
+    if foreign := names & set(_OTHERS):
+        return _OTHERS[min(foreign)]
     if names & _CARMEN:
         return "log"
     if names & _ISAM:

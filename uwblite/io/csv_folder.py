@@ -13,7 +13,6 @@ where the header has names of its own, or is missing, they stand in this order. 
 that were not there are not there either.
 """
 
-import csv
 import dataclasses
 import hashlib
 import io
@@ -30,15 +29,16 @@ from ..errors import ConfigError, FormatError
 from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .carmen_stamps import false_stamps, placed
+from .csv_table import csv_rows
 from .files import replacing
 from .folders import refuse_foreign, replacing_folder, unmarked
-from .scan_geometry import largest_reading, without_reach
+from .readings import largest_reading, ranges_of, without_reach
 from .settings_toml import to_toml
 from .source import finite, open_source
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class ScanGeometry:
+class Scans:
     """Geometry that all scans share."""
 
     angle_min: float = setting(0.0, minimum=-7.0, maximum=7.0)
@@ -73,7 +73,7 @@ class Mounting:
 class Sensors:
     """Everything about the sensors that is not a reading."""
 
-    scans: ScanGeometry = ScanGeometry()
+    scans: Scans = Scans()
     """Geometry of the scans."""
     mounting: Mounting = Mounting()
     """Mounting of the sensors."""
@@ -96,7 +96,7 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
 
 
 _FILES = ("odometry.csv", "gyro.csv", "ranges.csv", "scans.csv", "sensors.toml")
-_MARK = f"# {ScanGeometry.__doc__}"
+_MARK = f"# {Scans.__doc__}"
 """How sensors.toml begins with comments."""
 
 
@@ -137,9 +137,9 @@ def _scan_rows(scans: LaserScans) -> Iterator[str]:
 
 def _sensors(log: SensorLog) -> Sensors:
     m, s = log.mounting, log.scans
-    geometry = ScanGeometry()
+    geometry = Scans()
     if s is not None:
-        geometry = ScanGeometry(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
+        geometry = Scans(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
     laser, tag = tuple(m.T_base_laser.tolist()), tuple(m.tag_position.tolist())
     return Sensors(geometry, Mounting(laser, m.laser_flipped, tag, m.anchor_height, dict(m.anchor_heights)))
 
@@ -159,14 +159,16 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
         if isinstance(scanner := stated.get("scans"), dict) and scanner.get("range_max") != scanner.get("range_max"):
             scanner["range_max"] = np.inf  # nan states none either
         sensors = from_dict(Sensors, stated)
-    table = _in_order(_table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest), "odometry", warnings)
-    ranges = _read_ranges(path / "ranges.csv", digest, warnings) if (path / "ranges.csv").exists() else None
-    scans = _read_scans(path / "scans.csv", sensors.scans, digest, warnings) if (path / "scans.csv").exists() else None
-    gyro = _read_gyro(path / "gyro.csv", digest, warnings) if (path / "gyro.csv").exists() else None
+    table = _table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest, "odometry", warnings)
+    ranges, scans, gyro = (path / f"{name}.csv" for name in ("ranges", "scans", "gyro"))
+    radio = _read_ranges(ranges, digest, warnings) if ranges.exists() else None
+    lidar = _read_scans(scans, sensors.scans, digest, warnings) if scans.exists() else None
+    turns = _table(gyro, ("stamp", "heading"), digest, "gyro", warnings) if gyro.exists() else None
+    heading = None if turns is None else Gyro(turns[:, 0].copy(), np.unwrap(turns[:, 1]))
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
     notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest(), warnings=tuple(warnings))
-    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes, gyro=gyro)
+    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), radio, lidar, mounting, notes, gyro=heading)
 
 
 def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
@@ -180,21 +182,10 @@ def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
                 raise FormatError("not UTF-8 text", str(path)) from None
 
 
-def _rows(path: Path, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
-    """Yield (line number, fields) of the rows that are not empty."""
-    reader = csv.reader(_lines(path, digest))
-    try:
-        for row in reader:
-            if row:
-                yield reader.line_num, row
-    except csv.Error as error:
-        raise FormatError(f"not CSV: {error}", str(path), reader.line_num) from None
-
-
 def _columns(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
     """Yield (line number, fields) behind the header, fields in the order of `names`; quality is 100 where it is missing."""
     places, width = list[int](), 0
-    for line, row in _rows(path, digest):
+    for line, row in csv_rows(_lines(path, digest), str(path)):
         if not places:
             places, width = _places(row, names, path, line), len(row)
             if _is_header(row):
@@ -234,17 +225,14 @@ def _number(text: str, path: Path, line: int) -> float:
     return finite(text, f"{text[:30]!r} is not a finite number", str(path), line)
 
 
-def _table(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Floats:
+def _table(path: Path, names: tuple[str, ...], digest: "hashlib._Hash", what: str, warnings: list[str]) -> Floats:
+    """Return rows (n, k) in the order of their stamps, which are made sound before."""
     cells = array("d")
     for line, row in _columns(path, names, digest):
         cells.extend([_number(cell, path, line) for cell in row])
     if not cells:
         raise FormatError("there are no rows", str(path))
-    return np.array(cells).reshape(-1, len(names))
-
-
-def _in_order(table: Floats, what: str, warnings: list[str]) -> Floats:
-    """Return rows (n, k) in the order of their stamps, which are made sound before."""
+    table = np.array(cells).reshape(-1, len(names))
     table[:, 0] = _sound(table[:, 0], what, warnings)
     return table[np.argsort(table[:, 0], kind="stable")]
 
@@ -252,11 +240,6 @@ def _in_order(table: Floats, what: str, warnings: list[str]) -> Floats:
 def _sound(stamps: Floats, what: str, warnings: list[str]) -> Floats:
     """Return stamps (n,), s, in the order of rows, those that no clock gives placed by their rows; the header is line 1."""
     return placed(np.arange(2, len(stamps) + 2), stamps, false_stamps(stamps), what, warnings)
-
-
-def _read_gyro(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> Gyro:
-    table = _in_order(_table(path, ("stamp", "heading"), digest), "gyro", warnings)
-    return Gyro(table[:, 0].copy(), np.unwrap(table[:, 1]))
 
 
 def _read_ranges(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> UwbRanges | None:
@@ -271,17 +254,14 @@ def _read_ranges(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> Uw
         anchors.append(place)
     if not cells:
         return None
-    ids = tuple(sorted({one_word(name) for name in names}))
-    index = np.array([ids.index(one_word(name)) for name in names], dtype=np.intp)
     table = np.array(cells).reshape(-1, 3)
-    table[:, 0] = _sound(table[:, 0], "range", warnings)
-    order = np.argsort(table[:, 0], kind="stable")
-    return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)
+    stamps = _sound(table[:, 0], "range", warnings)
+    return ranges_of(stamps, np.array(anchors), [one_word(name) for name in names], table[:, 1], table[:, 2])
 
 
-def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash", warnings: list[str]) -> LaserScans | None:
+def _read_scans(path: Path, geometry: Scans, digest: "hashlib._Hash", warnings: list[str]) -> LaserScans | None:
     stamps, readings, beams = array("d"), array("f"), 0
-    for k, (line, row) in enumerate(_rows(path, digest)):
+    for k, (line, row) in enumerate(csv_rows(_lines(path, digest), str(path))):
         if k == 0 and _is_header(row):
             continue
         beams = beams or len(row) - 1

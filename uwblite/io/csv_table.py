@@ -3,6 +3,7 @@
 import csv
 import math
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,26 +67,25 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
     ------
     FormatError : unreadable, not text, or a row has another number of fields than the header.
     """
-    name = os.fspath(path)
-    data = b""
+    name, data = os.fspath(path), b""
     with open_source(name) as source:
         for block in source.blocks():
             data += block
             if len(data) > _LARGEST:
                 raise FormatError(f"is larger than {_LARGEST >> 20} MB: not a small table", name)
     try:
-        text = data.decode()
+        lines = data.decode().splitlines()
     except UnicodeDecodeError:
         raise FormatError("not UTF-8 text", name) from None
-    kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
-    if not kept:
+    plain = ("" if not line.strip() or line.lstrip().startswith("#") else line for line in lines)
+    rows = [(number, tuple(f.strip() for f in row)) for number, row in csv_rows(plain, name)]
+    if not rows:
         raise FormatError("holds no table; its first line must name the columns", name)
-    fields, lines = _fields(kept, name)
-    header, rows, lines = fields[0], fields[1:], lines[1:]
-    for row, line in zip(rows, lines, strict=True):
+    header = rows[0][1]
+    for number, row in rows:
         if len(row) != len(header):
-            raise FormatError(f"has {len(row)} fields where the header names {len(header)}", name, line)
-    return CsvTable(name, header, tuple(rows), lines)
+            raise FormatError(f"has {len(row)} fields where the header names {len(header)}", name, number)
+    return CsvTable(name, header, tuple(row for _, row in rows[1:]), tuple(number for number, _ in rows[1:]))
 
 
 _LARGEST = 1 << 26
@@ -94,15 +94,17 @@ _FARTHEST = 1e9
 """m; a number beyond it is no place on Earth."""
 
 
-def _fields(kept: list[tuple[int, str]], name: str) -> tuple[list[tuple[str, ...]], tuple[int, ...]]:
-    """Return the fields of each row and the number of the line on which it ends."""
-    reader = csv.reader(line for _, line in kept)
-    fields: list[tuple[str, ...]] = []
-    lines: list[int] = []
+def csv_rows(lines: Iterable[str], path: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of its last line and the fields of each row that is not empty.
+
+    Raises
+    ------
+    FormatError : this is no comma-separated text.
+    """
+    reader = csv.reader(lines)
     try:
         for row in reader:
-            fields.append(tuple(f.strip() for f in row))
-            lines.append(kept[reader.line_num - 1][0])
+            if row:
+                yield reader.line_num, row
     except csv.Error as error:
-        raise FormatError(f"is no comma-separated table ({error})", name, kept[max(reader.line_num, 1) - 1][0]) from None
-    return fields, tuple(lines)
+        raise FormatError(f"is no comma-separated table ({error})", path, reader.line_num) from None

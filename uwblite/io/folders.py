@@ -1,4 +1,4 @@
-"""Replacing a folder of files as a whole, as far as the system allows.
+"""Replacing a folder of files as a whole, as far as the system allows, by one writer at a time.
 
 A reader that looks at any time, and whoever looks after a crash, shall find all of the old files or all of the new ones.
 A new folder appears by one rename. One that holds nothing but an earlier result changes places with its successor in
@@ -7,16 +7,17 @@ the finished files are first named as such and then renamed one by one: what a c
 """
 
 import ctypes
+import hashlib
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import ConfigError
 from .files import WAITING, shortened, sync_files, sync_folder, write_text
-from .locks import one_at_a_time
 
 _READY = ".uwblite-ready"
 _LIST = "files"
@@ -176,3 +177,74 @@ def _exchange(one: Path, other: Path) -> bool:
     names = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
     first, second = names
     return bool(call(_AT_FDCWD, first, _AT_FDCWD, second, ctypes.c_uint(_RENAME_EXCHANGE)) == 0)
+
+
+@contextmanager
+def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the name of a result while it is computed, so that no second run computes in vain.
+
+    Raises
+    ------
+    ConfigError : another run of this user holds it.
+    """
+    with _held(path, "run", wait=False) as held:
+        if not held:
+            raise ConfigError(f"another run is writing {os.fspath(path)}; wait for it, or choose another --out")
+        yield
+
+
+@contextmanager
+def one_at_a_time(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Wait until no other process or thread of this user writes the files of a folder."""
+    with _held(path, "files", wait=True):
+        yield
+
+
+@contextmanager
+def _held(path: str | os.PathLike[str], what: str, *, wait: bool) -> Iterator[bool]:
+    """Hold a name; give False where another holds it and is not waited for. Without locks everybody holds it."""
+    handle, name = _locked(path, what, wait)
+    try:
+        yield handle != _TAKEN
+    finally:
+        if handle >= 0:
+            with suppress(OSError):
+                os.unlink(name)
+            os.close(handle)
+
+
+_TAKEN, _NO_LOCKS = -1, -2
+
+
+def _locked(path: str | os.PathLike[str], what: str, wait: bool) -> tuple[int, str]:
+    """Return the handle and name of a locked file that stands for a path; _TAKEN or _NO_LOCKS in place of the handle."""
+    try:
+        import fcntl
+    except ImportError:
+        return _NO_LOCKS, ""
+    key = hashlib.sha256(os.fsencode(os.path.realpath(path))).hexdigest()[:24]
+    try:
+        folder = tempfile.gettempdir()
+    except FileNotFoundError:
+        # Full disks: none of them takes a file, and the one that is written to may be another.
+        return _NO_LOCKS, ""
+    name = os.path.join(folder, f"uwblite-{os.getuid()}-{key}.{what}")
+    while True:
+        try:
+            handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        except OSError:
+            return _NO_LOCKS, ""
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            # The process that locked it before has removed it: then others lock another file of that name.
+            if os.path.samestat(os.fstat(handle), os.stat(name)):
+                return handle, name
+        except BlockingIOError:
+            os.close(handle)
+            return _TAKEN, ""
+        except FileNotFoundError:
+            pass
+        except OSError:
+            os.close(handle)
+            return _NO_LOCKS, ""
+        os.close(handle)

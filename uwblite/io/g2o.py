@@ -24,11 +24,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import WIDE, Floats, Ints, Wides
+from ..arrays import WIDE, Ints, Wides
 from ..errors import FormatError
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
+from .graph_file import GraphFile, assembled, check_lines, check_planar, given_places, measurements, rows_of
 from .plain_edges import ENDS, Measured, measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -72,22 +72,25 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
         content = read_records(source, _LAYOUTS)
     records = content.records
     check_planar(content)
-    toro = records["EDGE2"]
-    toro = Records(toro.lines, toro.stamps, toro.names, toro.numbers[:, _FROM_TORO])
-    steps = _together(records["EDGE_SE2"], toro)
-    vertices = _together(records["VERTEX_SE2"], records["VERTEX2"])
-    seen, ranged, meetings = records["EDGE_SE2_XY"], records["EDGE_RANGE_SE2_XY"], records["EDGE_RANGE_SE2"]
-    pinned, surveyed = records["EDGE_PRIOR_SE2"], records["EDGE_PRIOR_XY"]
+    toro = replace(records["EDGE2"], numbers=records["EDGE2"].numbers[:, _FROM_TORO])
+    steps, vertices = _together(records["EDGE_SE2"], toro), _together(records["VERTEX_SE2"], records["VERTEX2"])
+    lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
     ids = _ids(content)
-    pose_names = (vertices.names, steps.names, seen.names[:, :1], ranged.names[:, :1], pinned.names, meetings.names)
-    pose_ids, pose_of = _numbered(ids, pose_names)
-    landmark_names = (records["VERTEX_XY"].names, seen.names[:, 1:], ranged.names[:, 1:], surveyed.names)
-    landmark_ids, landmark_of = _numbered(ids, landmark_names)
-    _check(content, pose_ids, landmark_ids, pose_of[steps.names], steps.lines, ranged)
-    _check(content, pose_ids, landmark_ids, pose_of[meetings.names], meetings.lines, meetings)
+    used: dict[str, list[Ints]] = {"pose": [vertices.names], "landmark": [records["VERTEX_XY"].names]}
+    for kind, of in lines.items():
+        for place, end in enumerate(ENDS[kind]):
+            used[end].append(of.names[:, place : place + 1])
+    (pose_ids, pose_of), (landmark_ids, landmark_of) = (_numbered(ids, names) for names in used.values())
+    if len(pose_ids) == 0:
+        raise content.error(_no_poses(content))
+    if len(both := np.intersect1d(pose_ids, landmark_ids)):
+        raise content.error(f"vertex {both[0]} is used as a pose and as a landmark")
+    loops = ((of, pose_of[of.names[:, 0]] == pose_of[of.names[:, 1]], _LOOP) for of in (steps, lines["pose_range"]))
+    ranged = (lines[kind] for kind in ("range", "pose_range"))
+    positive = ((of, ~(of.numbers[:, 1] > 0), "the information of a range must be positive") for of in ranged)
+    check_lines(content, (*loops, *positive))
 
     index = {"pose": pose_of, "landmark": landmark_of}
-    lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
     try:
         plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
     except FormatError as error:
@@ -110,6 +113,7 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     return replace(file, warnings=(*_degrees(steps), *file.warnings))
 
 
+_LOOP = "an edge leads from a pose to itself"
 _ROOTS = (
     "in TORO's order (I11 I12 I22 I33 I13 I23). iSAM and gtsam write another EDGE2: the root R of the information row by row"
     " (R11 R12 R13 R22 R23 R33); write such a line as EDGE_SE2 with the upper triangle of R^T R"
@@ -163,25 +167,18 @@ def write_g2o(
 def _lines(graph: Graph, plain: dict[str, Measured], ranges: bool, number: Ints) -> Iterator[str]:
     """Yield the lines of each tag; `number` (poses + anchors,) is the id of each vertex."""
     n, placed = len(graph.poses), np.isfinite(graph.anchors).all(axis=1)
-    yield _rows("VERTEX_SE2", [number[:n]], graph.poses)
+    yield rows_of("VERTEX_SE2", " %d", [number[:n]], graph.poses)
     first = {"pose": 0, "landmark": n}
     for kind, tag in _TAGS.items():
         if kind == "observation":
-            yield _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
+            yield rows_of("VERTEX_XY", " %d", [number[n:][placed]], graph.anchors[placed])
         if ranges or "range" not in kind:
             m = plain[kind]
             ends = [number[first[end] + index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
-            yield _rows(tag, ends, m.value, upper_triangle(m.information))
+            yield rows_of(tag, " %d" * len(ends), ends, m.value, upper_triangle(m.information))
     fixed = np.flatnonzero(np.append(graph.fixed_poses, graph.fixed_anchors & placed))
     if fixed.tolist() != [0] or len(plain["pose_prior"].value):
-        yield _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
-
-
-def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> str:
-    """Return the lines of one tag: whole numbers, then numbers, written so that they read back as they were."""
-    numbers = np.concatenate(columns, axis=1) + 0.0
-    line = tag + " %d" * len(ids) + " %r" * numbers.shape[1] + "\n"
-    return "".join(map(line.__mod__, zip(*(column.tolist() for column in (*ids, *numbers.T)), strict=True)))
+        yield rows_of("FIX", " %d", [number[fixed]], np.zeros((len(fixed), 0)))
 
 
 def _together(a: Records, b: Records) -> Records:
@@ -210,21 +207,6 @@ def _numbered(ids: Wides, names: Sequence[Ints]) -> tuple[Wides, Ints]:
     index = np.full(len(ids), -1, dtype=np.intp)
     index[used] = place.reshape(-1)
     return listed, index
-
-
-def _check(content: RecordFile, pose_ids: Wides, landmark_ids: Wides, ends: Ints, lines: Ints, ranged: Records) -> None:
-    """Raise FormatError where the records make no graph."""
-    if len(pose_ids) == 0:
-        raise content.error(_no_poses(content))
-    both = np.intersect1d(pose_ids, landmark_ids)
-    if len(both):
-        raise content.error(f"vertex {both[0]} is used as a pose and as a landmark")
-    loops = np.flatnonzero(ends[:, 0] == ends[:, 1])
-    if len(loops):
-        raise content.error("an edge leads from a pose to itself", int(lines[loops[0]]))
-    bad = np.flatnonzero(~(ranged.numbers[:, 1] > 0))
-    if len(bad):
-        raise content.error("the information of a range must be positive", int(ranged.lines[bad[0]]))
 
 
 def _no_poses(content: RecordFile) -> str:

@@ -1,21 +1,24 @@
 """Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common."""
 
+import math
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
-from ..arrays import Floats, Ints
-from ..errors import FormatError
-from ..graph.components import floating_components, tied_chains
+from ..arrays import Bools, Floats, Ints
+from ..graph.components import floating_components, given_anchors, tied_chains
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
-from ..graph.point_edges import LandmarkEdges
+from ..graph.point_edges import LandmarkEdges, seen_anchors
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.unknowns import free_unknowns
-from .graph_chains import along_edges
 from .plain_edges import ENDS, WIDTHS, Measured, root
 from .records import RecordFile, Records
 
@@ -33,7 +36,7 @@ class GraphFile:
     """Name of each landmark in the file; they are the graph's anchors."""
     stamps: Floats
     """(n,) s, time of each pose; its number where the file gives no time."""
-    chains: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    chains: Ints = field(default_factory=lambda: _NONE)
     """(n,) chain of each pose: 0 stands in the map's frame; others begin at the origin and want a place (see `along_edges`)."""
     skipped: dict[str, int] = field(default_factory=dict)
     """Lines of kinds that are not used, by tag."""
@@ -62,18 +65,18 @@ class GraphFile:
         started, chains = along_edges(graph)
         file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))
         file = file.from_odometry() if from_odometry else file
-        lost = np.flatnonzero(~tied_chains(file.graph, file.chains))
-        if len(lost):
-            raise content.error(f"pose {pose_ids[lost[0]]} is not connected to the first one ({len(lost)} such poses)")
+        lost, floating = ~tied_chains(file.graph, file.chains), floating_components(file.graph) > 0
+        lost_words, floating_words = (
+            f"pose {pose_ids[int(np.argmax(poses))]} is not connected to the first one ({poses.sum()} such poses)"
+            if poses.any() else "" for poses in (lost, floating)
+        )  # fmt: skip
+        if lost_words:
+            raise content.error(lost_words)
         nowhere = [name for name, xy in zip(anchor_ids, file.graph.anchors, strict=True) if np.isnan(xy[0])]
-        warnings: tuple[str, ...] = (
-            (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
-        )
-        floating = np.flatnonzero(floating_components(file.graph) > 0)
-        if len(floating):
-            named = f"pose {pose_ids[floating[0]]} is not connected to the first one ({len(floating)} such poses)"
-            warnings += (f"{named}: they keep to their own edges, and where they stand says nothing",)
-        return replace(file, warnings=warnings)
+        warnings = [f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}"] if nowhere else []
+        if floating_words:
+            warnings.append(f"{floating_words}: they keep to their own edges, and where they stand says nothing")
+        return replace(file, warnings=tuple(warnings))
 
     def from_odometry(self) -> "GraphFile":
         """Return the graph as it starts where estimates are forgotten: what is fixed stays, all else follows the edges."""
@@ -84,22 +87,85 @@ class GraphFile:
         return replace(self, graph=graph, chains=chains)
 
 
+def along_edges(graph: Graph) -> tuple[Graph, Ints]:
+    """Return a graph with a start for its poses, and for the landmarks that edges see or priors place; and chains (n,).
+
+    Chain 0 stands in the map's frame: what is given, what has a prior, and what edges tie to these; in a graph that holds
+    nothing anywhere, the part of the first pose, which is the origin. Every other chain, which only ranges and landmarks
+    may tie to it, begins at the origin and wants a place.
+
+    Parameters
+    ----------
+    graph : poses and anchors that are given, nan where none is.
+    """
+    poses, anchors = graph.poses, graph.anchors.copy()
+    relative = [e for e in graph.edges if isinstance(e, RelativePoseEdges)]
+    steps = [np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j")] if relative else None
+    priors: dict[str, dict[int, Floats]] = {"poses": {}, "anchors": {}}
+    for e in graph.edges:
+        if isinstance(e, PriorEdges):
+            priors[e.block] |= dict(zip(e.index.tolist(), e.value, strict=True))
+    for anchor, place in priors["anchors"].items():
+        anchors[anchor] = place if np.isnan(anchors[anchor, 0]) else anchors[anchor]
+    chains = np.zeros(len(poses), dtype=np.intp)
+    given = bool(np.isfinite(poses[:, 0]).any() or given_anchors(graph).any())
+    poses = chained_poses(poses, *steps) if steps and np.isfinite(poses[:, 0]).any() else poses
+    while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
+        pinned = [k for k in lost.tolist() if k in priors["poses"]]
+        start = poses.copy()
+        start[pinned[0] if pinned else lost[0]] = priors["poses"][pinned[0]] if pinned else 0.0
+        reached = chained_poses(start, *steps) if steps else start
+        if not pinned and given:
+            chains[np.isnan(poses[:, 0]) & ~np.isnan(reached[:, 0])] = chains.max() + 1
+        poses, given = reached, True
+    framed = replace(graph, anchors=anchors, poses=np.where((chains == 0)[:, None], poses, np.nan))
+    return replace(graph, anchors=seen_anchors(framed), poses=poses), chains
+
+
+def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
+    """Return poses (n, 3) with the unknown ones (nan) reached from known ones along edges, steps i -> i + 1 preferred.
+
+    Parameters
+    ----------
+    poses : (n, 3) given poses, nan where unknown; where all are, the first pose is the origin.
+    i, j, T_i_j : (e,), (e,), (e, 3) measured poses of j in i.
+    """
+    n, known = len(poses), ~np.isnan(poses[:, 0])
+    if known.all():
+        return poses
+    if not known.any():
+        known[0], poses = True, np.zeros((n, 3))
+    # One further node represents everything known; its links are the shortest.
+    given = np.flatnonzero(known)
+    rows, cols = np.concatenate([i, np.full(len(given), n)]), np.concatenate([j, given])
+    cost = np.concatenate([np.where(np.abs(j - i) == 1, 2.0, 3.0), np.ones(len(given))])
+    key, link = np.unique(np.minimum(rows, cols) * (n + 1) + np.maximum(rows, cols), return_index=True)
+    links = csr_matrix((cost[link], (key // (n + 1), key % (n + 1))), shape=(n + 1, n + 1))
+    order, parent = breadth_first_order(minimum_spanning_tree(links), n, directed=False)
+    node = order[1:][~known[order[1:]]].astype(np.intp)
+    parent = parent[node].astype(np.intp)
+    edge = link[np.searchsorted(key, np.minimum(node, parent) * (n + 1) + np.maximum(node, parent))]
+    step = np.where((j[edge] == node)[:, None], T_i_j[edge], se2.inverse(T_i_j[edge]))
+    result = np.where(known[:, None], poses, np.nan)
+    for k, p, (dx, dy, turn) in zip(node.tolist(), parent.tolist(), step.tolist(), strict=True):
+        x, y, theta = result[p].tolist()
+        c, sn = math.cos(theta), math.sin(theta)
+        result[k] = x + c * dx - sn * dy, y + sn * dx + c * dy, math.remainder(theta + turn, 2.0 * math.pi)
+    return result
+
+
 def check_planar(content: RecordFile) -> None:
     """Raise FormatError where a file holds lines of a three-dimensional graph."""
     for tag in content.skipped:
-        if _SPATIAL.search(tag):
+        if re.search(r"S(E|IM)3|XYZ|(VERTEX|EDGE)3", tag):
             raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
 
 
-_SPATIAL = re.compile(r"S(E|IM)3|XYZ|(VERTEX|EDGE)3")
-
-
-def symmetric(upper: Floats, size: int) -> Floats:
-    """Return symmetric matrices (e, size, size) from their upper triangles row by row (e, size (size + 1) / 2)."""
-    row, col = np.triu_indices(size)
-    matrices = np.empty((len(upper), size, size))
-    matrices[:, row, col] = matrices[:, col, row] = upper
-    return matrices
+def check_lines(content: RecordFile, checks: Iterable[tuple[Records, Bools, str]]) -> None:
+    """Raise FormatError for the first line of some records (n,) that is flagged (n,) as wrong, with the words on it."""
+    for of, wrong, problem in checks:
+        if wrong.any():
+            raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
 
 
 def given_places(vertices: Records, index_of: Ints, count: int, content: RecordFile) -> Floats:
@@ -111,28 +177,11 @@ def given_places(vertices: Records, index_of: Ints, count: int, content: RecordF
     """
     places = np.full((count, vertices.numbers.shape[1]), np.nan)
     index = index_of[vertices.names[:, 0]]
-    _, first = np.unique(index, return_index=True)
-    if len(first) < len(index):
-        again = int(np.setdiff1d(np.arange(len(index)), first)[0])
-        raise content.error("this vertex was given before", int(vertices.lines[again]))
+    again = np.ones(len(index), dtype=bool)
+    again[np.unique(index, return_index=True)[1]] = False
+    check_lines(content, [(vertices, again, "this vertex was given before")])
     places[index] = vertices.numbers
     return places
-
-
-def read_matrices(upper: Floats, size: int, lines: Ints, path: str, what: str) -> Floats:
-    """Return symmetric matrices (e, size, size) from upper triangles, none of them with a negative eigenvalue.
-
-    Raises
-    ------
-    FormatError : a matrix has one; `what` names the kind of matrix.
-    """
-    matrices = symmetric(upper, size)
-    if len(matrices):
-        values = np.linalg.eigvalsh(matrices)
-        bad = np.flatnonzero(values[:, 0] < -1e-9 * np.abs(values[:, -1]))
-        if len(bad):
-            raise FormatError(f"the {what} matrix is not positive semi-definite", path, int(lines[bad[0]]))
-    return matrices
 
 
 def measurements(of: Records, kind: str, index: dict[str, Ints], content: RecordFile, what: str) -> Measured:
@@ -141,10 +190,19 @@ def measurements(of: Records, kind: str, index: dict[str, Ints], content: Record
     Parameters
     ----------
     index : place of each name of the file among poses, and among landmarks. what : the kind of matrix.
+
+    Raises
+    ------
+    FormatError : a matrix has a negative eigenvalue.
     """
     k = WIDTHS.get(kind, 1)
     ends = tuple(index[end][of.names[:, n]] for n, end in enumerate(ENDS[kind]))
-    return Measured(ends, of.numbers[:, :k], read_matrices(of.numbers[:, k:], k, of.lines, content.path, what))
+    (row, col), matrices = np.triu_indices(k), np.empty((len(of), k, k))
+    matrices[:, row, col] = matrices[:, col, row] = of.numbers[:, k:]
+    values = np.linalg.eigvalsh(matrices) if len(of) else np.zeros((0, k))
+    negative = values[:, 0] < -1e-9 * np.abs(values[:, -1])
+    check_lines(content, [(of, negative, f"the {what} matrix is not positive semi-definite")])
+    return Measured(ends, of.numbers[:, :k], matrices)
 
 
 def assembled(
@@ -158,22 +216,21 @@ def assembled(
     anchors : (a, 2) given landmarks, nan where the file gives none.
     fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior: the first pose is fixed.
     """
-    (i, j), T_i_j, _ = plain["relative"]
-    (pose, anchor), position, _ = plain["observation"]
-    (seer, seen), (one, other), (first, second) = (plain[kind].ends for kind in _DISTANCES)
     L = {kind: root(m.information) for kind, m in plain.items()}
-    ranges = {kind: (plain[kind].value[:, 0], 1.0 / L[kind][:, 0, 0]) for kind in _DISTANCES}
-    (prior,), value, _ = plain["pose_prior"]
-    (known,), place, _ = plain["landmark_prior"]
-    nowhere = np.zeros((len(ranges["pose_range"][0]), 2))
+    ends, value = {kind: m.ends for kind, m in plain.items()}, {kind: m.value for kind, m in plain.items()}
+    ranges = {kind: (*ends[kind], value[kind][:, 0], 1.0 / L[kind][:, 0, 0]) for kind in ENDS if "range" in kind}
+    (prior,), (known,), (pose, anchor, distance, sigma) = ends["pose_prior"], ends["landmark_prior"], ranges["range"]
+    none, flat = np.full((len(pose), 6), -1, dtype=np.intp), np.zeros((len(pose), 2))
+    at, nowhere = np.zeros(len(pose)), np.zeros((len(value["pose_range"]), 2))
+    one, other, *apart = ranges["pose_range"]
     edges = (
-        RelativePoseEdges(i, j, T_i_j, L["relative"]),
-        LandmarkEdges(pose, anchor, position, L["observation"]),
-        _ranges_from_poses(seer, seen, *ranges["range"]),
-        PointDistanceEdges(one, other, nowhere, nowhere, *ranges["pose_range"]),
-        AnchorDistanceEdges(first, second, *ranges["landmark_range"]),
-        PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
-        PriorEdges("anchors", known, place, L["landmark_prior"]),
+        RelativePoseEdges(*ends["relative"], value["relative"], L["relative"]),
+        LandmarkEdges(*ends["observation"], value["observation"], L["observation"]),
+        RangeEdges(pose, anchor, distance, sigma, flat, at, flat, np.zeros(2), at, none),
+        PointDistanceEdges(one, other, nowhere, nowhere, *apart),
+        AnchorDistanceEdges(*ranges["landmark_range"]),
+        PriorEdges("poses", prior, value["pose_prior"], L["pose_prior"] @ se2.rotation(-value["pose_prior"][:, 2])),
+        PriorEdges("anchors", known, value["landmark_prior"], L["landmark_prior"]),
     )
     given = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
     return Graph(
@@ -185,11 +242,8 @@ def assembled(
     )
 
 
-_DISTANCES = ("range", "pose_range", "landmark_range")
-
-
-def _ranges_from_poses(pose: Ints, anchor: Ints, ranges: Floats, sigma: Floats) -> RangeEdges:
-    """Return range edges without lever arms and calibration."""
-    n, flat = len(pose), np.zeros((len(pose), 2))
-    none = np.full((n, 6), -1, dtype=np.intp)
-    return RangeEdges(pose, anchor, ranges, sigma, flat, np.zeros(n), flat, np.zeros(2), np.zeros(n), none)
+def rows_of(tag: str, form: str, columns: Sequence[Any], *tables: Floats) -> str:
+    """Return the lines of one tag: columns in the form of one line, then numbers that read back as they were."""
+    numbers = np.concatenate(tables, axis=1) + 0.0
+    line = f"{tag}{form}{' %r' * numbers.shape[1]}\n"
+    return "".join(map(line.__mod__, zip(*(column.tolist() for column in (*columns, *numbers.T)), strict=True)))

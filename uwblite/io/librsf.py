@@ -12,13 +12,15 @@ truth and other sensors are skipped and counted.
 
 import os
 from array import array
+from collections import Counter
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats
 from ..errors import FormatError
-from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
+from ..sensor_log import LogNotes, Odometry, SensorLog, fault_of_id
+from .readings import ranges_of
 from .source import finite, open_source
 
 _LEAST = {b"odom2diff": 8, b"odom2": 5, b"range2": 7}
@@ -34,32 +36,30 @@ def read_librsf(path: str | os.PathLike[str]) -> SensorLog:
     ------
     FormatError : a line is wrong, or there is no odometry.
     """
-    speeds, ranges, ids, skipped, number = array("d"), array("d"), list[str](), dict[str, int](), 0
+    speeds, ranges, names, skipped = array("d"), array("d"), dict[str, int](), Counter[str]()
     with open_source(path) as source:
-        for block in source.blocks():
-            for line in block.split(b"\n")[:-1]:
-                number += 1
-                words = line.split()
-                if not words or words[0].startswith(b"#"):
-                    continue
-                if words[0] not in _LEAST:
-                    name = words[0][:40].decode("ascii", "replace")
-                    skipped[name] = skipped.get(name, 0) + 1
-                    continue
-                kind = words[0].decode()
-                if len(words) < _LEAST[words[0]]:
-                    raise FormatError(f"{kind} has {len(words)} words, expected {_LEAST[words[0]]}", source.path, number)
-                values = [finite(word, f"{word[:30]!r} is no finite number", source.path, number) for word in words[1:6]]
-                if kind == "range2":
-                    ids.append(_anchor(words[6], source.path, number))
-                    ranges.extend(values[:2])
-                else:
-                    speeds.extend((values[0], *_motion(kind, values, len(words))))
+        number = 0
+        for number, words in (row for rows in source.rows() for row in rows):
+            if words[0] not in _LEAST:
+                skipped[words[0][:40].decode("ascii", "replace")] += 1
+                continue
+            kind = words[0].decode()
+            if len(words) < _LEAST[words[0]]:
+                raise FormatError(f"{kind} has {len(words)} words, expected {_LEAST[words[0]]}", source.path, number)
+            values = [finite(word, f"{word[:30]!r} is no finite number", source.path, number) for word in words[1:6]]
+            if kind == "range2":
+                name = _anchor(words[6], source.path, number)
+                ranges.extend((values[0], values[1], names.setdefault(name, len(names))))
+            else:
+                speeds.extend((values[0], *_motion(kind, values, len(words))))
         sha256 = source.sha256()
     if not speeds:
         raise FormatError("holds no odometry (odom2diff or odom2)", source.path)
     notes = LogNotes(source=source.path, sha256=sha256, lines=number, skipped=dict(sorted(skipped.items())))
-    return SensorLog(_integrated(np.array(speeds).reshape(-1, 4)), _ranges(np.array(ranges).reshape(-1, 2), ids), notes=notes)
+    odometry, table = _integrated(np.array(speeds).reshape(-1, 4)), np.array(ranges).reshape(-1, 3)
+    stamps, metres, anchor = table.T
+    radio = ranges_of(stamps, anchor.astype(np.intp), list(names), metres, np.full(len(table), 100.0)) if names else None
+    return SensorLog(odometry, radio, notes=notes)
 
 
 def _motion(kind: str, values: list[float], words: int) -> tuple[float, float, float]:
@@ -86,13 +86,3 @@ def _integrated(rows: Floats) -> Odometry:
     with np.errstate(over="ignore", invalid="ignore"):  # a recording refuses what is beyond all measures
         steps = se2.exp(rows[:-1, 1:] * np.diff(rows[:, 0])[:, None])
         return Odometry(rows[:, 0].copy(), se2.chain(np.zeros(3), steps))
-
-
-def _ranges(rows: Floats, names: list[str]) -> UwbRanges | None:
-    if not names:
-        return None
-    order = np.argsort(rows[:, 0], kind="stable")
-    ids = tuple(sorted(set(names)))
-    place = {name: k for k, name in enumerate(ids)}
-    anchor = np.array([place[name] for name in names], dtype=np.intp)[order]
-    return UwbRanges(rows[order, 0], anchor, rows[order, 1], np.full(len(rows), 100.0), ids)

@@ -1,18 +1,30 @@
-"""The files of a recording that was cut into parts of bounded size: ``run.log``, ``run.2.log``, ``run.3.log`` ...
+"""The files of a recording that was cut into parts of bounded size (``run.log``, ``run.2.log`` ...), whole or as they grow.
 
-`uwblite record --rotate` writes into the head of each part which one it continues. Whoever names one of them means the
-recording.
+`uwblite record --rotate` writes into the head of each part which one it continues, and at the end which one follows. Whoever
+names one of them means the recording.
 """
 
+import errno
 import gzip
 import os
 import re
+import stat
 import zlib
 from collections.abc import Sequence
+from io import FileIO
+from pathlib import Path
+
+from ..errors import FormatError
 
 HEAD_BYTES = 1 << 16
-"""Bytes at the beginning of a part among which the comment stands."""
-TAIL_BYTES = 1024
+"""Bytes at the beginning of a log among which its PARAM lines stand, and what it continues."""
+TAIL_BYTES = 4 << 20
+"""Bytes at the end of a long log with which following begins: about a minute of a robot with a lidar."""
+_PIECE = 1 << 17
+"""Bytes read at once."""
+_NEXT_PART = re.compile(rb"^COMMENT continued in ([^\n]+)\n", re.MULTILINE)
+"""What the recorder writes at the end of a part, before the name of the next."""
+_MARK_BYTES = 1024
 
 
 def parts_of(path: str) -> tuple[list[str], str]:
@@ -74,7 +86,99 @@ def _goes_on(path: str) -> bool:
     """Return whether the last line of a part names a next one; of a packed one that is unknown."""
     try:
         with open(path, "rb") as file:
-            file.seek(max(0, os.path.getsize(path) - TAIL_BYTES))
+            file.seek(max(0, os.path.getsize(path) - _MARK_BYTES))
             return re.search(rb"^COMMENT continued in \S+\s*\Z", file.read(), re.MULTILINE) is not None
     except OSError:
         return False
+
+
+def _open(path: Path) -> FileIO:
+    """Open a regular file, or raise OSError."""
+    return open(path, "rb", buffering=0, opener=_regular)
+
+
+def _regular(path: str, flags: int) -> int:
+    """Open a file without waiting: a pipe would hold the opening until somebody writes into it."""
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return handle
+    os.close(handle)
+    raise OSError(errno.EINVAL, "it is a pipe, a device or a folder, and only a file can be followed")
+
+
+class GrowingFile:
+    """Follow a file from its head, and what it holds already from near its end or whole.
+
+    It goes on in the next part, once that is there. A file that became shorter, or that another has taken the place of,
+    is read from its beginning.
+
+    Parameters
+    ----------
+    whole : read all that it holds already.
+
+    Raises
+    ------
+    FormatError : it cannot be opened, or is no regular file.
+    """
+
+    def __init__(self, path: str, *, whole: bool = False) -> None:
+        self.path = Path(path)
+        self.restarts = 0
+        """How often the file was begun again."""
+        try:
+            self._file = _open(self.path)
+            size = os.fstat(self._file.fileno()).st_size
+        except OSError as error:
+            raise FormatError(f"cannot be followed: {error.strerror or error}", path) from None
+        self.skipped = 0 if whole else max(size - HEAD_BYTES - TAIL_BYTES, 0)
+        """Bytes between head and tail that are not read."""
+        self._head_left = HEAD_BYTES if self.skipped else 0
+        self._end = b""
+
+    def read(self) -> bytes:
+        """Return new bytes, at most one piece; b"" where there are none."""
+        if self._head_left:
+            data = self._file.read(self._head_left)
+            self._head_left = 0
+            self._file.seek(self.skipped + HEAD_BYTES)
+            # What was measured then is not wanted; the line into which the jump leads becomes a comment.
+            kept = [line for line in data.split(b"\n")[:-1] if line.startswith(b"PARAM ")]
+            return b"\n".join([*kept, b"# "])
+        if os.fstat(self._file.fileno()).st_size < self._file.tell():
+            self._file.seek(0)
+            self.restarts += 1
+            self._end = b""
+        data = self._file.read(_PIECE) or self._successor() or self._next_part()
+        self._end = (self._end + data)[-_MARK_BYTES:]
+        return data
+
+    def _successor(self) -> bytes:
+        """Return the beginning of another file that has taken this one's place; b"" where none has."""
+        try:
+            if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
+                return b""
+            other = _open(self.path)
+        except OSError:
+            return b""
+        self._file.close()
+        self._file, self._end = other, b""
+        self.restarts += 1
+        return self._file.read(_PIECE)
+
+    def _next_part(self) -> bytes:
+        """Return the beginning of the part beside this one that this one names as the next; b"" where there is none."""
+        named = _NEXT_PART.findall(self._end)
+        following = self.path.with_name(os.path.basename(named[-1].decode("utf-8", "replace").strip())) if named else None
+        if following is None or not following.is_file():
+            return b""
+        try:
+            part = _open(following)
+        except OSError:
+            return b""
+        self._file.close()
+        self.path, self._end, self._file = following, b"", part
+        return self._file.read(_PIECE)
+
+    def close(self) -> None:
+        """Let it go."""
+        self._file.close()

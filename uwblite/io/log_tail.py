@@ -14,8 +14,8 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import FormatError
-from .carmen_messages import numbers, stamp_of
-from .growing_file import GrowingFile
+from .carmen_words import numbers, stamp_of
+from .log_parts import GrowingFile
 from .source import MAX_LINE_BYTES
 
 WINDOW = 10.0

@@ -22,6 +22,7 @@ from .png import MOST_PIXELS, SIGNATURE, decode_png, encode_png, png_shape
 from .source import finite, open_input, read_bounded
 
 Image = NDArray[np.uint8]
+Settings = dict[str, str | list[str]]
 
 PIXEL_OCCUPIED, PIXEL_UNKNOWN, PIXEL_FREE = 0, 205, 254
 _MOST_YAML_BYTES = 1 << 16
@@ -105,12 +106,9 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
     """
     name, said = os.fspath(path), [] if warnings is None else warnings
     settings = _parse_yaml(read_bounded(name, _MOST_YAML_BYTES).decode("utf-8-sig", errors="replace"), name)
-    image = _text(settings, "image", name)
-    image_path = os.path.join(os.path.dirname(name), image)
-    pixels = _read_picture(image_path)[::-1]
-    resolution = _number(settings, "resolution", name)
-    origin = _origin(settings, name)
-    occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
+    pixels = _read_picture(os.path.join(os.path.dirname(name), _text(settings, "image", name)))[::-1]
+    origin, numbers = _origin(settings, name), ("resolution", "occupied_thresh", "free_thresh")
+    resolution, occupied, free = (_number(_text(settings, key, name), key, name) for key in numbers)
     if not LEAST_CELL <= resolution <= LARGEST_CELL or len(origin) != 3 or max(map(abs, origin)) > 1e7:
         raise FormatError("resolution must be positive (0.0001 to 1000 m) and origin must be a place [x, y, yaw]", name)
     mode = str(settings.get("mode", "trinary"))
@@ -128,18 +126,10 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
     grid = OccupancyGrid(GridGeometry(resolution, np.array(origin[:2]), *log_odds.shape), log_odds)
     # A turn that moves no cell to another's place is none: sums of angles leave 1e-9 where 0 was meant.
     yaw = float(np.angle(np.exp(1j * origin[2])))
-    if abs(yaw) * float(np.hypot(*log_odds.shape)) < _HALF_A_CELL:
-        return grid
-    turned = _turned(grid, yaw)
-    if turned.geometry.cells > MOST_PIXELS:
-        raise FormatError("is too large to be turned as its origin says; turn the picture and set the yaw to 0", name)
-    return turned
+    return grid if abs(yaw) * float(np.hypot(*log_odds.shape)) < 0.5 else _turned(grid, yaw, name)
 
 
-_HALF_A_CELL = 0.5
-
-
-def _origin(settings: dict[str, str | list[str]], name: str) -> list[float]:
+def _origin(settings: Settings, name: str) -> list[float]:
     """Return the pose of the lower left corner.
 
     Raises
@@ -147,9 +137,11 @@ def _origin(settings: dict[str, str | list[str]], name: str) -> list[float]:
     FormatError : it is none; older map savers wrote a yaw that is no number.
     """
     value = settings.get("origin")
-    if isinstance(value, list) and len(value) == 3 and value[2].lower().lstrip("+-.") == "nan":
+    if not isinstance(value, list):
+        raise FormatError("origin must be a list of numbers", name)
+    if len(value) == 3 and value[2].lower().lstrip("+-.") == "nan":
         raise FormatError(f"origin: the yaw is {value[2]}, as some map savers write it; set it to 0 in the YAML file", name)
-    return _numbers(settings, "origin", name)
+    return [_number(item, "origin", name) for item in value]
 
 
 def _keep_unknown(log_odds: NDArray[np.float32], pixels: Image, free: float) -> int:
@@ -164,19 +156,18 @@ def _keep_unknown(log_odds: NDArray[np.float32], pixels: Image, free: float) -> 
     return int(np.count_nonzero(grey))
 
 
-def _turned(grid: OccupancyGrid, yaw: float) -> OccupancyGrid:
+def _turned(grid: OccupancyGrid, yaw: float, name: str) -> OccupancyGrid:
     """Return a map, turned about its lower left corner by an angle, rad, on a grid along the axes: each cell takes the state of
     the one that its centre falls on."""
     g, turn = grid.geometry, np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     corners = (turn @ (g.resolution * np.array([[0, g.cols, 0, g.cols], [0, 0, g.rows, g.rows]], dtype=np.float64))).T
     low = g.resolution * np.floor(corners.min(axis=0) / g.resolution + 1e-6)
     cols, rows = np.ceil((corners.max(axis=0) - low) / g.resolution - 1e-6).astype(int).tolist()
-    found = np.zeros((rows, cols), dtype=np.float32)
     if rows * cols > MOST_PIXELS:
-        return OccupancyGrid(GridGeometry(g.resolution, g.origin + low, rows, cols), found)
+        raise FormatError("is too large to be turned as its origin says; turn the picture and set the yaw to 0", name)
+    found = np.zeros((rows, cols), dtype=np.float32)
     x = low[0] + g.resolution * (np.arange(cols) + 0.5)
-    for row in range(rows):
-        y = low[1] + g.resolution * (row + 0.5)
+    for row, y in enumerate((low[1] + g.resolution * (np.arange(rows) + 0.5)).tolist()):
         col = np.floor((turn[0, 0] * x + turn[1, 0] * y) / g.resolution + 1e-6).astype(np.intp)
         line = np.floor((turn[0, 1] * x + turn[1, 1] * y) / g.resolution + 1e-6).astype(np.intp)
         inside = np.flatnonzero((col >= 0) & (col < g.cols) & (line >= 0) & (line < g.rows))
@@ -205,9 +196,9 @@ def _log_odds(pixels: Image, negate: bool, occupied: float, free: float, mode: s
     return log_odds
 
 
-def _parse_yaml(text: str, path: str) -> dict[str, str | list[str]]:
+def _parse_yaml(text: str, path: str) -> Settings:
     """Read the flat YAML of a map: ``key: value``, lists in brackets or as ``- item`` lines, comments, quotes."""
-    settings: dict[str, str | list[str]] = {}
+    settings: Settings = {}
     key = ""
     for number, line in enumerate(text.splitlines(), 1):
         line = re.sub(r"(^|\s)#.*", "", line).rstrip()
@@ -230,23 +221,15 @@ def _parse_yaml(text: str, path: str) -> dict[str, str | list[str]]:
     return settings
 
 
-def _text(settings: dict[str, str | list[str]], key: str, path: str) -> str:
+def _text(settings: Settings, key: str, path: str) -> str:
     value = settings.get(key)
     if not isinstance(value, str) or not value:
         raise FormatError(f"{key} is missing; needed are image, resolution, origin, occupied_thresh and free_thresh", path)
     return value
 
 
-def _number(settings: dict[str, str | list[str]], key: str, path: str) -> float:
-    text = _text(settings, key, path)
+def _number(text: str, key: str, path: str) -> float:
     return finite(text, f"{key}: {text[:40]!r} is not a number", path)
-
-
-def _numbers(settings: dict[str, str | list[str]], key: str, path: str) -> list[float]:
-    value = settings.get(key)
-    if not isinstance(value, list):
-        raise FormatError(f"{key} must be a list of numbers", path)
-    return [finite(item, f"{key}: {item[:40]!r} is not a number", path) for item in value]
 
 
 def _read_picture(path: str) -> Image:
@@ -277,45 +260,23 @@ def _decode_pgm(start: bytes, rest: BinaryIO, path: str) -> Image:
     if not 0 < highest <= 255 or not 0 < width * height <= MOST_PIXELS:
         most = f"{MOST_PIXELS / 1e6:.0f} million pixels"
         raise FormatError(f"a PGM of {width} x {height} pixels with values up to {highest} is not read (at most {most})", path)
-    start = start[header.end() :]
+    start, count = start[header.end() :], width * height
     if header[1] == b"P2":
-        pixels = _text_pixels(start, rest, width * height, path)
+        text = start + rest.read(_TEXT_BYTES * count)
+        plain = re.fullmatch(rb"[\d\s]*", text) is not None and text.strip() != b""
+        values = np.fromstring(text, dtype=np.float32, sep=" ")[:count] if plain else np.zeros(0)
+        if (text.strip() and not plain) or values.max(initial=0.0) > 255.0:
+            raise FormatError("the PGM's pixels are damaged", path)
+        pixels = values.astype(np.uint8)
     else:
-        pixels = np.frombuffer(start + rest.read(max(width * height - len(start), 0)), dtype=np.uint8)
-    if len(pixels) < width * height:
+        pixels = np.frombuffer(start + rest.read(max(count - len(start), 0)), dtype=np.uint8)[:count]
+    if len(pixels) < count:
         raise FormatError("the PGM is cut off", path)
-    pixels = pixels[: width * height].reshape(height, width)
+    pixels = pixels.reshape(height, width)
     if highest != 255:
         pixels = (np.minimum(np.arange(256), highest) * (255.0 / highest)).astype(np.uint8)[pixels]
     return pixels
 
 
-def _text_pixels(start: bytes, rest: BinaryIO, count: int, path: str) -> Image:
-    """Return `count` whole numbers, or as many as there are."""
-    pixels, done, carry = np.empty(count, dtype=np.uint8), 0, b""
-    block = start
-    while done < count and (block or (block := rest.read(_TEXT_BYTES))):
-        text = carry + block
-        cut = max(text.rfind(b" "), text.rfind(b"\n"), text.rfind(b"\t")) + 1
-        words, carry, block = text[:cut].split(), text[cut:], b""
-        done = _take_words(words, pixels, done, path)
-        if len(carry) > 3 + _TEXT_BYTES // 2:
-            raise FormatError("the PGM's pixels are damaged", path)
-    return pixels[: _take_words(carry.split(), pixels, done, path)]
-
-
-_TEXT_BYTES = 1 << 18
-"""Bytes of a text picture taken apart at a time."""
-
-
-def _take_words(words: list[bytes], pixels: Image, done: int, path: str) -> int:
-    """Write numbers behind those that are there already; return how many there are then."""
-    words = words[: len(pixels) - done]
-    try:
-        values = np.array(words, dtype=np.intp)  # not uint8: numpy 1 wraps what is above 255
-    except (ValueError, OverflowError):
-        values = np.array([-1])
-    if len(values) and not 0 <= values.min() <= values.max() <= 255:
-        raise FormatError("the PGM's pixels are damaged", path)
-    pixels[done : done + len(words)] = values
-    return done + len(words)
+_TEXT_BYTES = 5
+"""Of a pixel in a text picture, with the blank or line end behind it."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
+from .graph_file import GraphFile, assembled, check_lines, check_planar, given_places, measurements, rows_of
 from .plain_edges import ENDS, Measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -70,20 +70,21 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     steps, seen = records["EDGE_SE2"], records["EDGE_SE2_XY"]
     pinned, surveyed = records["VERTEX_SE2:PRIOR"], records["VERTEX_XY:PRIOR"]
     ranged, meetings, surveys = _kinds_of_ranges(records["EDGE_RANGE"], pose_of, landmark_of)
-    ends = pose_of[steps.names]
-    for of, wrong, problem in (
+    ends, both = pose_of[steps.names], (meetings, surveys)
+    seen_both = (pose_of[seen.names[:, 0]] >= 0) & (landmark_of[seen.names[:, 1]] >= 0)
+    vertices, landmarks = records["VERTEX_SE2"], records["VERTEX_XY"]
+    checks = (
         (steps, (ends < 0).any(axis=1), "an edge between poses names a landmark"),
         (steps, ends[:, 0] == ends[:, 1], "an edge leads from a pose to itself"),
-        (seen, (pose_of[seen.names[:, 0]] < 0) | (landmark_of[seen.names[:, 1]] < 0), "needs a pose and a landmark"),
-        *((of, ~(of.numbers[:, 1] > 0), "the variance of a range must be positive") for of in (ranged, meetings, surveys)),
-        *((of, of.names[:, 0] == of.names[:, 1], "a range leads from a vertex to itself") for of in (meetings, surveys)),
+        (seen, ~seen_both, "needs a pose and a landmark"),
+        *((of, ~(of.numbers[:, 1] > 0), "the variance of a range must be positive") for of in (ranged, *both)),
+        *((of, of.names[:, 0] == of.names[:, 1], "a range leads from a vertex to itself") for of in both),
         (pinned, pose_of[pinned.names[:, 0]] < 0, "a prior on a pose names a landmark"),
         (surveyed, landmark_of[surveyed.names[:, 0]] < 0, "a prior on a landmark names a pose"),
-        (records["VERTEX_SE2"], pose_of[records["VERTEX_SE2"].names[:, 0]] < 0, "a pose is named like a landmark"),
-        (records["VERTEX_XY"], landmark_of[records["VERTEX_XY"].names[:, 0]] < 0, "a landmark is named like a pose"),
-    ):
-        if wrong.any():
-            raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
+        (vertices, pose_of[vertices.names[:, 0]] < 0, "a pose is named like a landmark"),
+        (landmarks, landmark_of[landmarks.names[:, 0]] < 0, "a landmark is named like a pose"),
+    )
+    check_lines(content, checks)
 
     index = {"pose": pose_of, "landmark": landmark_of}
     lines = {"relative": steps, "observation": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
@@ -91,12 +92,14 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     plain = {}
     for kind, of in lines.items():
         found = measurements(of, kind, index, content, "covariance")
-        plain[kind] = found._replace(information=_inverse(found.information, of, content))
-    poses = given_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content)
-    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
+        inverse, least = _inverted(found.information)
+        check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
+        plain[kind] = found._replace(information=inverse)
+    poses = given_places(vertices, pose_of, len(pose_ids), content)
+    anchors = given_places(landmarks, landmark_of, len(landmark_ids), content)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
-    stamps[pose_of[records["VERTEX_SE2"].names[:, 0]]] = records["VERTEX_SE2"].stamps
+    stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
     return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content, from_odometry)
 
 
@@ -151,8 +154,8 @@ def _lines(
     """Yield the lines of each tag."""
     first = int(np.argmax(graph.fixed_poses)) if len(graph.poses) else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
-    yield _rows("VERTEX_SE2", stamps, [poses], graph.poses)
-    yield _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])
+    yield rows_of("VERTEX_SE2", " %.6f %s", [stamps, poses], graph.poses)
+    yield rows_of("VERTEX_XY", " %s", [anchors[placed]], graph.anchors[placed])
     names = {"pose": poses, "landmark": anchors}
     for kind, tag in _TAGS.items():
         m = plain[kind]
@@ -160,33 +163,17 @@ def _lines(
         # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
         at = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
         when = stamps[at[-1 if kind == "relative" else 0]] if at else np.full(len(m.value), stamps[first])
-        yield _rows(tag, when, ends, m.value, _covariances(m.information))
+        covariances = upper_triangle(_inverted(m.information)[0])
+        yield rows_of(tag, " %.6f" + " %s" * len(ends), [when, *ends], m.value, covariances)
 
 
-def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> str:
-    """Return the lines of one tag; numbers are written so that they read back as they were."""
-    numbers, times = np.concatenate(columns, axis=1) + 0.0, [] if stamps is None else [stamps]
-    line = tag + " %.6f" * len(times) + " %s" * len(names) + " %r" * numbers.shape[1] + "\n"
-    return "".join(map(line.__mod__, zip(*(column.tolist() for column in (*times, *names, *numbers.T)), strict=True)))
-
-
-def _covariances(information: Floats) -> Floats:
-    """Return upper triangles of covariances (e, k (k + 1) / 2)."""
-    if len(information) == 0:
-        return upper_triangle(information)
-    values, vectors = np.linalg.eigh(information)
-    return upper_triangle((vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2))
-
-
-def _inverse(covariance: Floats, of: Records, content: RecordFile) -> Floats:
-    """Return the information matrices (e, k, k)."""
-    if len(covariance) == 0:
-        return covariance
-    values, vectors = np.linalg.eigh(covariance)
-    bad = np.flatnonzero(~(values[:, 0] > 0))
-    if len(bad):
-        raise content.error("the covariance matrix is singular", int(of.lines[bad[0]]))
-    return (vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+def _inverted(matrices: Floats) -> tuple[Floats, Floats]:
+    """Return the inverses (e, k, k) of symmetric matrices, and their least eigenvalues (e,)."""
+    if len(matrices) == 0:
+        return matrices, np.zeros(0)
+    values, vectors = np.linalg.eigh(matrices)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2), values[:, 0]
 
 
 def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ...], Ints]:

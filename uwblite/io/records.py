@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import FormatError
-from .source import OVERLONG_LINE, TextSource
+from .source import OVERLONG_LINE, TextSource, finite
 
 _TAGS_COUNTED = 100
 _FARTHEST = 1e9
@@ -81,19 +81,13 @@ def read_records(source: TextSource, layouts: Mapping[str, Layout]) -> RecordFil
     parts: dict[bytes, list[Records]] = {tag: [] for tag in known}
     names: dict[bytes, int] = {}
     result = RecordFile(source.path, [], {})
-    read = 0
-    for block in source.blocks():
+    for block in source.rows():
         rows: dict[bytes, list[tuple[int, list[bytes]]]] = {}
-        lines = block.split(b"\n")[:-1]
-        for number, line in enumerate(lines, read + 1):
-            tokens = line.split()
-            if not tokens or tokens[0].startswith(b"#"):
-                continue
+        for number, tokens in block:
             if tokens[0] in known:
                 rows.setdefault(tokens[0], []).append((number, tokens))
             else:
                 _count(result, tokens[0], number)
-        read += len(lines)
         for tag, found in rows.items():
             parts[tag].append(_table(found, known[tag], names, result))
     result.names = list(names)
@@ -123,7 +117,10 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
     try:
         values = np.array(numeric, dtype=np.float64).reshape(len(rows), -1)
     except ValueError:
-        raise _not_a_number(rows, numeric, result) from None
+        for (line, _), words in zip(rows, numeric, strict=True):
+            for word in words:
+                finite(word, f"{word[:30]!r} is not a number", result.path, line)
+        raise result.error("a number cannot be read", rows[0][0]) from None
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise result.error("a number is not finite", rows[bad[0]][0])
@@ -139,16 +136,6 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
         np.array(indices, dtype=np.intp).reshape(len(rows), layout.names),
         values[:, 1:] if layout.stamped else values,
     )
-
-
-def _not_a_number(rows: list[tuple[int, list[bytes]]], numeric: list[list[bytes]], result: RecordFile) -> FormatError:
-    for (line, _), tokens in zip(rows, numeric, strict=True):
-        for token in tokens:
-            try:
-                float(token)
-            except ValueError:
-                return result.error(f"{token[:30]!r} is not a number", line)
-    return result.error("a number cannot be read", rows[0][0])
 
 
 def _joined(parts: list[Records], layout: Layout) -> Records:

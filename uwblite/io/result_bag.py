@@ -13,8 +13,8 @@ from ..errors import ConfigError
 from ..report import palette
 from ..report.palette import share
 from ..sensor_log import SensorLog
-from .ros_messages import BASE, MAP, ODOM, Messages
-from .rosbag_writer import Stamped, recording_messages, write_messages
+from . import ros_messages as ros
+from .rosbag_writer import TF, Stamped, recording_messages, write_messages
 from .stored_result import StoredAnchor, StoredResult
 
 _MOST_POSES = 10_000
@@ -46,7 +46,7 @@ def write_result_bag(
     _check(result, logs)
     trajectories = tuple((_from_zero(stamps), poses) for stamps, poses in result.trajectories)
     result = replace(result, trajectories=trajectories, keyframe_stamps=_from_zero(result.keyframe_stamps))
-    write_messages(path, lambda make: _messages(result, logs, make), storage=storage)
+    write_messages(path, _messages(result, logs), storage=storage)
 
 
 def _from_zero(stamps: Floats) -> Floats:
@@ -65,80 +65,78 @@ def _check(result: StoredResult, logs: Sequence[SensorLog]) -> None:
             raise ConfigError(f"{name} lasts from {first:.1f} to {last:.1f} s, the map's recording {begin:.1f} to {end:.1f} s")
 
 
-def _messages(result: StoredResult, logs: Sequence[SensorLog], make: Messages) -> Iterator[Stamped]:
+def _messages(result: StoredResult, logs: Sequence[SensorLog]) -> Iterator[Stamped]:
     first = min(float(stamps[0]) for stamps, _ in result.trajectories)
-    yield from _once(result, make, first)
-    moving = [_poses(result, make)]
+    yield from _once(result, first)
+    moving = [_poses(result)]
     for number, (stamps, poses) in enumerate(result.trajectories, 1):
         prefix = "" if number == 1 else f"recording_{number}/"
         if logs:
             log = logs[number - 1]
-            moving += [recording_messages(log, make, prefix=prefix), _corrections(result, number, log, make, prefix)]
+            # T_map_odom = T_map_base T_odom_base^-1 at every reading of the wheels.
+            stamps = log.odometry.stamps
+            poses = se2.compose(result.pose_at(number, stamps), se2.inverse(log.odometry.poses))
+            moving += [recording_messages(log, prefix=prefix), _transforms(ros.MAP, prefix + ros.ODOM, stamps, poses)]
         else:
-            yield first, "/tf_static", make.tf(first, MAP, prefix + ODOM, np.zeros(3))
-            pairs = zip(stamps.tolist(), poses, strict=True)
-            moving.append((t, "/tf", make.tf(t, prefix + ODOM, prefix + BASE, pose)) for t, pose in pairs)
+            yield first, "/tf_static", TF, ros.tf(first, ros.MAP, prefix + ros.ODOM, np.zeros(3))
+            moving.append(_transforms(prefix + ros.ODOM, prefix + ros.BASE, stamps, poses))
     yield from heapq.merge(*moving, key=lambda message: message[0])
 
 
-def _corrections(result: StoredResult, number: int, log: SensorLog, make: Messages, prefix: str) -> Iterator[Stamped]:
-    """Yield T_map_odom = T_map_base T_odom_base^-1 at every reading of the wheels."""
-    stamps = log.odometry.stamps
-    T_map_odom = se2.compose(result.pose_at(number, stamps), se2.inverse(log.odometry.poses))
-    for stamp, pose in zip(stamps.tolist(), T_map_odom, strict=True):
-        yield stamp, "/tf", make.tf(stamp, MAP, prefix + ODOM, pose)
+def _transforms(parent: str, child: str, stamps: Floats, poses: Floats) -> Iterator[Stamped]:
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        yield stamp, "/tf", TF, ros.tf(stamp, parent, child, pose)
 
 
-def _poses(result: StoredResult, make: Messages) -> Iterator[Stamped]:
+def _poses(result: StoredResult) -> Iterator[Stamped]:
     order = np.argsort(result.keyframe_stamps, kind="stable")
     for k in order.tolist():
         stamp, number = float(result.keyframe_stamps[k]), int(result.keyframe_recordings[k])
-        pose = result.pose_at(number, np.array(stamp))
+        pose = ros.pose_with_covariance(stamp, result.pose_at(number, np.array(stamp)), result.keyframe_covariances[k])
         topic = "/pose" if number == 1 else f"/recording_{number}/pose"
-        yield stamp, topic, make.pose_with_covariance(stamp, pose, result.keyframe_covariances[k])
+        yield stamp, topic, "geometry_msgs/msg/PoseWithCovarianceStamped", pose
 
 
-def _once(result: StoredResult, make: Messages, first: float) -> Iterator[Stamped]:
+def _once(result: StoredResult, first: float) -> Iterator[Stamped]:
     """Yield what does not change: map, paths and markers."""
     if result.grid is not None:
-        yield first, "/map", make.grid(first, result.grid)
+        yield first, "/map", "nav_msgs/msg/OccupancyGrid", ros.occupancy(first, result.grid)
     for number, (stamps, poses) in enumerate(result.trajectories, 1):
         step = -(-len(stamps) // _MOST_POSES)
-        yield first, "/path" if number == 1 else f"/path_{number}", make.path(stamps[::step], poses[::step])
-    if anchors := [marker for k, a in enumerate(result.anchors) for marker in _anchor_markers(a, k, first, make)]:
-        yield first, "/anchors", make.make("visualization_msgs/MarkerArray", markers=anchors)
-    if result.closures:
-        yield first, "/closures", make.make("visualization_msgs/MarkerArray", markers=_closure_markers(result, first, make))
+        topic = "/path" if number == 1 else f"/path_{number}"
+        yield first, topic, "nav_msgs/msg/Path", ros.path(stamps[::step], poses[::step])
+    anchors = [marker for k, a in enumerate(result.anchors) for marker in _anchor_markers(a, k, first)]
+    for topic, markers in (("/anchors", anchors), ("/closures", _closure_markers(result, first))):
+        if markers:
+            yield first, topic, "visualization_msgs/msg/MarkerArray", {"markers": markers}
 
 
-def _anchor_markers(anchor: StoredAnchor, number: int, stamp: float, make: Messages) -> list[object]:
+def _anchor_markers(anchor: StoredAnchor, number: int, stamp: float) -> list[ros.Fields]:
     """Return an anchor's point, name and ellipse of two sigma; nothing where it has no place."""
     if not np.isfinite(anchor.position).all():
         return []
     x, y = anchor.position.tolist()
-    pose = make.pose(np.array([x, y, 0.0]))
-    above = make.make("geometry_msgs/Pose", position=make.point(x, y, 0.4), orientation=make.turn(0.0))
+    above, size = {"position": ros.xyz(x, y, 0.4), "orientation": ros.turn(0.0)}, ros.xyz(0.0, 0.0, 0.3)
     markers = [
-        make.marker(stamp, "anchors", number, _SPHERE, _ANCHOR, pose=pose, scale=make.vector(0.2, 0.2, 0.2)),
-        make.marker(stamp, "names", number, _TEXT, _ANCHOR, pose=above, scale=make.vector(0.0, 0.0, 0.3), text=anchor.id),
+        ros.marker(
+            stamp, "anchors", number, _SPHERE, _ANCHOR, pose=ros.pose(np.array([x, y, 0.0])), scale=ros.xyz(0.2, 0.2, 0.2)
+        ),
+        ros.marker(stamp, "names", number, _TEXT, _ANCHOR, pose=above, scale=size, text=anchor.id),
     ]
     if np.isfinite(anchor.covariance).all():
         values, vectors = np.linalg.eigh(anchor.covariance)
         width, length = 4.0 * np.sqrt(np.maximum(values, 1e-6))
-        turned = make.pose(np.array([x, y, np.arctan2(vectors[1, 1], vectors[0, 1])]))
-        faint = (*_ANCHOR[:3], 0.3)
-        markers.append(
-            make.marker(stamp, "two sigma", number, _CYLINDER, faint, pose=turned, scale=make.vector(length, width, 0.02))
-        )
+        turned = ros.pose(np.array([x, y, np.arctan2(vectors[1, 1], vectors[0, 1])]))
+        size, faint = ros.xyz(length, width, 0.02), (*_ANCHOR[:3], 0.3)
+        markers.append(ros.marker(stamp, "two sigma", number, _CYLINDER, faint, pose=turned, scale=size))
     return markers
 
 
-def _closure_markers(result: StoredResult, stamp: float, make: Messages) -> list[object]:
+def _closure_markers(result: StoredResult, stamp: float) -> list[ros.Fields]:
     """Return accepted and rejected closures as lines."""
     markers = []
     for number, (name, wanted, colour) in enumerate((("accepted", True, _ACCEPTED), ("rejected", False, _REJECTED))):
-        ends = [make.point(*place) for c in result.closures if c.accepted == wanted for place in c.places.tolist()]
+        ends = [ros.xyz(*place) for c in result.closures if c.accepted == wanted for place in c.places.tolist()]
         if ends:
-            width = make.vector(0.03, 0.0)
-            markers.append(make.marker(stamp, name, number, _LINES, colour, scale=width, points=ends))
+            markers.append(ros.marker(stamp, name, number, _LINES, colour, scale=ros.xyz(0.03, 0.0), points=ends))
     return markers

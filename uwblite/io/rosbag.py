@@ -6,22 +6,18 @@ those of the headers.
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
 from ..errors import FormatError
-from ..sensor_log import LaserScans, LogNotes, SensorLog, SensorMounting, UwbRanges
-from .bag_clock import BagClock
-from .bag_frames import Frames, planar
-from .bag_imu import ImuReadings
-from .bag_odometry import MovingFrames, OdometryReadings, no_odometry, once_each
-from .bag_ranges import RangeReadings
+from ..sensor_log import LogNotes, Odometry, SensorLog, SensorMounting
+from .bag_motion import BagClock, Frames, MovingFrames, OdometryReadings, no_odometry, planar
 from .bag_reading import open_bag
-from .bag_scans import ScanReadings
+from .bag_sensors import ImuReadings, RangeReadings, ScanReadings
 from .bag_topics import GUESSED, ODOMETRY, BagTopic, BagTopics, TopicPlan, is_truth, plan_topics, unread_warning
 from .files import sha256_of
 from .uwb_mapping import UwbMapping, readings_of, short_type
@@ -109,34 +105,43 @@ class Collector:
     def _by_transforms(self) -> bool:
         return not self.plan.odometry or self.plan.odometry in self.plan.tf
 
-    def log(self, path: str, sha256: str, held: tuple[BagTopic, ...] = (), notes: list[str] | None = None) -> SensorLog:
+    def log(self, path: str, sha256: str, held: tuple[BagTopic, ...] = (), notes: Sequence[str] = ()) -> SensorLog:
         """Return the collected messages as a recording.
 
         Parameters
         ----------
         held : topics of the bag. notes : what is odd about the bag itself.
         """
-        warnings = [*(notes or ()), *self._warnings()]
-        table = self._odometry_table(path, held, warnings)
+        warnings = [*notes, *self._warnings()]
+        odometry = self._odometry(path, held, warnings)
+        mounting, laser, places = SensorMounting(), None, np.zeros((1, 3))
         scans = self.scans.scans(self.clock.offset("scans"), warnings)
         ranges, tags = self.ranges.ranges(self.clock.offset("ranges"), warnings)
-        mounting = self._mounting(scans, ranges, tags, warnings)
+        if scans is not None and (laser := self.frames.pose(self.base_frame, self.scans.frame)) is None:
+            warnings.append(
+                f"no transform from {self.base_frame} to {self.scans.frame}: the laser is taken to sit in the middle of"
+                " the robot, looking ahead; give --laser-pose X,Y,THETA where it does not"
+            )
+        if ranges is not None:
+            places = self.ranges.places(tags, self.frames, self.base_frame, warnings)
+        pose, flipped = (mounting.T_base_laser, False) if laser is None else planar(laser)
+        mounting = SensorMounting(pose, flipped, places[0], more_tags=places[1:])
         gyro = self.imu.gyro(self.frames, self.base_frame, warnings) if self.plan.imu else None
         if self.frames.invalid:
             names = ", ".join(sorted(self.frames.invalid)[:5])
             warnings.append(f"transforms without a rotation (a quaternion of zeros, or no number) were left out: {names}")
         warnings += self.clock.warnings()
         log_notes = LogNotes(source=path, sha256=sha256, warnings=tuple(warnings), unread=tuple(self.plan.unread))
-        return SensorLog(once_each(table), ranges, scans, mounting, log_notes, gyro=gyro)
+        return SensorLog(odometry, ranges, scans, mounting, log_notes, gyro=gyro)
 
-    def _odometry_table(self, path: str, held: tuple[BagTopic, ...], warnings: list[str]) -> Floats:
-        """Return stamp and pose (n, 4) of the odometry.
+    def _odometry(self, path: str, held: tuple[BagTopic, ...], warnings: list[str]) -> Odometry:
+        """Return the odometry.
 
         Raises
         ------
         FormatError : there is none, or it has no headings.
         """
-        where = self.plan.odometry
+        where, cure = self.plan.odometry, "; where tf has a transform from odom to the base: --odometry-topic /tf"
         if self._by_transforms:
             best = self.moving.best(self.base_frame)
             if best is None:
@@ -144,34 +149,16 @@ class Collector:
                 truths = [t.name for t in held if t.type == ODOMETRY and is_truth(t.name)]
                 raise FormatError(no_odometry(topics, truths, self.frames.steps), path)
             (parent, child), self.odometry = best
-            self.base_frame, where = self.base_frame or child, f"tf, {parent} -> {child}"
+            self.base_frame, where, cure = self.base_frame or child, f"tf, {parent} -> {child}", ""
             reason = "no topic of nav_msgs/Odometry is there" if not self.plan.odometry else "as asked"
             others = [" -> ".join(pair) for pair in self.moving.pairs if pair != (parent, child)]
             more = f"; --base-frame takes another ({', '.join(others[:4])})" if others else ""
             warnings.append(f"the odometry is read from {where}: {reason}{more}")
-        table = self.odometry.table(warnings)
-        if not len(table):
-            cure = "" if self._by_transforms else "; where tf has a transform from odom to the base: --odometry-topic /tf"
-            said = warnings[-1] if len(self.odometry) else "there is no message"
-            raise FormatError(f"no message on {where} can be used: {said}{cure}", path)
-        return table
-
-    def _mounting(
-        self, scans: LaserScans | None, ranges: UwbRanges | None, tags: tuple[str, ...], warnings: list[str]
-    ) -> SensorMounting:
-        T_base_laser, flipped, places = np.zeros(3), False, np.zeros((1, 3))
-        if scans is not None:
-            pose = self.frames.pose(self.base_frame, self.scans.frame)
-            if pose is None:
-                warnings.append(
-                    f"no transform from {self.base_frame} to {self.scans.frame}: the laser is taken to sit in the middle of"
-                    " the robot, looking ahead; give --laser-pose X,Y,THETA where it does not"
-                )
-            else:
-                T_base_laser, flipped = planar(pose)
-        if ranges is not None:
-            places = self.ranges.places(tags, self.frames, self.base_frame, warnings)
-        return SensorMounting(T_base_laser, flipped, places[0], more_tags=places[1:])
+        odometry = self.odometry.odometry(warnings)
+        if odometry is None:
+            why = warnings[-1] if len(self.odometry) else "there is no message"
+            raise FormatError(f"no message on {where} can be used: {why}{cure}", path)
+        return odometry
 
     def _warnings(self) -> list[str]:
         chosen = {name for text in self.plan.choices for name in self.plan.passed_over if name in text}

@@ -4,18 +4,19 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import ConfigError, FormatError, UwbliteError
 from ..sensor_log import SensorLog
+from . import ros_messages as ros
 from .files import shortened
 from .optional_packages import missing_package
-from .ros_messages import BASE, ODOM, Messages, nanoseconds
 
 _FORMAT: Final = 8
 """Version of rosbag2's metadata. From 9 on QoS policies are words, which ROS 2 Humble refuses ("bad conversion"); later
@@ -24,8 +25,8 @@ releases read all earlier versions (ros2/rosbag2#1895)."""
 _LAST_STAMP: Final = 2.0**31
 """s; ROS 2 counts them in 32 bits."""
 
-Stamped = tuple[float, str, Any]
-"""Time of recording, s; topic; message."""
+Stamped = tuple[float, str, str, ros.Fields]
+"""Time of recording, s; topic; type, such as nav_msgs/msg/Path; fields of the message."""
 
 LATCHED = ("/tf_static", "/map", "/anchors", "/closures", "/path")
 """Topics whose last message a late subscriber gets too (transient local), and those that begin so, as /path_2."""
@@ -48,12 +49,10 @@ def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "m
     ------
     ConfigError : the package rosbags is not installed, or the folder exists.
     """
-    write_messages(path, lambda make: recording_messages(log, make), storage=storage)
+    write_messages(path, recording_messages(log), storage=storage)
 
 
-def write_messages(
-    path: str | os.PathLike[str], messages: Callable[[Messages], Iterator[Stamped]], *, storage: str = "mcap"
-) -> None:
+def write_messages(path: str | os.PathLike[str], messages: Iterable[Stamped], *, storage: str = "mcap") -> None:
     """Write messages as a ROS 2 bag, whole or not at all; see `write_bag`.
 
     Parameters
@@ -75,15 +74,16 @@ def write_messages(
     try:
         with _errors_of_ours(target), Writer(waiting / "bag", version=_FORMAT, storage_plugin=plugin) as writer:
             connections: dict[str, Any] = {}
-            for stamp, topic, message in messages(Messages(store)):
+            for stamp, topic, kind, fields in messages:
                 if not 0.0 <= stamp < _LAST_STAMP:
                     problem = f"a stamp of {stamp:.0f} s has no place in a ROS message, which counts seconds from 0 to 2^31"
                     raise FormatError(f"{problem}; in which unit, and since when, does the recording count?", str(target))
-                kind = message.__msgtype__
                 if topic not in connections:
                     offered = [_profile(topic)]
                     connections[topic] = writer.add_connection(topic, kind, typestore=store, offered_qos_profiles=offered)
-                writer.write(connections[topic], nanoseconds(stamp), store.serialize_cdr(message, kind))
+                writer.write(
+                    connections[topic], ros.nanoseconds(stamp), store.serialize_cdr(ros.made(store, kind, fields), kind)
+                )
         os.replace(next((waiting / "bag").glob("*.mcap")) if single else waiting / "bag", target)
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
@@ -120,7 +120,7 @@ def _profile(topic: str) -> Any:
     )
 
 
-def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> Iterator[Stamped]:
+def recording_messages(log: SensorLog, *, prefix: str = "") -> Iterator[Stamped]:
     """Yield a recording's messages in time order; the static transforms come first.
 
     Parameters
@@ -129,28 +129,37 @@ def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> I
     """
     sensors = (log.odometry, log.gyro, log.ranges, log.scans)
     first = min(float(s.stamps[0]) for s in sensors if s is not None and len(s.stamps))
-    yield first, "/tf_static", make.mounting(first, log.mounting, prefix)
-    topic = f"/{prefix}"
-    stamps = log.odometry.stamps
-    sources: list[tuple[Any, Callable[[int], tuple[str, Any]]]] = [
-        (stamps, lambda k: (f"{topic}odom", make.odometry(log, k, prefix))),
-        (stamps, lambda k: ("/tf", make.tf(float(stamps[k]), prefix + ODOM, prefix + BASE, log.odometry.poses[k]))),
+    yield first, "/tf_static", TF, ros.mounting(first, log.mounting, prefix)
+    stamps, poses = log.odometry.stamps, log.odometry.poses
+
+    def tf(k: int) -> ros.Fields:
+        return ros.tf(float(stamps[k]), prefix + ros.ODOM, prefix + ros.BASE, poses[k])
+
+    def topic(name: str) -> Callable[[int], str]:
+        return lambda _: f"/{prefix}{name}"
+
+    sources: list[tuple[Floats, Callable[[int], str], str, Callable[[int], ros.Fields]]] = [
+        (stamps, topic("odom"), "nav_msgs/msg/Odometry", lambda k: ros.odometry(log, k, prefix)),
+        (stamps, lambda _: "/tf", TF, tf),
     ]
     if log.gyro is not None:
-        sources.append((log.gyro.stamps, lambda k: (f"{topic}imu", make.gyro(log, k, prefix))))
-    if log.ranges is not None:
-        ranges = log.ranges
+        sources.append((log.gyro.stamps, topic("imu"), "sensor_msgs/msg/Imu", lambda k: ros.gyro(log, k, prefix)))
+    if (ranges := log.ranges) is not None:
         ranges.require_one_tag("a bag")
-        names = _topic_names(ranges.anchor_ids, topic)
-        sources.append((ranges.stamps, lambda k: (names[ranges.anchor[k]], make.range(log, k))))
+        names = _topic_names(ranges.anchor_ids, f"/{prefix}")
+        row = (lambda k: names[ranges.anchor[k]]), "sensor_msgs/msg/Range", lambda k: ros.range_to_anchor(log, k)
+        sources.append((ranges.stamps, *row))
     if log.scans is not None:
-        sources.append((log.scans.stamps, lambda k: (f"{topic}scan", make.scan(log, k, prefix))))
-    times = np.concatenate([s for s, _ in sources])
-    kind = np.repeat(np.arange(len(sources)), [len(s) for s, _ in sources])
-    index = np.concatenate([np.arange(len(s)) for s, _ in sources])
-    for k in np.argsort(times, kind="stable").tolist():
-        name, message = sources[kind[k]][1](int(index[k]))
-        yield float(times[k]), name, message
+        sources.append((log.scans.stamps, topic("scan"), "sensor_msgs/msg/LaserScan", lambda k: ros.scan(log, k, prefix)))
+    times = np.concatenate([s for s, *_ in sources])
+    which = np.repeat(np.arange(len(sources)), [len(s) for s, *_ in sources])
+    index = np.concatenate([np.arange(len(s)) for s, *_ in sources])
+    for n in np.argsort(times, kind="stable").tolist():
+        (_, named, kind, fields), k = sources[which[n]], int(index[n])
+        yield float(times[n]), named(k), kind, fields(k)
+
+
+TF = "tf2_msgs/msg/TFMessage"
 
 
 def _topic_names(ids: tuple[str, ...], prefix: str) -> list[str]:

@@ -118,6 +118,15 @@ class TextSource:
         if carry:
             yield carry + b"\n"
 
+    def rows(self) -> Iterator[list[tuple[int, list[bytes]]]]:
+        """Yield line number and words of the lines that are neither blank nor a comment (#), a block of lines at a time."""
+        read = 0
+        for block in self.blocks():
+            lines = block.split(b"\n")[:-1]
+            rows = ((number, line.split()) for number, line in enumerate(lines, read + 1))
+            yield [(number, words) for number, words in rows if words and not words[0].startswith(b"#")]
+            read += len(lines)
+
 
 @contextmanager
 def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = None) -> Iterator[TextSource]:

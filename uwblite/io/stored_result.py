@@ -2,7 +2,8 @@
 
 import json
 import os
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,19 +117,10 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
     trajectories = tuple(read_tum(p) for p in (path / "trajectory.tum", *(p for p in later if p.is_file())))
     report = _report(path / "report.json")
     stamps, recordings, covariances = _keyframes(path / "trajectory_covariance.csv", len(trajectories))
-    result = StoredResult(
-        path,
-        trajectories,
-        stamps,
-        recordings,
-        covariances,
-        _anchors(path / "anchors.csv"),
-        (),
-        _ranges(path / "range_errors.csv"),
-        read_map(path / "map.yaml") if (path / "map.yaml").exists() else None,
-        report,
-    )
-    return _with_closures(result)
+    anchors, ranges = _anchors(path / "anchors.csv"), _ranges(path / "range_errors.csv")
+    grid = read_map(path / "map.yaml") if (path / "map.yaml").exists() else None
+    result = StoredResult(path, trajectories, stamps, recordings, covariances, anchors, (), ranges, grid, report)
+    return replace(result, closures=tuple(_closures(result)))
 
 
 def _ranges(path: Path) -> StoredRanges:
@@ -189,18 +181,13 @@ def _pose(values: Any) -> Floats | None:
     return np.array(values, dtype=np.float64) if good else None
 
 
-def _with_closures(result: StoredResult) -> StoredResult:
-    """Return the result with the closures of its report; those of keyframes that the tables do not know are left out."""
-    from dataclasses import replace
-
-    count, found = len(result.keyframe_stamps), []
+def _closures(result: StoredResult) -> Iterator[StoredClosure]:
+    """Yield the closures of a result's report; those of keyframes that the tables do not know are left out."""
     for entry in result.report.get("closures") or ():
-        ends = (entry.get("i"), entry.get("j"))
-        if not all(isinstance(k, int) and 0 <= k < count for k in ends):
+        i, j = entry.get("i"), entry.get("j")
+        if not all(isinstance(k, int) and 0 <= k < len(result.keyframe_stamps) for k in (i, j)):
             continue
-        numbers = tuple(int(result.keyframe_recordings[k]) for k in ends)
-        stamps = tuple(float(result.keyframe_stamps[k]) for k in ends)
-        places = np.array([result.pose_at(n, np.array(t))[:2] for n, t in zip(numbers, stamps, strict=True)])
+        (one, other), (start, end) = result.keyframe_recordings[[i, j]].tolist(), result.keyframe_stamps[[i, j]].tolist()
+        places = np.array([result.pose_at(n, np.array(t))[:2] for n, t in ((one, start), (other, end))])
         kept, why = entry.get("accepted", entry.get("outcome") == "accepted"), str(entry.get("reason", ""))
-        found.append(StoredClosure(stamps, numbers, places, bool(kept), why, _pose(entry.get("T_i_j"))))  # type: ignore[arg-type]
-    return replace(result, closures=tuple(found))
+        yield StoredClosure((start, end), (one, other), places, bool(kept), why, _pose(entry.get("T_i_j")))

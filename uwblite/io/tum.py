@@ -1,4 +1,4 @@
-"""Trajectories as evo reads them: TUM text, ``timestamp tx ty tz qx qy qz qw``, and KITTI text, a pose matrix a line."""
+"""Trajectories as evo reads them, TUM and KITTI text, and relations between scans."""
 
 import os
 
@@ -75,16 +75,11 @@ def read_rows(path: str | os.PathLike[str], columns: str, what: str) -> Floats:
     ------
     FormatError : a line has not eight finite numbers, or there is none.
     """
-    parts: list[Floats] = []
+    parts: list[Floats] = [np.zeros((0, 8))]
     with open_source(path) as source:
-        number = 0
-        for block in source.blocks():
-            lines = block.split(b"\n")[:-1]
-            rows = [(number + i, line.split()) for i, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
-            rows = [(n, tokens) for n, tokens in rows if tokens]
+        for rows in source.rows():
             parts.append(_numbers(rows, source.path, columns))
-            number += len(lines)
-        table = np.concatenate(parts) if parts else np.zeros((0, 8))
+        table = np.concatenate(parts)
         if len(table) == 0:
             raise FormatError(f"no {what} in it", source.path)
     return table
@@ -105,3 +100,22 @@ def _numbers(rows: list[tuple[int, list[bytes]]], path: str, columns: str) -> Fl
     if len(bad):
         raise FormatError("a number is not finite", path, rows[bad[0]][0])
     return table
+
+
+def read_relations(path: str | os.PathLike[str]) -> tuple[Floats, Floats, Floats]:
+    """Read relations between scans, as the SLAM benchmark of Kuemmerle et al. has them; height, roll and pitch are dropped.
+
+    Parameters
+    ----------
+    path : the file, plain or gzip; ``-`` = standard input. Blank lines and lines beginning with ``#`` are skipped.
+
+    Returns
+    -------
+    stamp1, stamp2 : (r,) s. T_1_2 : (r, 3) pose of the second scan as seen from the first; m, m, rad.
+
+    Raises
+    ------
+    FormatError : a line has not eight finite numbers, or there is no relation.
+    """
+    table = read_rows(path, "stamp1 stamp2 x y z roll pitch yaw", "relations")
+    return table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]].copy()

@@ -66,7 +66,8 @@ def learnt_noise(residual: Floats, reach: Floats, place: Ints, surface: Ints, cu
         own = np.abs(residual[number == k])
         if len(own) >= _FEWEST:
             by_distance[k] = max(MAD_TO_SIGMA * float(np.median(own)), _LEAST)
-    clipped = np.clip(residual / by_distance[number], -_CLIP, _CLIP)
+    clipped = residual / by_distance[number]
+    clipped = np.where(np.abs(clipped) < _CLIP, clipped, 0.0)
     return RayNoise(by_distance, _design_effects(clipped, place, surface, curved))
 
 

@@ -162,6 +162,14 @@ class Surroundings:
         return rows, which, away
 
 
+    def on_rim(self, at: Floats, margin: float) -> Bools:
+        """Return which points (p, 2) are nearer to a column's rim than a margin, m."""
+        rows, which, away = self.nearest(at)
+        found = np.zeros(len(at), dtype=bool)
+        found[rows] = np.abs(away - self.columns[which, 2]) < margin
+        return found
+
+
 _SQUARE, _MOST_SQUARES = 0.2, 1e6
 """Size of a square, m, and the largest number of squares; a larger map gets larger squares."""
 

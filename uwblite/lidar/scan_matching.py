@@ -5,7 +5,7 @@ pose (3 x 3), which is all that the graph needs.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,49 +183,6 @@ def condensed(
         squared=summed[:, 3, 3],
         weight=np.einsum("en,en->e", root, root),
     )
-
-
-def shifts_by_range_error(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float, turn: Floats
-) -> Floats:
-    """Return the sensitivity of pairs to a common error of all ranges to surfaces that face one way.
-
-    A range too long by c puts points c farther out along their rays. Seen from one place, that moves a wall by less where the
-    ray is oblique; from the next place it is another part of the wall that is moved less, and the pair comes out shifted and
-    turned: r changes by n . (R ray_p - ray_q) for each match. The ray is taken from the origin of the base: the exact place of
-    the laser changes both rays equally.
-
-    Parameters
-    ----------
-    gate, scale, points : see match. turn : (e,) heading of cloud i in a frame that all pairs share, rad: the ways to face are
-        the quarters about its axes.
-
-    Returns
-    -------
-    (e, 4, 3) change of the error Z^-1 T_i_j by metre of the surfaces that face each quarter, m/m and rad/m; 0 along what the
-    scans cannot see.
-    """
-    parts, slopes = [], np.zeros((len(i), 4, 3))
-    for found in correspondences(clouds, raster, i, T_i_j, points, gate):
-        parts.append(condensed(clouds, found, scale))
-        (nx, ny), (rx, ry) = found.normal, found.arm
-        qx, qy = (column.take(found.target) for column in clouds.points.T)
-        far_p, far_q = np.maximum(np.hypot(rx, ry), _NEAREST), np.maximum(np.hypot(qx, qy), _NEAREST)
-        by_range = nx * (rx / far_p - qx / far_q) + ny * (ry / far_p - qy / far_q)
-        weighted = found.good / np.square(1.0 + np.square(found.distance * (1.0 / scale))) * by_range
-        quarter = np.floor((np.arctan2(ny, nx) + turn[found.pairs, None]) * (2.0 / np.pi) + 0.5).astype(np.intp) % 4
-        for k in range(4):
-            own = weighted * (quarter == k)
-            sums = [(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)]
-            slopes[found.pairs, k] = np.stack(sums, axis=1)
-    factors = concatenated(parts)
-    moved = np.stack([nondegenerate_step(replace(factors, gradient=slopes[:, k]))[0] for k in range(4)], axis=1)
-    moved[..., :2] = se2.rotate(-T_i_j[:, None, 2], moved[..., :2])
-    return -moved
-
-
-_NEAREST = 0.05
-"""Distance of a point below which the direction of its ray is not defined, m."""
 
 
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:

@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Table, dots
+from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, unique_rows
 from ..odometry.attached import ScanPoints
-from .cloud_rasters import CloudRasters, look_up
 from .clouds import Clouds
 from .ray_noise import RayNoise, range_sigma
 from .round_columns import Surroundings, refined_columns, surroundings, to_circle
-from .stretches import Stretches
-from .walls import Walls
 
 _GATE = 4.0
 """Standard deviations within which a ray ends on the surface."""
@@ -76,11 +73,12 @@ class Surfaces(Table):
         return replace(self, place=place, facing=np.where(self.round, 0.0, self.facing - pose[2]))
 
 
-def surfaces_of(walls: Walls, columns: Floats) -> Surfaces:
-    """Return walls, and after them columns (c, 3), x, y, radius, with no range offset."""
-    w, c = len(walls.centre), len(columns)
-    facing = np.concatenate([se2.bearing(walls.normal), np.zeros(c)])
-    place, radius = np.concatenate([walls.centre, columns[:, :2]]), np.concatenate([np.ones(w), columns[:, 2]])
+def surfaces_of(centre: Floats, normal: Floats, columns: Floats) -> Surfaces:
+    """Return walls through centres (w, 2) with normals (w, 2), and after them columns (c, 3), x, y, radius, with no range
+    offset."""
+    w, c = len(centre), len(columns)
+    facing = np.concatenate([se2.bearing(normal), np.zeros(c)])
+    place, radius = np.concatenate([centre, columns[:, :2]]), np.concatenate([np.ones(w), columns[:, 2]])
     return Surfaces(np.arange(w + c) >= w, place, facing, np.zeros(w + c), radius)
 
 
@@ -167,31 +165,6 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
-def stretch_of(rays: SurfaceRays, clouds: Clouds, raster: CloudRasters, found: Stretches) -> Ints:
-    """Return on which straight stretch (p,) of its own cloud each ray ends, away from the stretch's ends; -1 = on none."""
-    stretch = np.full(len(rays.keyframe), -1)
-    if not len(clouds.points) or not len(stretch):
-        return stretch
-    x, y = (rays.points[:, k : k + 1].astype(np.float64) for k in range(2))
-    nearest = look_up(raster, rays.keyframe, x, y)[:, 0].astype(np.intp)
-    of = found.of_point[np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)]
-    near = np.flatnonzero((nearest >= 0) & found.straight[of])
-    near = near[_ends_on(rays.rows(near), found, of[near])]
-    stretch[near] = of[near]
-    return stretch
-
-
-def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
-    """Return which rays (m,) end on these stretches (m,), tested where ray and line intersect, without noise along the ray."""
-    normal, off = found.normal.take(stretch, axis=0), rays.points - found.centre.take(stretch, axis=0)
-    residual, incidence = dots(off, normal), -dots(rays.directions, normal)
-    oblique = np.maximum(incidence, INCIDENCE)
-    end = off + (residual / oblique)[:, None] * rays.directions
-    along = end[:, 0] * normal[:, 1] - end[:, 1] * normal[:, 0]
-    gate = _GATE * np.hypot(rays.sigma * incidence, ROUGHNESS)
-    return np.asarray(found.inside(stretch, along) & (incidence > INCIDENCE) & (np.abs(residual) < gate))
-
-
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
     if not len(columns):
@@ -207,38 +180,39 @@ NEAR = 0.3
 """Distance from a column's rim up to which rays are kept until it is fitted, m."""
 
 
-def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> Ints:
-    """Return the numbers (n,) of the rays (m,) from poses (k, 3) that end near columns."""
+def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> SurfaceRays:
+    """Return the rays from poses (k, 3) that end near columns."""
     rows, which, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
-    return rows[away < columns.columns[which, 2] + NEAR]
+    return rays.rows(rows[away < columns.columns[which, 2] + NEAR])
 
 
-def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:
-    """Return the kind of each of the clouds' points (p,): 0 on a wall, 1 on one of the columns (c, 3), -1 on neither."""
-    kind = np.where(walls.of_stretch >= 0, 0, -1).astype(np.int8)[found.of_point]
-    kind[_around(clouds, poses, columns)] = 1
-    return kind
-
-
-def without_columns(kind: NDArray[np.int8], clouds: Clouds, poses: Floats, columns: Floats) -> NDArray[np.int8]:
-    """Return the kinds (p,) of the clouds' points, see points_on, after columns (c, 3) were found to be false."""
-    kind = kind.copy()
-    kind[_around(clouds, poses, columns)] = -1
-    return kind
-
-
-def _around(clouds: Clouds, poses: Floats, columns: Floats) -> Ints:
-    """Return the numbers (n,) of the clouds' points on columns (c, 3)."""
-    near, found = surroundings(columns, _ROUND), [np.zeros(0, dtype=np.intp)]
-    for first in range(0, len(clouds.points) if len(columns) else 0, _POINTS_AT_ONCE):
+def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArray[np.int8]:
+    """Return the kind of each of the clouds' points (p,), whose frames are (k, 3) in the map: 0 on a wall where rays showed
+    it, 1 on a column, -1 on neither."""
+    surfaces, kind = found.surfaces, np.full(len(clouds.points), -1, dtype=np.int8)
+    shown = _shown_walls(found, sensors)
+    columns = surfaces.rows(surfaces.round)
+    near = surroundings(np.column_stack([columns.place, columns.radius]), _ON)
+    for first in range(0, len(kind), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
-        rows, which, away = near.nearest(se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64)))
-        found.append(first + rows[np.abs(away - columns[which, 2]) < _ROUND])
-    return np.concatenate(found)
+        at = se2.transform_each(sensors, clouds.owner[part], clouds.points[part].astype(np.float64))
+        kind[part][np.isfinite(shown.query(at, distance_upper_bound=_ON)[0])] = 0
+        kind[part][near.on_rim(at, _ON)] = 1
+    return kind
 
 
-_ROUND = 0.06
-"""Distance from a column's circle up to which a point of a cloud is on it, m."""
+_ON = 0.06
+"""Distance from a surface up to which a point of a cloud is on it, m."""
+
+
+def _shown_walls(found: MeasuredSurfaces, sensors: Floats) -> cKDTree:
+    """Return the middles of the cells of walls in which rays end."""
+    surfaces, rays = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface])
+    way, wall = surfaces.tangent, rays.surface.astype(np.intp)
+    ended = se2.transform_each(sensors, rays.keyframe, rays.points)
+    along = dots(ended - surfaces.place.take(wall, axis=0), way.take(wall, axis=0))
+    wall, cell = unique_rows(np.column_stack([wall, np.floor(along / _ON).astype(np.intp)]))[0].T
+    return cKDTree(surfaces.place[wall] + ((cell + 0.5) * _ON)[:, None] * way[wall])
 
 
 def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Straight walls: which straight stretches of many clouds are one wall."""
+"""Straight walls: which straight pieces of many scans are one wall."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,97 +8,101 @@ from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, connected, dots, unique_rows
-from .clouds import Clouds
-from .stretches import Stretches, extent, principal_axes
+from .pieces import Pieces
 
-_EVERY = 0.5
-"""Distance between the places at which stretches are compared, m."""
-_REACH, _OFF, _LEAN = 0.4, 0.06, np.cos(np.deg2rad(6.0))
-"""Two stretches are of one wall where places on them are nearer than this, m, each within this distance of the other's line, m,
-and face the same way (cosine): more than maps err by after the joint refinement, less than objects stand off walls."""
-_BENT = 0.15
-"""Farthest that places of one wall lie off its line, m; a wall farther off is bent: its halves may be walls."""
-_STRETCHES = 3
-"""Least number of stretches of a wall."""
+
+@dataclass(frozen=True, slots=True)
+class WallConfig:
+    """Which pieces are of one wall, by what maps err by after the joint refinement, and objects stand off walls."""
+
+    every: float = 0.5
+    """m between the places at which pieces are compared."""
+    reach: float = 0.4
+    """m, largest distance of places."""
+    off: float = 0.06
+    """m, largest distance of a place from the other's line."""
+    lean: float = np.deg2rad(6.0)
+    """rad, largest difference of directions, beside two standard deviations of it."""
+    scatter: float = 0.03
+    """m, rms scatter of places about a straight wall."""
+    keyframes: int = 4
+    """Least number that see it."""
+    halvings: int = 6
+    """Most times that a bent wall is halved."""
+
+
+_CONFIG = WallConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walls:
     """Straight walls (w) of a map."""
 
-    of_stretch: Ints
-    """(s,) wall of each stretch; -1 = of none."""
+    of_piece: Ints
+    """(s,) wall of each piece; -1 = of none."""
     centre: Floats
     """(w, 2) m, map frame."""
     normal: Floats
     """(w, 2) unit, towards the robot."""
 
 
-def find_walls(clouds: Clouds, found: Stretches, poses: Floats) -> Walls:
-    """Join the straight stretches of all clouds that lie on each other, at poses (k, 3) of the clouds, to walls."""
-    rows = _places(found)
-    stretch, owner = found.of_point[rows], clouds.owner[rows]
-    at = se2.transform(poses[owner], clouds.points[rows].astype(np.float64))
-    normal = se2.rotate(poses[owner, 2], found.normal[stretch])
-    number = _halved(_joined(stretch, at, normal, len(found.straight)), stretch, at, owner)
-    return _judged(number, stretch, at, normal, found)
+def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _CONFIG) -> Walls:
+    """Join those of some pieces (s,) that lie on each other, at poses (k, 3) of the keyframes, to walls."""
+    piece, at, normal = _places(pieces, poses, config.every)
+    kept = np.flatnonzero(some[piece])
+    piece, at, normal = piece[kept], at[kept], normal[kept]
+    deviation, keyframe = pieces.deviation[piece], pieces.keyframe[piece]
+    number = _joined(piece, at, normal, deviation, len(some), config)[piece]
+    number = _halved(number, at, normal, deviation, keyframe, config)
+    centre, facing = _lines(number, at, normal, deviation)
+    seen = np.bincount(unique_rows(np.stack([number, keyframe], axis=1))[0][:, 0], minlength=len(centre))
+    good = (seen >= config.keyframes) & (_scatter(number, at, centre, facing) < config.scatter)
+    of_piece = np.full(len(some), -1)
+    of_piece[piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
+    return Walls(of_piece, centre[good], facing[good])
 
 
-def _places(found: Stretches) -> Ints:
-    """Return rows of points on straight stretches, one every so often, none near an end."""
-    return np.concatenate([_places_among(found, part) for part in _parts(found.of_point)] or [np.zeros(0, dtype=np.intp)])
+def _places(pieces: Pieces, poses: Floats, every: float) -> tuple[Ints, Floats, Floats]:
+    """Return places on pieces, two on each at least, evenly spread: the piece (m,), where it is in the map, and its normal."""
+    many = np.maximum(np.ceil(pieces.length / every).astype(np.intp), 2)
+    piece = np.repeat(np.arange(len(many)), many)
+    rank = np.arange(len(piece)) - (np.cumsum(many) - many)[piece]
+    along = ((rank + 0.5) / many[piece] - 0.5) * pieces.length[piece]
+    normal = pieces.normal[piece]
+    at = pieces.centre[piece] + along[:, None] * np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+    keyframe = pieces.keyframe[piece]
+    return piece, se2.transform_each(poses, keyframe, at), se2.rotate_each(poses[:, 2], keyframe, normal)
 
 
-def _parts(of_point: Ints) -> Iterator[slice]:
-    """Yield the points of whole stretches, about so many at a time; of_point (p,) is ascending."""
-    first = 0
-    while first < len(of_point):
-        last = min(first + _POINTS_AT_ONCE, len(of_point)) - 1
-        yield slice(first, first := int(np.searchsorted(of_point, of_point[last], "right")))
-
-
-_POINTS_AT_ONCE = 1 << 17
-"""Points among which places are chosen at once; bounds the memory."""
-
-
-def _places_among(found: Stretches, part: slice) -> Ints:
-    stretch, along = found.of_point[part], found.along[part]
-    rows = np.flatnonzero(found.straight[stretch] & found.inside(stretch, along))
-    key = np.stack([stretch[rows], np.floor(along[rows] / _EVERY).astype(np.intp)], axis=1)
-    number = unique_rows(key)[1]
-    return part.start + rows[np.unique(number, return_index=True)[1]]
-
-
-def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
-    """Return the number (s,) of the set of each of many stretches: those are one whose places (m, 2), with normals (m, 2), lie
-    on one line and face the same way."""
+def _joined(piece: Ints, at: Floats, normal: Floats, deviation: Floats, many: int, config: WallConfig) -> Ints:
+    """Return the number (s,) of the set of each of many pieces: those are one whose places (m, 2), with normals (m, 2), lie on
+    one line and face the same way."""
     one, other = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-    for rows in _strips(at):
-        of_place = stretch[rows]
+    for rows in _strips(at, config.reach):
         # Linking each place with its first neighbour joins the same sets as all of its links, of which there may be thousands.
-        one.append(of_place)
-        other.append(of_place[_together(at[rows], normal[rows])])
+        one.append(piece[rows])
+        other.append(piece[rows][_together(at[rows], normal[rows], deviation[rows], config)])
     return connected(np.concatenate(one), np.concatenate(other), many)
 
 
-def _strips(at: Floats) -> Iterator[Ints]:
+def _strips(at: Floats, reach: float) -> Iterator[Ints]:
     """Yield rows of places (m, 2), a bounded number at a time: strips of the map that overlap by the reach."""
     order = np.argsort(at[:, 0], kind="stable")
     x = at[order, 0]
     for first in range(0, len(x), _AT_ONCE):
         last = min(first + _AT_ONCE, len(x))
-        yield order[first : np.searchsorted(x, x[last - 1] + _REACH, "right")]
+        yield order[first : np.searchsorted(x, x[last - 1] + reach, "right")]
 
 
 _AT_ONCE = 1 << 13
 """Places of a strip; bounds the memory."""
 
 
-def _together(at: Floats, normal: Floats) -> Ints:
+def _together(at: Floats, normal: Floats, deviation: Floats, config: WallConfig) -> Ints:
     """Return for each place (m, 2) with a normal (m, 2) the first one of its set; places that lie on one line and face the same
     way are of one set."""
-    pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray")
-    columns = [np.ascontiguousarray(column) for column in (*at.T, *normal.T)]
+    pairs = cKDTree(at).query_pairs(config.reach, output_type="ndarray")
+    columns = [np.ascontiguousarray(column) for column in (*at.T, *normal.T, deviation)]
     first = each = np.arange(len(at))
     # Some of the pairs link most of the places, and few others remain to be tested.
     for tested in (pairs[::_SOME], pairs):
@@ -107,7 +111,7 @@ def _together(at: Floats, normal: Floats) -> Ints:
             one, other = tested[begin : begin + _PAIRS_AT_ONCE].T
             apart = np.flatnonzero(first.take(one) != first.take(other))
             one, other = one[apart], other[apart]
-            links.append(np.stack([one, other])[:, _on_one_line(one, other, *columns)])
+            links.append(np.stack([one, other])[:, _on_one_line(config, one, other, *columns)])
         one, other = np.concatenate(links, axis=1)
         own = connected(one, other, len(at))
         first = np.unique(own, return_index=True)[1][own]
@@ -120,76 +124,76 @@ _PAIRS_AT_ONCE = 1 << 15
 """Pairs that are processed together, so that they fit into the processor's cache."""
 
 
-def _on_one_line(one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, left: Floats) -> Bools:
-    """Return which pairs (e,) of places do, with coordinates and normals (m,)."""
+def _on_one_line(
+    config: WallConfig, one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, left: Floats, deviation: Floats
+) -> Bools:
+    """Return which pairs (e,) of places do, with coordinates, normals and the deviations of these (m,)."""
     across, along = x.take(other) - x.take(one), y.take(other) - y.take(one)
     (ax, ay), (bx, by) = ((ahead.take(side), left.take(side)) for side in (one, other))
-    good = ax * bx + ay * by > _LEAN
+    lean = config.lean + 2.0 * np.hypot(deviation.take(one), deviation.take(other))
+    good = ax * bx + ay * by > np.cos(lean)
     for nx, ny in ((ax, ay), (bx, by)):
-        good &= np.abs(nx * across + ny * along) < _OFF
+        good &= np.abs(nx * across + ny * along) < config.off
     return np.asarray(good)
 
 
-def _halved(number: Ints, stretch: Ints, at: Floats, owner: Ints) -> Ints:
-    """Return the number (s,) of the set of each stretch, -1 = without places, with bent sets halved along their length.
+def _halved(number: Ints, at: Floats, normal: Floats, deviation: Floats, keyframe: Ints, config: WallConfig) -> Ints:
+    """Return the number (m,) of the set of each place, with bent sets halved along their length.
 
     Heading errors of some mrad over a long distance bend a long wall in the map, which looks straight from each pose. Its parts
-    are straight, and are joined once poses have been adjusted to them (joined_walls.py). Walls bent in one cloud stay whole.
-
-    Parameters
-    ----------
-    number : (s,) set of each stretch.
-    stretch, at, owner : (m,), (m, 2), (m,) of places on stretches: of which, where in the map, m, and seen in which cloud.
+    are straight, and are joined once poses have been adjusted to them (joined_walls.py). Walls bent in one scan stay whole.
     """
-    own, which = (np.unique(k, return_inverse=True)[1] for k in (number[stretch], stretch))
-    middle = principal_axes(which, at, int(which.max(initial=-1)) + 1)[0][which]
-    bent = _bent(own, at) & ~_curved(own, at, owner)
-    for _ in range(_HALVINGS):
+    number = np.unique(number, return_inverse=True)[1]
+    centre, facing = _lines(number, at, normal, deviation)
+    bent = _scatter(number, at, centre, facing) > config.scatter
+    bent &= ~_curved(number, at, keyframe, facing, config)
+    for _ in range(config.halvings):
         if not bent.any():
             break
-        centre, direction, _ = _lines(own, at)
-        beyond = bent[own] & (dots(middle - centre[own], direction[own]) > 0.0)
-        halves, own = np.unique(2 * own + beyond, return_inverse=True)
-        bent = bent[halves // 2] & _bent(own, at)
-    halved = np.full(len(number), -1)
-    halved[stretch] = own
-    return halved
+        off = at - centre[number]
+        beyond = bent[number] & (off[:, 0] * facing[number, 1] > off[:, 1] * facing[number, 0])
+        halves, number = np.unique(2 * number + beyond, return_inverse=True)
+        centre, facing = _lines(number, at, normal, deviation)
+        bent = bent[halves // 2] & (_scatter(number, at, centre, facing) > config.scatter)
+    return number
 
 
-_HALVINGS = 6
-"""Most times that a bent set of stretches is halved."""
+def _lines(number: Ints, at: Floats, normal: Floats, deviation: Floats) -> tuple[Floats, Floats]:
+    """Return centre and normal (w, 2) of the line that fits each set of places (m, 2), numbered (m,): to where they are and, by
+    their deviations, to how they are turned."""
+    many = int(number.max(initial=-1)) + 1
+    weight = 1.0 / (deviation**2 + _TURNED**2)
+    centre, facing = _mean(number, at, np.ones(len(at)), many), _mean(number, normal, weight, many)
+    facing /= np.maximum(np.hypot(*facing.T), 1e-9)[:, None]
+    off, own = at - centre[number], facing[number]
+    across, along = dots(off, own), off[:, 1] * own[:, 0] - off[:, 0] * own[:, 1]
+    turn = normal[:, 1] * own[:, 0] - normal[:, 0] * own[:, 1]
+    known = np.bincount(number, (along / _OFF) ** 2 + weight, many)
+    turn = np.bincount(number, turn * weight - along * across / _OFF**2, many) / known
+    return centre, se2.rotate(turn, facing)
 
 
-def _lines(own: Ints, at: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return centre, direction and normal (w, 2) of the line that fits each set of places (m, 2), numbered (m,)."""
-    centre, direction, _ = principal_axes(own, at, int(own.max(initial=-1)) + 1)
-    return centre, direction, np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+_TURNED, _OFF = 0.02, 0.02
+"""Standard deviations of pieces about the wall beside the noise of rays: by the poses, and because walls are not straight, rad
+and m."""
 
 
-def _bent(own: Ints, at: Floats) -> Bools:
-    """Return which sets of places (m, 2), numbered (m,), reach too far off their line."""
-    centre, _, across = _lines(own, at)
-    return np.asarray(extent(own, np.abs(dots(at - centre[own], across[own])), len(centre))[1] >= _BENT)
+def _scatter(number: Ints, at: Floats, centre: Floats, facing: Floats) -> Floats:
+    """Return the rms distance (w,) of places (m, 2) from the lines of their sets, m."""
+    off = dots(at - centre[number], facing[number])
+    return np.asarray(np.sqrt(np.bincount(number, off**2, len(centre)) / np.bincount(number, minlength=len(centre))))
 
 
-def _curved(own: Ints, at: Floats, owner: Ints) -> Bools:
-    """Return which sets of places (m, 2), numbered (m,), are not straight in most of the clouds (m,) that see them."""
-    seen, number = unique_rows(np.stack([own, owner], axis=1))
-    off = principal_axes(number, at, len(seen))[2] > _ROUND
+def _curved(number: Ints, at: Floats, keyframe: Ints, facing: Floats, config: WallConfig) -> Bools:
+    """Return which sets of places (m, 2), numbered (m,), are not straight in most of the keyframes (m,) that see them."""
+    seen, own = unique_rows(np.stack([number, keyframe], axis=1))
+    ones = np.ones(len(at))
+    centre, facing = _lines(own, at, facing[number], ones)
+    off = _scatter(own, at, centre, facing) > config.scatter
     return np.asarray(np.bincount(seen[:, 0], np.where(off, 1.0, -1.0)) > 0.0)
 
 
-_ROUND = 0.02
-"""Root mean square distance from their line from which on places in one cloud are on a curve, m."""
-
-
-def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
-    """Fit a line to each set (s,) of stretches, see _halved, by their places (m,), and keep those that are walls."""
-    own = number[stretch]
-    centre, _, across = _lines(own, at)
-    many = len(centre)
-    across *= np.where(np.bincount(own, dots(normal, across[own]), many) < 0.0, -1.0, 1.0)[:, None]
-    stretches_of = np.bincount(number[np.unique(stretch)], minlength=many)
-    good = (stretches_of >= _STRETCHES) & ~_bent(own, at)
-    new = np.where(good, np.cumsum(good) - 1, -1)
-    return Walls(np.where(found.straight & (number >= 0), new[number], -1), centre[good], across[good])
+def _mean(number: Ints, values: Floats, weight: Floats, many: int) -> Floats:
+    """Return the weighted mean (m, 2) of values (s, 2) by their numbers (s,)."""
+    total = np.bincount(number, weight, many)
+    return np.stack([np.bincount(number, weight * v, many) / total for v in values.T], axis=1)

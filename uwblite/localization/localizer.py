@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from .. import se2
 from ..arrays import Floats
+from ..clocks.sensor_clock import JUMP, SensorClock
 from ..errors import DataError
 from ..odometry.gyro_turns import GyroTurns
 from ..odometry.odometer import Odometer
@@ -23,7 +24,6 @@ from .pose_estimator import PoseEstimator
 from .range_update import RangeFacts
 from .records import LocalizerState, Scanner
 from .sensing import LEAD, Range, Scan, Waiting, scan_rays
-from .sensor_clock import JUMP, SensorClock
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""

@@ -83,25 +83,17 @@ def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: float) -
 
 
 def range_scale(pose: Floats, ranges: Ranges) -> Scale:
-    """Fit pose, way and distances to the ranges, once with all anchors and once without the one that disagrees most.
+    """Fit pose, way, distances and one constant error per anchor to the ranges.
 
-    Returns
-    -------
-    Of both scale errors, the one that is fewer standard deviations from 0 is returned: a moved anchor must not look like
-    another unit.
+    Notes
+    -----
+    Gauss-Newton with Cauchy kernels, on the ranges and on the anchors' errors: an anchor that was moved by metres explains its
+    own ranges, and does not look like another unit; errors that all anchors share do.
     """
-    whole, own = _fitted(pose, ranges)
-    odd = ranges.anchor == np.unique(ranges.anchor)[int(np.argmax(np.abs(own)))]
-    less = _fitted(pose, ranges.rows(np.flatnonzero(~odd)))[0] if len(own) > 2 else whole
-    return min(whole, less, key=lambda s: abs(s.error) / s.sigma)
-
-
-def _fitted(pose: Floats, ranges: Ranges) -> tuple[Scale, Floats]:
-    """Return the scale and one constant error per anchor (a,), m, by Gauss-Newton with a Cauchy kernel."""
     names, anchor = np.unique(ranges.anchor, return_inverse=True)
     own = np.eye(len(names))[anchor]
-    information = np.diag(1.0 / np.square(np.append(_PRIOR, np.full(len(names), _ANCHOR_SIGMA))))
-    x, hessian = np.zeros(5 + len(names)), information
+    prior = 1.0 / np.square(np.append(_PRIOR, np.full(len(names), _ANCHOR_SIGMA)))
+    x, hessian = np.zeros(5 + len(names)), np.diag(prior)
     for _ in range(_ITERATIONS):
         tags = ranges.tags * (1.0 + x[3])
         now = Ranges(ranges.anchor, ranges.places, tags, ranges.values * (1.0 + x[4]) - own @ x[5:], ranges.sigma)
@@ -110,7 +102,13 @@ def _fitted(pose: Floats, ranges: Ranges) -> tuple[Scale, Floats]:
         turned = unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1]
         along = (unit * lever).sum(axis=1) / (1.0 + x[3])
         jacobian = np.column_stack([unit, turned, along, -ranges.values, own])
-        weight = 1.0 / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+        weight = _cauchy(error, ranges.sigma) / ranges.sigma**2
+        information = np.diag(prior * np.append(np.ones(5), _cauchy(x[5:], _ANCHOR_SIGMA)))
         hessian = information + (jacobian * weight[:, None]).T @ jacobian
         x = x - np.linalg.solve(hessian, information @ x - jacobian.T @ (weight * error))
-    return Scale(float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4]))), x[5:]
+    return Scale(float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4])))
+
+
+def _cauchy(error: Floats, sigma: Floats | float) -> Floats:
+    """Return the weights of errors with a Cauchy kernel of two standard deviations."""
+    return np.asarray(1.0 / (1.0 + np.square(error / (2.0 * sigma))))

@@ -35,7 +35,8 @@ _FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.8, 3
 _CONFIRM, _CONFIRM_BUSY, _CONFIRM_ALONE = 0.5, 1.0, 2.0
 """m driven between two searches that agree; the second where people are near, the third with scans or ranges alone."""
 _UNIT_KNOWN = 0.04
-"""Standard deviation of the map's unit from which another one would have been noticed."""
+"""Standard deviation of the map's unit from which another one would have been noticed; a start also needs the unit itself to be
+within what data sheets allow."""
 _UNIT_CLEAR = 0.01
 """The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
 
@@ -102,7 +103,8 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges
             return f"distances in the map are {1.0 + scale.error:.2f} times those of the {name}; is this the right map?"
         if not start and scale.sigma < _UNIT_CLEAR:
             break
-    if start and compared and min(scale.sigma for _, scale, _ in compared) > _UNIT_KNOWN:
+    sigma, error, limit = min(((s.sigma, abs(s.error), limit) for _, s, limit in compared), default=(0.0, 0.0, 0.0))
+    if start and (sigma > _UNIT_KNOWN or error > limit):
         return "whether the map has the sensors' unit is not known yet; drive on"
     return ""
 

@@ -19,10 +19,13 @@ from ..lidar.registration import Registration, matched_by_chance
 from ..lidar.scan_matching import pair_points
 from ..lidar.visibility import nearest_by_bearing
 from ..odometry.slips import log_densities, with_slips
+from ..problem.solution import rough
 from . import lidar_stages, surface_adjustment
-from .anchor_places import BreakPolicy, BrokenStep, broken_steps, decide_places, range_evidence
+from .anchor_places import decide_places
+from .broken_steps import BreakPolicy, BrokenStep, broken_steps
 from .estimate import Estimate, Task
-from .radio_stages import rough, with_range_noise
+from .radio_stages import with_range_noise
+from .radio_tracks import range_evidence
 
 _SUDDEN = 5.0
 """Standard deviations that a step of faultless wheels hardly ever exceeds."""

@@ -6,11 +6,12 @@ from ..arrays import Floats
 from ..errors import SolverError
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
+from ..problem.alternatives import EvidencePolicy
 from ..problem.constancy import log_odds_of_constant, without_prior
 from ..problem.evidence import prior_sigma
 from ..problem.parts import stretch
+from ..problem.solution import rough
 from .estimate import Estimate, Task
-from .radio_stages import rough
 
 TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
@@ -18,8 +19,6 @@ _PARTS = 8
 """Parts of a recording whose offsets are compared."""
 _LEAST = 20
 """Least number of keyframes in a part."""
-_ODDS = float(np.log(3.0))
-"""Logarithm of the odds from which on an offset is taken (positive evidence: Kass and Raftery, Bayes factors, 1995)."""
 
 
 def late(estimate: Estimate, task: Task) -> float:
@@ -34,7 +33,7 @@ def late(estimate: Estimate, task: Task) -> float:
         return 0.0
     values, sigmas = _by_parts(estimate, at, task)
     prior = float(prior_sigma(estimate.graph)[at])
-    return off if log_odds_of_constant(values - estimate.lidar.delay, sigmas, prior) > _ODDS else 0.0
+    return off if log_odds_of_constant(values - estimate.lidar.delay, sigmas, prior) > EvidencePolicy.positive else 0.0
 
 
 def _by_parts(estimate: Estimate, at: int, task: Task) -> tuple[Floats, Floats]:

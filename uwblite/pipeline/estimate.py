@@ -9,12 +9,15 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, rms_length
 from ..constraints import Constraints
 from ..graph.graph import Edges, Graph
+from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
+from ..graph.solver import SolverConfig, SolverSummary
 from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
 from ..lidar.surface_rays import MeasuredSurfaces
 from ..loop_closure.closures import Closures, no_closures
+from ..problem.solution import solve
 from ..radio.bootstrap_attempt import BootstrapResult
 from .mapping_config import MappingConfig
 from .progress import Stages
@@ -85,7 +88,7 @@ class Estimate:
     """Between neighbouring clouds; None before scan-to-scan matching."""
     closures: Closures = field(default_factory=no_closures)
     other_heights: OtherHeights | None = None
-    other_minimum: Graph | None = None
+    other_side: Graph | None = None
     """Of a recording without lidar: another optimum of odometry and ranges; None where none was found."""
     recordings: Recordings | None = None
     """With the keyframes of the graph's poses; None while these are the task's."""
@@ -136,6 +139,12 @@ class Estimate:
         """The graph with every measurement in it."""
         lidar = self.steps_and_closures if self.joint is None else (self.joint,)
         return self.graph.with_edges(*self.odometry_and_ranges, *lidar)
+
+    def solved(self, config: SolverConfig, optimizer: Optimizer | None = None) -> tuple["Estimate", SolverSummary]:
+        """Return the estimate at the optimum of all of its measurements, and how the search went; see problem/solution.py."""
+        found, summary = solve(self.problem, config, optimizer)
+        graph = replace(self.graph.with_estimates_of(found), fixed_calibration=found.fixed_calibration)
+        return replace(self, graph=graph), summary
 
     def moved_since(self, poses: Floats) -> float:
         """Return how far its poses are from earlier ones (k, 3), root mean square, m."""

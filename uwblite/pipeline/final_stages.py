@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
-from ..graph.calibration import HEIGHT, with_free, with_nonnegative_heights
+from ..graph.calibration import HEIGHT, with_free
 from ..graph.covariances import Covariances
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
@@ -17,11 +17,11 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
 from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
-from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
 from ..problem.parts import at_given_poses
+from ..problem.solution import with_nonnegative_heights
 from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
@@ -46,7 +46,6 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.joint is not None and estimate.ranges is not None:
         estimate = _anchors_alone(estimate, task)
-    estimate = _with_range_errors(estimate, task)
     # Data for matching takes most of the memory; walls are needed once more where the map's axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
     # The clock with which clouds were made is uncertain as well.
@@ -54,11 +53,8 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, graph=graph, scans=scans, steps=None, joint=None)
 
 
-def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Covariances]:
-    """Return the estimate corrected for the estimated errors of ranges to surfaces, and its covariances.
-
-    These contain the correlated errors of the lidar's ranges and of the radio's.
-    """
+def covariances_of(estimate: Estimate, task: Task) -> Covariances:
+    """Return the covariances of a finished estimate, with the correlated errors of odometry and ranges in them."""
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.intp))
     graph, rays, certainty = with_fewer_pairs(estimate.graph), None, None
@@ -66,15 +62,13 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
         graph, on_surfaces = for_covariances(estimate.surfaces, graph, task)
         rays, certainty = on_surfaces.equations, on_surfaces.sums.poses
     stated = with_noise_shown(graph, certainty)
-    found = marginals(stated, common := common_range_errors(stated), among=along, further=rays)
-    if common:
-        estimate = estimate.with_estimates_of(with_nonnegative_heights(found.corrected()))
+    found = marginals(stated, among=along, further=rays)
     covariances = found.covariances
     if estimate.ranges is not None:
         covariances = _with_correlated_ranges(found, stated, estimate, task.config.ranges)
     if not task.recordings.have_scans:
-        return estimate, covariances
-    return estimate, replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
+        return covariances
+    return replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
 
 
 _ALONG = 60
@@ -131,18 +125,6 @@ def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
     longer = np.bincount(side, minlength=2 * len(frames))[side[order]] - rank
     total = np.bincount(owner[order], np.abs(away[order]) * (2 * longer - 1), len(frames))
     return total / np.maximum(np.bincount(owner, minlength=len(frames)), 1) ** 2
-
-
-def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with the sensitivity of its scan edges to errors of ranges to surfaces."""
-    scans = estimate.scans
-    if scans is None:
-        return estimate
-    joint, steps = (
-        edges if edges is None else with_range_errors(edges, estimate.graph, scans.clouds, scans.raster, task.config.refinement)
-        for edges in (estimate.joint, estimate.steps if estimate.joint is None else None)
-    )
-    return replace(estimate, joint=joint, steps=estimate.steps if steps is None else steps)
 
 
 def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:

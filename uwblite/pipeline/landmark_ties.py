@@ -21,10 +21,10 @@ from ..graph.graph import Graph
 from ..graph.solver import optimize
 from ..lidar.clouds import Clouds
 from ..lidar.columns import Landmarks, find_columns, fit_circle
+from ..problem.solution import rough
 from . import map_frame
 from .estimate import Estimate, Task
 from .lidar_stages import refine_jointly, solve_by_own_errors, solved
-from .radio_stages import rough
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""

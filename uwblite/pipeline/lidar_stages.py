@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Ints
-from ..graph.calibration import LASER, RADIO, TURNING, optimize_with_heights, with_free, with_nonnegative_heights
+from ..graph.calibration import LASER, RADIO, TURNING, with_free
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
@@ -19,12 +19,13 @@ from ..graph.solver import SolverConfig, optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps
+from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.tag_pattern import without_pattern
 from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
 from .progress import solver_figures
-from .radio_stages import rough, with_range_noise
+from .radio_stages import with_range_noise
 from .recordings import denser, later
 
 
@@ -322,10 +323,8 @@ def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate
 
 
 def solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer | None = None) -> Estimate:
-    """Return the estimate at the optimum of all of its measurements; for the parameters see optimize_with_heights."""
-    found = optimize_with_heights(estimate.problem, solver, optimizer)[0]
-    graph = replace(estimate.graph, fixed_calibration=found.fixed_calibration)
-    return replace(estimate, graph=graph.with_estimates_of(found))
+    """Return the estimate at the optimum of all of its measurements; for the parameters see problem/solution.py."""
+    return estimate.solved(solver, optimizer)[0]
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:

@@ -11,29 +11,21 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, spread
 from ..graph import calibration
-from ..graph.calibration import (
-    BIAS,
-    ODOMETRY,
-    OMNI,
-    RADIO,
-    RANGE_SCALE,
-    optimize_with_heights,
-    with_free,
-    with_nonnegative_heights,
-)
+from ..graph.calibration import BIAS, ODOMETRY, OMNI, RADIO, RANGE_SCALE, with_free
 from ..graph.graph import Graph, edge_cost
 from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
-from ..graph.solver import SolverConfig, SolverSummary
+from ..graph.solver import SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import sideways_priors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
+from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from . import anchor_heights, joining, map_frame, other_minima
+from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -132,12 +124,12 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
-        estimate, result = _solved(estimate, anchor_heights.compared(task.config.solver), optimizer)
+        estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
         laps = range(0) if have_scans else laps[-1:]
     for lap in laps:
         estimate, result = _lap(estimate, lap, task, optimizer)
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
-    found = estimate if have_scans or estimate.alone else other_minima.at_best(estimate, task)
+    found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
         estimate, result = _lap(found, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
@@ -148,20 +140,12 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
     """Estimate the ranges' noise and optimise once; the last lap chooses the radio's priors and frees its calibration."""
     config, estimate = task.config, with_range_noise(estimate, task.config)
     if lap == _NOISE_ROUNDS - 1:
-        graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
-        return _solved(replace(estimate, graph=with_free(graph, *RADIO)), config.solver, optimizer)
+        graph = with_selected_priors(estimate, config).graph
+        return replace(estimate, graph=with_free(graph, *RADIO)).solved(config.solver, optimizer)
     # A robust odometry would break where the path only begins badly.
     odometry, solver = estimate.odometry, config.solver if lap else rough(config.solver)
-    estimate, result = _solved(replace(estimate, odometry=replace(odometry, kernel=SQUARED)), solver, optimizer)
+    estimate, result = replace(estimate, odometry=replace(odometry, kernel=SQUARED)).solved(solver, optimizer)
     return replace(estimate, odometry=odometry), result
-
-
-def _solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
-    """Return the optimum of odometry and ranges."""
-    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
-    solved, result = optimize_with_heights(problem, solver, optimizer)
-    graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
-    return replace(estimate, graph=graph.with_estimates_of(solved)), result
 
 
 _NOISE_ROUNDS = 3
@@ -198,7 +182,7 @@ def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tup
     """Return the logarithms of the evidence but for the ranges, and of each range's density (m,), and its independent share."""
     ranges = estimate.ranges
     assert ranges is not None
-    graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    graph = estimate.problem
     squared = edge_cost(ranges, ranges.residuals(graph))
     density, share = log_densities(ranges, graph, config.ranges)
     return (laplace_marginal_likelihood(graph) + 0.5 * squared, density), share
@@ -211,30 +195,17 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     matches, beside which ranges had little weight so far, such errors show in the residuals, unless scans see so little that
     this chain can be bent as well.
     """
-    config, steps, optimizer = task.config, estimate.steps, Optimizer()
-    if estimate.ranges is None or steps is None:
+    if estimate.ranges is None or estimate.steps is None:
         return estimate
-    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
-    held = estimate.with_estimates_of(optimizer.optimize(problem, rough(config.solver))[0])
+    config, optimizer = task.config, Optimizer()
+    held = estimate.solved(rough(config.solver), optimizer)[0]
     estimate = held if _let_go(held, estimate) else estimate
     for solver in (rough(config.solver), config.solver):
         assert estimate.ranges is not None
         graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
-        estimate = with_range_noise(replace(estimate, graph=graph), config)
-        problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
-        estimate = estimate.with_estimates_of(optimizer.optimize(problem, solver)[0])
+        estimate = with_range_noise(replace(estimate, graph=graph), config).solved(solver, optimizer)[0]
     task.stages.end("ranges re-estimated")
-    return replace(estimate, graph=with_nonnegative_heights(estimate.graph))
-
-
-def rough(solver: SolverConfig) -> SolverConfig:
-    """Return the solver settings for an optimisation after which weights are re-estimated and another one follows."""
-    iterations, decrease = min(solver.max_iterations, _ROUGH_ITERATIONS), max(solver.relative_decrease, _ROUGH_DECREASE)
-    return replace(solver, max_iterations=iterations, relative_decrease=decrease)
-
-
-_ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
-"""Most iterations of such an optimisation, and the relative decrease of chi2 that ends it."""
+    return estimate
 
 
 def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
@@ -248,8 +219,13 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     if estimate.steps is None or not estimate.rests_on_ranges:
         weak = _with_learnt_ranges(estimate, task, steady=True)
         estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
-    edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
+    return with_selected_priors(estimate, task.config)
+
+
+def with_selected_priors(estimate: Estimate, config: MappingConfig) -> Estimate:
+    """Return the estimate, which is at its optimum, with the priors of units of length and biases of greatest evidence."""
+    measured = estimate.problem.edges[len(estimate.graph.edges) :]
+    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, measured, config.calibration))
 
 
 def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
@@ -257,9 +233,7 @@ def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Esti
     optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
         # The marginal likelihood is valid only at the optimum for the weights with which it is computed.
-        estimate = with_range_noise(estimate, task.config, steady=steady)
-        edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-        estimate = estimate.with_estimates_of(optimizer.optimize(estimate.graph.with_edges(*edges), solver)[0])
+        estimate = with_range_noise(estimate, task.config, steady=steady).solved(solver, optimizer)[0]
     return estimate
 
 

@@ -28,11 +28,11 @@ from ..graph.unknowns import Unknowns, moved
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.ray_noise import RayNoise
-from ..lidar.surface_rays import MeasuredSurfaces, Surfaces
+from ..lidar.surface_rays import MeasuredSurfaces, Surfaces, points_on
 from ..odometry import floor as floors
 from .estimate import Estimate, ScanClouds, Task
 from .lidar_stages import solved
-from .surface_search import FoundSurfaces, find_surfaces
+from .surface_search import find_surfaces, with_round_columns
 
 _ROUNDS, _STILL = 6, 1e-3
 """Most Gauss-Newton steps; the next change of the poses, rms, m, that ends them once noise and pairs have settled."""
@@ -44,9 +44,10 @@ step; half as much in each that follows (graduated non-convexity: A. Blake and A
 _LEAST = 0.03
 """Least weight of a point in pairs of clouds."""
 _PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
-"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm and a surface's 12 mm,
-see lidar/surface_errors.py), and radius, m. Those of turn and place must not even constrain the heading of the whole map: four
-surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the first pose to 0.01 rad."""
+"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm by data sheets, a
+surface's 12 mm by colour and material: L. Kneip et al., ICRA 2009), and radius, m. Those of turn and place must not even
+constrain the heading of the whole map: four surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the
+first pose to 0.01 rad."""
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
@@ -135,20 +136,18 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
     assert joint is not None
     report = task.stages.reporter("surfaces")
     report(0, _ROUNDS + 1)
-    first: FoundSurfaces | None = find_surfaces(_lidar(graph, joint, task).sensors, estimate.lidar, task)
-    assert first is not None
-    found, kind = first.measured, first.kind
+    found = find_surfaces(_lidar(graph, joint, task).sensors, estimate.lidar, task)
+    kind = np.zeros(0, dtype=np.int8)
     others = () if estimate.ranges is None else (estimate.ranges,)
     step = np.inf
     for turn in range(_ROUNDS):
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
-        if first is not None and turn == 1:
+        if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
-            own = weighted_sums(found, lidar.sensors, poses, _KERNEL).surfaces + np.diag(_PRIOR**-2.0)
-            found, kind = first.revised(found, estimate.lidar.clouds, lidar.sensors, poses, own)
-            first, order = None, None
+            found, order = with_round_columns(found, lidar.sensors, poses), None
+            kind = points_on(estimate.lidar.clouds, found, lidar.sensors)
         if not len(found.rays.keyframe):
             break
         report(turn + 1, _ROUNDS + 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.io.scan_geometry import ScanGeometry, resampled
+from uwblite.io.readings import ScanGeometry, resampled
 
 
 def wall(geometry, distance=2.0, bearing=0.3):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.errors import FormatError
-from uwblite.io.relations_file import read_relations
+from uwblite.io.tum import read_relations
 
 
 def test_relations_are_read(tmp_path):

@@ -11,11 +11,12 @@ from uwblite.arrays import rms_length
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
-from uwblite.pipeline import other_minima, radio_stages
+from uwblite.pipeline import line_sides, radio_stages
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import gather
+from uwblite.problem.alternatives import Explanation
 from uwblite.sensor_log import SensorLog
 
 
@@ -44,9 +45,9 @@ def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
     graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     assert error(graph.poses, true) < 0.15
     # One way is caught where it is put to the other side of the anchors.
-    caught = optimize(graph.with_estimates_of(estimate.other_minimum), task.config.solver)[0]
+    caught = optimize(graph.with_estimates_of(estimate.other_side), task.config.solver)[0]
     assert error(caught.poses, true) > 0.3
-    best = other_minima.minima(caught, estimate.placed, task.config.solver)[0]
+    best = line_sides.sides(caught, estimate.placed, task.config.solver)[0].graph
     assert best.chi2() < caught.chi2() - 4.0
     assert error(best.poses, true) < 0.1
 
@@ -59,7 +60,7 @@ def test_anchors_stand_on_a_line_but_for_one(beside, line):
     along = np.column_stack([np.arange(4) * 9.0, np.full(4, 2.0)])
     anchors = np.concatenate([along, [[4.0 * k, 2.0 + off] for k, off in enumerate(beside)]]) if beside else along
     path = np.column_stack([np.linspace(0.0, 27.0, 50), 1.8 - 0.02 * np.abs(np.arange(50) - 20), np.zeros(50)])
-    starts = other_minima.mirrored_tails(Graph(path, anchors, ()), np.ones(len(anchors), dtype=bool))
+    starts = line_sides.mirrored_tails(Graph(path, anchors, ()), np.ones(len(anchors), dtype=bool))
     assert len(starts) == line
 
 
@@ -68,21 +69,23 @@ def test_anchors_on_both_sides_leave_no_other_side():
     estimate = radio_stages.first_optimisation(task)
     graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     assert error(graph.poses, true) < 0.15
-    assert not other_minima.mirrored_tails(graph, estimate.placed)
-    assert other_minima.minima(graph, estimate.placed, task.config.solver) == [graph]
-    assert estimate.other_minimum is None
+    assert not line_sides.mirrored_tails(graph, estimate.placed)
+    assert [each.graph for each in line_sides.sides(graph, estimate.placed, task.config.solver)] == [graph]
+    assert estimate.other_side is None
 
 
 @pytest.mark.parametrize(
-    ("more", "off", "lidar", "doubts"),
-    [(3.9, 0.41, False, 1), (-9.0, 0.41, False, 1), (4.1, 0.41, False, 0), (3.9, 0.39, False, 0), (3.9, 0.41, True, 0)],
+    ("log_odds", "off", "lidar", "doubts"),
+    [(-4.9, 0.41, False, 1), (4.0, 0.41, False, 1), (-5.1, 0.41, False, 0), (-4.9, 0.39, False, 0), (-4.9, 0.41, True, 0)],
 )
-def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, more, off, lidar, doubts):
-    here, there = (SimpleNamespace(chi2=lambda c=c: 100.0 + c) for c in (0.0, more))
-    monkeypatch.setattr(other_minima, "minima", lambda *_: [here, there])
-    monkeypatch.setattr(other_minima, "apart", lambda one, other: off * (one is not other))
+def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, log_odds, off, lidar, doubts):
+    here, there = Explanation("here", 0.0), Explanation("there", log_odds)
+    monkeypatch.setattr(line_sides, "sides", lambda *_: [here, there])
+    monkeypatch.setattr(line_sides, "apart", lambda one, other: off * (one != other))
     stages = Stages(None, None)
     recordings = type("One", (), {"have_scans": lidar, "__len__": lambda _: 1})()
     task = SimpleNamespace(recordings=recordings, stages=stages, config=MappingConfig())
-    stages.findings.extend(other_minima.check_other_minimum(SimpleNamespace(graph=here, other_minimum=None, placed=None), task))
+    stages.findings.extend(
+        line_sides.check_other_side(SimpleNamespace(graph="here", other_side=None, placed=None), task)
+    )
     assert [d.kind for d in stages.doubts] == ["other-side"] * doubts

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.localization.sensor_clock import SensorClock
+from uwblite.clocks.sensor_clock import SensorClock
 
 PERIOD = 0.2
 

@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from uwblite.drivers.clock import DeviceClock, Unwrapper
-from uwblite.drivers.clock_map import MAX_SKEW, ClockMap
+from uwblite.clocks.clock_map import MAX_SKEW, ClockMap
+from uwblite.clocks.device_clock import DeviceClock, Unwrapper
 
 
 @pytest.mark.parametrize(("modulus", "tick"), [(1 << 24, 1e-3), (1 << 16, 1e-3)])

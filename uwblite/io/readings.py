@@ -1,15 +1,34 @@
-"""Scans of a lidar whose number of beams varies from turn to turn, brought to one geometry.
+"""What readers of recordings share: ranges by the names of anchors, scans brought to one geometry, a reach that is not stated.
 
 Cheap spinning lidars send 672 to 682 readings a turn, as their motor runs; logs of others mix 180 and 181 beams.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats
-from ..sensor_log import MOST_METRES
+from ..arrays import Floats, Ints
+from ..sensor_log import MOST_METRES, UwbRanges
+
+
+def ranges_of(
+    stamps: Floats, anchor: Ints, names: Sequence[str], metres: Floats, quality: Floats, tag: Ints | None = None
+) -> UwbRanges:
+    """Return ranges in the order of time and anchors in that of their names.
+
+    Parameters
+    ----------
+    stamps, metres, quality : (n,) s, m, 0..100.
+    anchor : (n,) index into the names, of which equal ones are one anchor.
+    tag : (n,) which of the robot's tags; None = it has one.
+    """
+    ids, order = tuple(sorted(set(names))), np.argsort(stamps, kind="stable")
+    place = {name: k for k, name in enumerate(ids)}
+    rank = np.array([place[name] for name in names], dtype=np.intp)[anchor]
+    return UwbRanges(stamps[order], rank[order], metres[order], quality[order], ids, None if tag is None else tag[order])
+
 
 _SAME_VIEW = 0.03
 """Share of the field of view by which geometries of one lidar differ at most."""

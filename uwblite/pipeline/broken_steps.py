@@ -1,0 +1,255 @@
+"""Broken steps of the path: the rival of anchors that move together.
+
+Sound anchors seem to move where the path is torn: from a broken step on, one rigid motion of the path explains the ranges to
+all anchors, and no anchor was moved. So moves that begin together compete with such a step, which the closures to other visits
+may exclude.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from .. import se2
+from ..arrays import Floats, Ints
+from ..findings import Finding, doubt
+from ..radio.place_evidence import Explanation, MovePolicy, intervals_of
+from ..radio.place_intervals import explain
+from .estimate import Estimate, Task
+from .radio_tracks import RadioTrack, radio_tracks
+
+
+@dataclass(frozen=True, slots=True)
+class BreakPolicy:
+    """What is known beforehand of a step at which the path is torn, and how it is sought."""
+
+    broken: ClassVar[float] = 0.1
+    """Probability that a recording's path has one."""
+    size: ClassVar[float] = 1.0
+    """Standard deviation of the error of such a step, m and rad."""
+    turns: ClassVar[int] = 8
+    """Headings from which the error of the step is sought."""
+    rounds: ClassVar[int] = 4
+    """Most solutions of a path that ranges hold; two are usual."""
+    near: ClassVar[int] = 3
+    """Ranges by which the time of a change may be off."""
+    sigma: ClassVar[float] = 0.1
+    """Least standard deviation of ranges of known places, m."""
+    loss: ClassVar[float] = 2.5
+    """Standard deviations from which on an error counts less."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Change:
+    """A radio's change to another place within a recording."""
+
+    radio: int
+    """Number of it."""
+    interval: Ints
+    """Rows of its track at the new place, until the next change."""
+    before: int
+    """Number of the place before."""
+    frames: tuple[int, int]
+    """Keyframes between which it lies."""
+
+    def with_other(self, other: "_Change") -> bool:
+        """Return whether another change may be at the same time."""
+        return self.frames[0] <= other.frames[1] and other.frames[0] <= self.frames[1]
+
+
+def _changes(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> Iterator[_Change]:
+    """Yield all changes of place within recordings."""
+    for number, (radio, each) in enumerate(zip(radios, found, strict=True)):
+        for one, other in pairwise(intervals_of(each.place)):
+            if radio.track.recording[one[-1]] == radio.track.recording[other[0]]:
+                frames = int(radio.pose[one[-BreakPolicy.near :][0]]), int(radio.pose[other[: BreakPolicy.near][-1]])
+                yield _Change(number, other, int(each.place[one[-1]]), frames)
+
+
+def _groups(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> list[list[_Change]]:
+    """Return changes that may be at the same time together, each group with all that may be at the time of its first one."""
+    groups, changes = list[list[_Change]](), list(_changes(radios, found))
+    for change in changes:
+        if not any(change.with_other(other) for group in groups for other in group):
+            groups.append([other for other in changes if change.with_other(other)])
+    return groups
+
+
+def without_moves_of_path(
+    estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation]
+) -> tuple[list[Explanation], list["BrokenStep"]]:
+    """Return the explanations without moves that a broken step of the path explains better, for all radios together; and the
+    broken steps."""
+    kept, broken = list(found), list[BrokenStep]()
+    for group in _groups(radios, found):
+        rival = BrokenStep(estimate, task, radios, kept, [c for c in _changes(radios, kept) if group[0].with_other(c)])
+        if rival.moves and rival.gain() + rival.log_prior() > 0.0:
+            kept = rival.found
+            broken.append(rival)
+    return kept, broken
+
+
+def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
+    """Return broken steps that explain ranges beside anchors that move together, the best one of each such time, with its gain.
+
+    Parameters
+    ----------
+    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor, and
+        where they say nothing against anchors that stand still, it may still be broken.
+    """
+    radios, best = radio_tracks(estimate, task), list[tuple[float, BrokenStep]]()
+    found = [explain(radio.model) for radio in radios]
+    for group in _groups(radios, found) or [[]]:
+        tried = [BrokenStep(estimate, task, radios, found, group)] if group else []
+        end = tried[0].end if tried else len(estimate.graph.poses)
+        tried += [BrokenStep(estimate, task, radios, found, group, int(k)) for k in suspects if k < end]
+        gains = [step.gain() for step in tried]
+        best += [(max(gains), tried[int(np.argmax(gains))])] if tried else []
+    return best
+
+
+class BrokenStep:
+    """The rival of moves that begin together: a broken step of the path, after which a stretch of it is displaced as one."""
+
+    def __init__(
+        self, estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation],
+        moves: Sequence[_Change], begin: int | None = None,
+    ) -> None:
+        self.estimate, self.radios, self.moves, self.found, self.before = estimate, radios, moves, list(found), list(found)
+        heard, end = self._extent(task) if moves else (0, len(estimate.graph.poses))
+        begin = heard if begin is None else begin
+        self.recording = task.recordings.each[int(task.recordings.of_keyframe[begin])]
+        self.begin = max(begin, self.recording.rows.start + 1)
+        self.end = min(end, self.recording.rows.stop)
+        for k, (radio, each) in enumerate(zip(radios, self.found, strict=True)):
+            outside = np.setdiff1d(np.arange(len(radio.pose)), radio.inside(self.begin, self.end))
+            if len(each.found) == 1 and len(outside) >= task.config.trilateration.min_ranges:
+                # The stretch has pulled the place along.
+                self.found[k] = replace(each, found=(radio.model.likeliest(each.height, [outside])[0],))
+        for move in moves:
+            each = self.found[move.radio]
+            place = each.place.copy()
+            place[move.interval] = move.before
+            self.found[move.radio] = replace(each, place=place)
+
+    def _extent(self, task: Task) -> tuple[int, int]:
+        """Return the first keyframe of the longest move, and the one at which it ends or the recording does."""
+        first = max(self.moves, key=lambda move: len(move.interval), default=None)
+        if first is None:
+            return 0, len(self.estimate.graph.poses)
+        radio, last = self.radios[first.radio], int(first.interval[-1])
+        recording = radio.track.recording
+        more = last + 1 < len(radio.pose) and recording[last + 1] == recording[last]
+        end = int(radio.pose[last]) + 1 if more else task.recordings.each[int(recording[last])].rows.stop
+        return int(radio.pose[first.interval[0]]), end
+
+    def gain(self) -> float:
+        """Return by how much its evidence is greater than that of the moves, if a step is broken there."""
+        poses = self.estimate.graph.poses
+        for _ in range(MovePolicy.laps):
+            # Places that a displaced stretch has pulled along hide some of the step, so both are found in turn.
+            self.motion, spread = self._fitted()
+            gain = self._evidence()
+        gain += spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
+        return gain - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
+
+    def log_prior(self) -> float:
+        """Return the logarithm of the prior probability of a broken step just there, and of one where it ends."""
+        ends = 1 if self.end == self.recording.rows.stop else 2
+        return ends * float(np.log(BreakPolicy.broken / len(self.recording.frames)))
+
+    def displaced(self, poses: Floats) -> Floats:
+        """Return poses (k, 3) with the stretch moved to where the ranges have it."""
+        poses = poses.copy()
+        poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
+        return poses
+
+    def places(self, anchors: Floats) -> Floats:
+        """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
+        assert self.estimate.ranges is not None
+        anchors = anchors.copy()
+        for radio, each in zip(self.radios, self.found, strict=True):
+            of = self.estimate.ranges.anchor[radio.rows[radio.chosen]]
+            for number in radio.numbers:
+                own = each.place[(of == number) & (each.place >= 0)]
+                anchors[number] = each.places[np.bincount(own).argmax()] if len(own) else anchors[number]
+        return anchors
+
+    def _displacement(self) -> Floats:
+        """Return the motion (3,) of the stretch in the map."""
+        origin = self.estimate.graph.poses[self.begin - 1]
+        return np.asarray(se2.compose(se2.compose(origin, self.motion), se2.inverse(origin)))
+
+    def _evidence(self) -> float:
+        """Return by how much the evidence of all ranges is greater than with the moves, the places at their likeliest."""
+        gain, moved = 0.0, self._displacement()
+        for k, radio in enumerate(self.radios):
+            inside, path = radio.inside(self.begin, self.end), radio.track.path.copy()
+            if len(inside):
+                path[inside] = se2.transform(moved, path[inside])
+                shares = radio.model.worth(self.before[k].place)
+                one = radio.model.with_places(self.before[k], shares)
+                self.found[k] = radio.model.along(path).with_places(self.found[k], shares)
+                gain += self.found[k].evidence - one.evidence
+        return gain
+
+    def _fitted(self) -> tuple[Floats, float]:
+        """Return the error (3,) of the step that explains the stretch's ranges best, and the logarithm of what share of its
+        prior the ranges leave."""
+        home = se2.inverse(self.estimate.graph.poses[self.begin - 1])
+        parts = []
+        for radio, each in zip(self.radios, self.found, strict=True):
+            own = radio.inside(self.begin, self.end)
+            own = own[each.place[own] >= 0]
+            at, bias = each.place[own], np.array([place.bias for place in each.found])
+            root = np.sqrt(radio.model.worth(each.place)[own]) / max(2.0 * radio.track.sigma, BreakPolicy.sigma)
+            parts.append((each.places[at], radio.track.path[own], radio.track.level(each.height)[own] - bias[at], root))
+        places, tags, measured, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
+        place, tag = se2.transform(home, places), se2.transform(home, tags)
+
+        def errors(step: Floats) -> Floats:
+            """Return whitened errors of the ranges, and the prior of the step."""
+            distance = np.hypot(*(se2.transform(step, tag) - place).T)
+            return np.append(weight * (distance - measured), step / BreakPolicy.size)
+
+        angles = np.linspace(-np.pi, np.pi, BreakPolicy.turns, endpoint=False)
+        starts = [*np.column_stack([np.zeros((len(angles), 2)), angles]), *self._motions_of_anchors(home)]
+        tried = [least_squares(errors, start, loss="cauchy", f_scale=BreakPolicy.loss) for start in starts]
+        done = min(tried, key=lambda each: float(each.cost))
+        spread = -0.5 * np.linalg.slogdet(done.jac.T @ done.jac)[1] - 3.0 * np.log(BreakPolicy.size)
+        return np.asarray(done.x), float(spread)
+
+    def _motions_of_anchors(self, home: Floats) -> list[Floats]:
+        """Return motions (3,) of the stretch that would move the anchors of the moves back to where they were."""
+        moved = [(self.before[m.radio].places, m.before, int(self.before[m.radio].place[m.interval[0]])) for m in self.moves]
+        if not moved:
+            return []
+        here, there = (
+            se2.transform(home, np.array(points))
+            for points in ([at[one] for at, one, _ in moved], [at[other] for at, _, other in moved])
+        )
+        shift = np.append((here - there).mean(axis=0), 0.0)
+        return [shift, se2.align(there, here)] if len(here) > 1 else [shift]
+
+    def _cost(self, poses: Floats) -> float:
+        """Return chi2 of what ties the stretch to the rest besides ranges: scans of other visits, and what the user gave.
+
+        The prior of a broken step takes the place of the wheels' noise, and of that of scans that follow each other.
+        """
+        return replace(self.estimate.graph, poses=poses).with_edges(self.estimate.closures.edges).chi2()
+
+    def finding(self) -> Finding:
+        """Return the doubt: a stretch of the path is displaced."""
+        stamps, start = self.recording.frames.stamps, float(self.recording.log.odometry.stamps[0])
+        begin, end = (float(stamps[k - self.recording.first]) for k in (self.begin, self.end - 1))
+        names = ", ".join(sorted({self.radios[move.radio].name for move in self.moves}))
+        off, turned = float(np.hypot(*self.motion[:2])), float(np.rad2deg(abs(self.motion[2])))
+        text = (
+            f"from t = {begin - start:.0f} to {end - start:.0f} s the ranges to {names} fit a path that lies {off:.1f} m and "
+            f"{turned:.0f} deg from the map's: a step is broken at the beginning, by slip or a wrong match of scans; drive "
+            "there again, or map the parts before and after separately"
+        )
+        return doubt("path-displaced", text, recording=self.recording.number + 1, begin=begin, end=end, apart=off)

@@ -1,0 +1,57 @@
+"""Solution of a problem: its optimum, of which no anchor's squared height is below 0."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..graph.calibration import HEIGHT
+from ..graph.graph import Graph
+from ..graph.optimizer import Optimizer
+from ..graph.solver import SolverConfig, SolverSummary
+from ..graph.unknowns import free_unknowns
+
+
+def solve(graph: Graph, config: SolverConfig, optimizer: Optimizer | None = None) -> tuple[Graph, SolverSummary]:
+    """Return the graph at its optimum without a squared height below 0, and how the last search went; see solver.optimize.
+
+    Heights that come out negative are fixed at 0, and all other unknowns are solved again.
+
+    Parameters
+    ----------
+    optimizer : of graphs like this one.
+    """
+    optimizer = optimizer or Optimizer()
+    while True:
+        solved, summary = optimizer.optimize(graph, config)
+        graph = with_nonnegative_heights(solved)
+        anything_free = any(free.any() for free in free_unknowns(graph).values())
+        if not anything_free or np.array_equal(graph.calibration.values, solved.calibration.values):
+            return graph, summary
+
+
+def with_nonnegative_heights(graph: Graph) -> Graph:
+    """Return the graph with negative squared heights set to 0 and fixed."""
+    values = graph.calibration.values.copy()
+    below = graph.calibration.of_kinds(HEIGHT) & (values < 0.0)
+    values[below] = 0.0
+    graph = graph.updated(graph.poses, graph.anchors, values)
+    return replace(graph, fixed_calibration=graph.fixed_calibration | below)
+
+
+def rough(solver: SolverConfig) -> SolverConfig:
+    """Return the solver settings for an optimisation after which weights are re-estimated and another one follows."""
+    iterations, decrease = min(solver.max_iterations, _ROUGH_ITERATIONS), max(solver.relative_decrease, _ROUGH_DECREASE)
+    return replace(solver, max_iterations=iterations, relative_decrease=decrease)
+
+
+_ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
+"""Most iterations of such an optimisation, and the relative decrease of chi2 that ends it."""
+
+
+def comparable(solver: SolverConfig) -> SolverConfig:
+    """Return the solver settings for an optimisation whose evidence is compared; the chosen one is then continued."""
+    return replace(solver, relative_decrease=max(solver.relative_decrease, _COMPARABLE))
+
+
+_COMPARABLE = 1e-5
+"""Relative decrease of chi2 that ends such an optimisation."""
