@@ -43,7 +43,7 @@ def test_a_heading_that_drifts_throughout_is_calibrated(sound):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="known limit: places of anchors that change at once explain the swap before the halves do")
+@pytest.mark.xfail(run=False, reason="known limit: places of anchors that change at once explain the swap before the halves do")
 def test_turns_that_change_their_sign_half_way(sound):
     poses = sound.odometry.poses
     steps = se2.between(poses[:-1], poses[1:])

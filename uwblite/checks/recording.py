@@ -75,7 +75,7 @@ def diagnose(
 
 def _advice_without_ranges(log: SensorLog) -> str:
     if log.notes.unread:
-        return f"there may be some in what was not read: {', '.join(log.notes.unread)}; --uwb-mapping says where (see above)"
+        return f"there may be some in what was not read: {', '.join(log.notes.unread)}; `mappings` say where (see above)"
     return "the map rests on wheels and lidar; check the tag if that is not meant"
 
 

@@ -115,8 +115,8 @@ def plan_topics(
     spare += [name for name in uwb if name not in kept]
     choices = []
     for kind, taken, named, what, option in (
-        (ODOMETRY, odometry, asked.odometry, "odometry is", "--odometry-topic"),
-        (SCAN, scan, asked.scan, "scans are", "--scan-topic"),
+        (ODOMETRY, odometry, asked.odometry, "odometry is", "`topics.odometry`"),
+        (SCAN, scan, asked.scan, "scans are", "`topics.scan`"),
     ):
         alike = [t.name for t in topics if t.type == kind and t.name != taken]
         if taken and alike and not named:
@@ -136,7 +136,7 @@ def unread_warning(plan: TopicPlan) -> str:
     names = ", ".join(plan.unread)
     return (
         f"not read, though there may be ranges in it: {names}. If there are, put this line into a file uwb.toml, correct it"
-        f" (docs/formats.md explains it) and give --uwb-mapping uwb.toml: {as_toml(plan.unread.values())}"
+        f" (docs/formats.md explains it) and give `mappings=uwb.toml`: {as_toml(plan.unread.values())}"
     )
 
 
@@ -191,7 +191,7 @@ def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) 
 
 
 def _no_mapping(topic: BagTopic, guess: UwbMapping | None) -> str:
-    text = f"no uwb mapping reads {topic.name} of type {short_type(topic.type)}; describe it in a file for --uwb-mapping"
+    text = f"no uwb mapping reads {topic.name} of type {short_type(topic.type)}; describe it in a file for `mappings`"
     return text if guess is None else f"{text}, for a start: {as_toml([guess])}"
 
 

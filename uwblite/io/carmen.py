@@ -226,7 +226,7 @@ class LogReader:
         if scans is not None and others:
             counts = ", ".join(f"{count} of {name}" for name, count in others.items())
             used = self.scan_message or "the first"
-            hint = f"--scan-topic {min(others)} would take those of another"
+            hint = f"`topics.scan={min(others)}` would take those of another"
             warnings.append(f"a map uses one lidar, here {used}; scans of others are left out ({counts}); {hint}")
         notes = LogNotes(
             source=self.path,

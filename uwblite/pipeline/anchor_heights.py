@@ -97,6 +97,6 @@ def check_heights(estimate: Estimate, task: Task) -> None:
     taken, instead = ("high", "low") if other.taken else ("low", "high")
     text = (
         f"the ranges fit anchors {other.high:.1f} m above the tag about as well as low ones: taken as {taken}; if they are "
-        f"{instead}, the trajectory differs by {other.apart:.1f} m (rms); give the anchors' heights (--anchor-height)"
+        f"{instead}, the trajectory differs by {other.apart:.1f} m (rms); give the anchors' heights (`mounting.anchor_height`)"
     )
     task.stages.doubt("anchor-heights", text, height=other.high, taken=taken, apart=other.apart)

@@ -178,7 +178,7 @@ def _finding(
         off=off, turned=turned,
     )  # fmt: skip
     cure = (
-        f"`uwblite convert run.log before.log --end {begin - start:.0f}` gives the part that is supported best; map that, or "
-        "`uwblite map run.log --without lidar` for what wheels and ranges alone say"
+        f"`end={begin - start:.0f}` gives the part that is supported best; map that, or "
+        "`use_lidar=false` for what wheels and ranges alone say"
     )
     return replace(told, sensor="lidar", recording=step.recording.number + 1, stretches=((begin, end),), cure=cure)

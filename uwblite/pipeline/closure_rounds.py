@@ -138,7 +138,7 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
     text = (
         f"the scans at t = {a:.0f} s and at t = {b:.0f} s may show the same place, but their relative position is known to "
         f"{sigma:.1f} m only and no scan match confirms it ({len(left.target)} such pairs): drive there once more in the same "
-        "direction, or force the closure (uwblite view)"
+        "direction, or force the closure"
     )
     task.stages.doubt("open-loops", text, pairs=len(left.target), first=a, second=b, sigma=sigma)
 

@@ -190,7 +190,7 @@ def _check_resolution(geometry: GridGeometry, asked: float, task: Task) -> None:
     most = task.config.grid.max_cells / 1e6
     text = (
         f"the map is drawn with cells of {edge:g} m instead of {asked:g} m: there would be more than {most:g} million; "
-        "raise grid.max_cells where there is memory (12 bytes each), or set --crop or a smaller grid.max_range"
+        "raise grid.max_cells where there is memory (12 bytes each), or set `crop` or a smaller grid.max_range"
     )
     say = task.stages.warn if edge <= _COARSEST * asked else task.stages.doubt
     say("coarse-grid", text, resolution=edge, asked=asked)

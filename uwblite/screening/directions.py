@@ -65,7 +65,7 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     text = (
         "laser and wheels turn in opposite directions: the laser was taken as mounted "
         f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
-        f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
+        f"settle it by {'' if flipped else 'leaving out '}`mounting.laser_flipped`, or by the odometry's sign"
     )
     return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [doubt("laser-turned-over", text)]
 
@@ -92,7 +92,7 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Finding]]
         mount, tags = around, np.column_stack([se2.rotate(np.full(len(tags), angle), tags[:, :2]), tags[:, 2]])
     text = (
         f"the laser's direction differs by {np.degrees(angle):+.0f} degrees from its given pose, by the motion that both "
-        f"measure; corrected: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
+        f"measure; corrected: `mounting.T_base_laser={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}`"
     )
     mounting = replace(log.mounting, T_base_laser=mount, laser_is_base=False, tag_position=tags[0], more_tags=tags[1:])
     return replace(log, mounting=mounting), [warning("laser-turned-away", text)]
