@@ -21,7 +21,6 @@ from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
 from ..problem.parts import at_given_poses
-from ..problem.solution import with_nonnegative_heights
 from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
