@@ -65,14 +65,8 @@ class AnchorErrors:
 
 def statistics(errors: Floats) -> ErrorStatistics:
     """Return the figures of the errors (n,), n >= 1."""
-    return ErrorStatistics(
-        rmse=float(np.sqrt(np.mean(errors**2))),
-        mean=float(np.mean(errors)),
-        median=float(np.median(errors)),
-        std=float(np.std(errors)),
-        max=float(np.max(errors)),
-        count=len(errors),
-    )
+    figures = np.sqrt(np.mean(errors**2)), np.mean(errors), np.median(errors), np.std(errors), np.max(errors)
+    return ErrorStatistics(*map(float, figures), count=len(errors))
 
 
 def evaluate_trajectory(

@@ -1,12 +1,4 @@
-"""A recording as a folder of CSV files, for spreadsheets, pandas and other languages.
-
-| file | columns |
-|---|---|
-| odometry.csv | stamp, x, y, theta |
-| ranges.csv | stamp, anchor, range, quality |
-| gyro.csv | stamp, heading: of a gyro, from any zero |
-| scans.csv | stamp, then one column a beam; empty = nothing seen, nan = invalid |
-| sensors.toml | geometry of the scans, mounting of the sensors |
+"""A recording as a folder of CSV files, for spreadsheets, pandas and other languages; docs/formats.md lists files and columns.
 
 Stamps in seconds, lengths in metres, angles in radians. Columns are found by the names of the header, others are skipped;
 where the header has names of its own, or is missing, they stand in this order. The quality may be missing. Files of sensors
@@ -125,7 +117,7 @@ def _write(path: Path, header: str, rows: Iterable[str]) -> None:
 
 def _range_rows(ranges: UwbRanges) -> Iterator[str]:
     names = [csv_field(name) for name in ranges.anchor_ids]
-    columns = (ranges.stamps.tolist(), ranges.anchor.tolist(), ranges.ranges.tolist(), ranges.quality.tolist())
+    columns = (column.tolist() for column in (ranges.stamps, ranges.anchor, ranges.ranges, ranges.quality))
     for stamp, anchor, distance, quality in zip(*columns, strict=True):
         yield f"{stamp:.6f},{names[anchor]},{distance:.4f},{quality:g}"
 

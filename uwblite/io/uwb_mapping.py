@@ -1,14 +1,6 @@
 """Places of UWB ranges in ROS messages: there is no standard, so a table lists where to look.
 
-As TOML, one ``[[uwb]]`` table per kind of message; the first that fits a topic is used::
-
-    [[uwb]]
-    topic = "/beacon_raw"        # pattern of the topic's name, * and ? as in file names
-    readings = "sensed_data"     # list within the message that holds the readings; "" = the message is one reading
-    anchor = "id"                # field of the reading with the anchor's id
-    range = "range"              # field of the reading with the distance
-    unit = 1.0                   # metres per unit of it, 0.001 for millimetres
-    stamp = "header.stamp"       # field of the message with the time; "" = when it was recorded
+As TOML, one ``[[uwb]]`` table per kind of message with the fields of `UwbMapping` (docs/formats.md); the first that fits holds.
 """
 
 import math

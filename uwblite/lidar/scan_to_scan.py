@@ -70,6 +70,8 @@ class ScanOdometry:
     """(e,) probability that the wheels slipped over each."""
     moving: Bools
     """(p,) points of the clouds that belong to objects that moved by themselves."""
+    rejected: Bools
+    """(e,) steps that contradict the wheels although the clouds are likelier as the wheels count; not among the measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +136,11 @@ def follow(
     found = registration.register(i, i + 1, points, prior, steps.pose)
     slips = posterior(found.log_odds, wheels.duration)
     placed = found.chosen(slips)
-    edges, learnt, searched = _measured_near(clouds, raster, wheels, graph, steps, certain, tight, config)
+    edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)
+    # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.
+    rejected = _contradicted(edges, noise, graph) & (found.log_odds < 0.0)
+    edges = edges.rows(np.flatnonzero(~rejected[np.searchsorted(i, edges.i)]))
+    learnt = with_uncounted_ways(noise, edges, graph)
     lasting = (slips > 0.5) & (placed.factors.matched >= _FEWEST)
     lasting &= placed.evidence > np.log(RegistrationConfig.useless)
     seen, others = np.flatnonzero(lasting), ~np.isin(edges.i, i[slips > 0.5])
@@ -143,15 +149,14 @@ def follow(
     miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
         edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
-        float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving,
+        float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving, rejected,
     )
 
 
 def _measured_near(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, certain: RelativePoseEdges,
-    gate: float, config: TrackingConfig,
-) -> tuple[RelativePoseEdges, OdometryEdges, int]:
-    """Return the steps as wheels that do not slip allow, the wheels with the noise that these show, and how many were searched.
+    clouds: Clouds, raster: CloudRasters, steps: Steps, certain: RelativePoseEdges, gate: float, config: TrackingConfig
+) -> tuple[RelativePoseEdges, int]:
+    """Return the steps as wheels that do not slip allow, and how many were searched.
 
     Neighbours that share few points are searched for in the local sub-map of the keyframes before; where that finds nothing, or
     two equally good places, the step is left to the odometry.
@@ -161,10 +166,28 @@ def _measured_near(
     further = steps.enough & ~lost & ~good
     measured_steps = certain.followed_by(_edges(clouds, raster, steps.i[further], pose[further], gate, config)[0])
     measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
-    learnt = reestimate_wheel_noise(wheels, measured_steps, graph)
-    return measured_steps, with_uncounted_ways(learnt, measured_steps, graph), searched
+    return measured_steps, searched
 
 
+def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph) -> Bools:
+    """Return over which steps (e,) of the odometry measured edges contradict it, in the directions that these measure."""
+    own = np.searchsorted(wheels.i, edges.i)
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    onto, turn = covariance @ information, se2.rotation(edges.T_i_j[:, 2])
+    off = np.einsum("eij,ej->ei", onto, se2.between(edges.T_i_j, wheels.corrected(graph)[own]))
+    by_wheels = np.swapaxes(turn, 1, 2) @ covariance_of(wheels, graph)[own] @ turn
+    joint = onto @ by_wheels @ np.swapaxes(onto, 1, 2) + covariance
+    squared = np.einsum("ei,eij,ej->e", off, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), off)
+    # Single steps also hold the errors that telescope, which the wheels' noise leaves out.
+    usual = max(float(np.median(squared)) / _MEDIAN, 1.0) if len(squared) else 1.0
+    contradicted = np.zeros(len(wheels), dtype=bool)
+    contradicted[own[squared > usual * _CONTRADICTS]] = True
+    return contradicted
+
+
+_MEDIAN, _CONTRADICTS = 2.366, 16.266
+"""Median of chi2 with three degrees of freedom, and what one step in a thousand exceeds by chance."""
 _FEWEST = 6
 """Matches from which on a step is measured: twice its unknowns."""
 

@@ -173,7 +173,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
     good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE * rays.sigma + _SLACK)
-    return replace(rays, surface=nearest + first).rows(good).bundled()
+    return replace(rays, surface=nearest + first).rows(good)
 
 
 NEAR = 0.3
