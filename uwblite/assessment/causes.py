@@ -24,8 +24,8 @@ _BY_RANGES = _PLACES | {
 }
 """What a map by ranges and wheels alone shows of a fault of either."""
 _BY_SCANS = frozenset({
-    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-jumps",
-    "odometry-steps", "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
+    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-steps",
+    "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
     "unusual-calibration", "mirrored",
 })  # fmt: skip
 """What a map shows of a fault of lidar or wheels."""
