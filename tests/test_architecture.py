@@ -26,7 +26,7 @@ FLOORS = (
     ("map_result", "radio", "navigation"),
     ("lidar", "report"),
     ("screening",),
-    ("loop_closure", "checks", "evaluation", "io"),
+    ("loop_closure", "evaluation", "io"),
     ("pipeline",),
     ("assessment",),
     ("mapping",),

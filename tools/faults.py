@@ -36,7 +36,7 @@ from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
 from uwblite import se2
-from uwblite.checks.recording import diagnose
+from uwblite.assessment.recording import diagnose
 from uwblite.errors import UwbliteError
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_words import time_order
@@ -143,7 +143,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
         kinds = tuple(doubt.kind for doubt in result.doubts)
         code, seconds = 3 if result.doubts else 0, time.process_time() - began
         signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
-        check = checked(log, anchors=result.anchors, calibration=result.calibration, doubts=result.doubts)
+        check = checked(log, result=result)
     except TimeoutError as error:
         stated, code = (str(error),), CRASHED
     except UwbliteError as error:
@@ -180,8 +180,8 @@ def outcomes(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
 
 
 def checked(log: SensorLog, **map_says: Any) -> int:
-    """Return the exit code of `uwblite check`, which makes the same map: 3 where it finds anything serious."""
-    return 3 if diagnose(log, **map_says).serious else 0
+    """Return the exit code of `uwblite check`, which makes the same map: 3 where it doubts the recording."""
+    return 3 if diagnose(log, **map_says).doubts else 0
 
 
 def clean_cases(worlds: Sequence[str], minutes: float, seed: int) -> dict[str, Case]:

@@ -42,6 +42,21 @@ class Finding:
         return self.text
 
 
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """What a stage saw or did, for people to know; the rule of its kind makes a finding of it."""
+
+    kind: str
+    """As a finding's."""
+    figures: dict[str, Any]
+    """What the rule needs (JSON-ready)."""
+
+    @staticmethod
+    def of(kind: str, **figures: Any) -> "Fact":
+        """Return a fact with named figures."""
+        return Fact(kind, figures)
+
+
 WHEELS_AGAINST_LIDAR = "wheels-against-lidar"
 """Kind of a finding of which only a map can tell whether it is a doubt."""
 

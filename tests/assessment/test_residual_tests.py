@@ -19,6 +19,7 @@ from uwblite.assessment.residual_tests import (
     check_slips,
     check_support,
 )
+from uwblite.findings import doubt
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
@@ -84,7 +85,7 @@ def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
     ties = ScanEdges(i, j, se2.between(truth[i], truth[j]), root, none, none, scan_indices(Calibration()))
     stages = Stages(None, None)
     for kind in doubts:
-        stages.doubt(kind, "")
+        stages.findings.append(doubt(kind, ""))
     recordings = SimpleNamespace(
         stamps=50.0 + np.arange(80.0), path=np.arange(80.0), of_keyframe=np.zeros(80, dtype=int)
     )

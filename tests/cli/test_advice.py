@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.room_recording import recording, two_rounds
 
-from uwblite.checks.recording import diagnose
+from uwblite.assessment.recording import diagnose
 from uwblite.cli import main
 from uwblite.cli.formats import read_recording
 from uwblite.errors import DataError
@@ -66,7 +66,7 @@ def test_a_unit_that_is_named_is_the_one_that_mends_the_recording(tmp_path, soun
     if mended.scans is not None:
         seen = [s.ranges[np.isfinite(s.ranges)] for s in (mended.scans, sound.scans)]
         np.testing.assert_allclose(*map(np.median, seen), rtol=1e-2)
-    assert not [f for f in diagnose(mended).serious if "look like" in f.what]
+    assert not [f for f in diagnose(mended).doubts if "look like" in f.text]
 
 
 def test_figures_are_printed_as_a_person_reads_them(tmp_path, sound, capsys):

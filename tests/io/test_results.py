@@ -190,7 +190,7 @@ def killed_behind(what, folder):
 
 
 @pytest.mark.usefixtures("small_picture")
-@pytest.mark.parametrize("what", ["write_png", "write_pyfg", "_write_trajectories", "render", "summary"])
+@pytest.mark.parametrize("what", ["write_png", "write_pyfg", "write_tum", "render", "summary"])
 @pytest.mark.parametrize("fresh", [True, False])
 def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
     folder = tmp_path / "map"

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.planted_graphs import loop
+from helpers.told import doubted
 
 from uwblite.graph.graph import Calibration, UnknownKey
 from uwblite.pipeline import lidar_stages
@@ -15,15 +16,15 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 
 
-@pytest.mark.parametrize(("share", "visits", "doubted"), [(0.051, 5, True), (0.05, 5, False), (0.9, 4, False), (0.0, 9, False)])
-def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(monkeypatch, share, visits, doubted):
+@pytest.mark.parametrize(("share", "visits", "said"), [(0.051, 5, True), (0.05, 5, False), (0.9, 4, False), (0.0, 9, False)])
+def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(monkeypatch, share, visits, said):
     """More than 5 % of the points, on five visits at least."""
     monkeypatch.setattr(lidar_stages.visibility, "free_space_violation", lambda *args: (share, visits))
     stages = Stages(None, None)
     estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=None), graph=SimpleNamespace(poses=None))
     task = SimpleNamespace(recordings=SimpleNamespace(path=None, of_keyframe=None), stages=stages)
     assert check_map_consistency(estimate, task) is estimate
-    assert [n.kind for n in stages.doubts] == (["free-space-violation"] if doubted else [])
+    assert [n.kind for n in doubted(stages)] == (["free-space-violation"] if said else [])
     assert stages.done[0].figures == {"visits": visits, "free_space_violation": share}
 
 
@@ -84,3 +85,19 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     monkeypatch.setattr(lidar_stages, "_matched_once_more", matched)
     assert lidar_stages.solve_by_own_errors(estimate, task) is estimate
     assert " ".join(made) == done
+
+
+def test_pairs_of_one_visit_do_not_lead_across_a_step_that_clouds_measure_falsely(monkeypatch):
+    """Those between visits do: their clouds are compared at the poses that everything else gives."""
+    i, j = np.array([0, 2, 3, 3, 4, 0]), np.array([1, 4, 4, 5, 5, 9])
+    monkeypatch.setattr(lidar_stages.joint_refinement, "choose_pairs", lambda *_: (i, j))
+    rejected = np.arange(10) == 3
+    estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=None), rejected=rejected)
+    task = SimpleNamespace(
+        recordings=SimpleNamespace(path=None, of_keyframe=None), allowed=lambda i, j: np.ones(len(i), dtype=bool)
+    )
+    graph, settings = SimpleNamespace(poses=None), MappingConfig().refinement
+    kept = lidar_stages._pairs(estimate, graph, settings, task)
+    assert list(zip(*(part.tolist() for part in kept), strict=True)) == [(0, 1), (4, 5), (0, 9)]
+    estimate.rejected = None
+    assert len(lidar_stages._pairs(estimate, graph, settings, task)[0]) == len(i)
