@@ -83,7 +83,6 @@ def build_map(
         estimate = stage(estimate, task)
         task = task.following(estimate)
     covariance = final_stages.covariances_of(estimate, task)
-    stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, covariance, grid, task)
 

@@ -17,6 +17,7 @@ from uwblite.assessment.plausibility import (
     check_moved_together,
 )
 from uwblite.constraints import Constraints, GivenAnchor
+from uwblite.findings import warning
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate
 from uwblite.mapping import MappingConfig, build_map
@@ -279,7 +280,7 @@ def test_names_left_out_count_as_distrusted_anchors(used, left_out, lidar, doubt
     anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for k in range(used)]
     stages = Stages(None, None)
     for _ in range(left_out):
-        stages.warn("shared-name", "two anchors answer to a name")
+        stages.findings.append(warning("shared-name", "two anchors answer to a name"))
     stages.findings.extend(check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar))))
     assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubted
     assert all(f"{left_out} of {used + left_out} anchors" in n.text and "too few" in n.text for n in stages.doubts)
@@ -319,7 +320,7 @@ def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doub
     """Where it is known that the wheels lost some of their way, and by more than a radio is usually off."""
     stages, key = Stages(None, None), UnknownKey("range_scale")
     if wheels:
-        stages.warn("wheels-stand-still", "the wheels count nothing from t = 3 to 5 s")
+        stages.findings.append(warning("wheels-stand-still", "the wheels count nothing from t = 3 to 5 s"))
     value = CalibrationEstimate(key, scale, 0.004, "1", "relative error of all ranges", "estimated")
     recordings = SimpleNamespace(have_scans=True)
     stages.findings.extend(

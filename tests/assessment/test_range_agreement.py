@@ -12,7 +12,7 @@ from uwblite.assessment.range_agreement import (
     check_wheels_against_lidar,
     outlier_stretches,
 )
-from uwblite.findings import Finding
+from uwblite.findings import Fact, warning
 from uwblite.map_result import AnchorEstimate
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import OdometryBreaks, Screening
@@ -53,7 +53,7 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
 def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_other(have_scans, kinds, names, doubted):
     stages = Stages(None, None)
     for kind in kinds:
-        stages.warn(kind, "warned of before")
+        stages.findings.append(warning(kind, "warned of before"))
     anchors = [SimpleNamespace(id=n.split()[-1], status="distrusted" if "bad" in n else "ok") for n in names]
     stages.findings.extend(
         check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
@@ -137,7 +137,7 @@ def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretc
     other = {**table, "residual": np.ones(150), "recording": np.ones(150)}
     table = {name: np.concatenate([table[name], other[name]]) for name in table}
     anchors = [SimpleNamespace(id=name, status=status) for name, status in zip(names, statuses, strict=True)]
-    found = Finding("wheels-against-lidar", "doubt", "they differ", stretches=stretches)
+    found = Fact.of("wheels-against-lidar", start=0.0, stretches=stretches)
     logs = [SimpleNamespace(screening=None), SimpleNamespace(screening=None)]
     logs[whose - 1] = SimpleNamespace(screening=Screening((found,), OdometryBreaks.none()))
     task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log) for log in logs]))
@@ -151,7 +151,7 @@ def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
     stages = against(lambda s: np.where((s % 10 == 0) | ((s > 60) & (s < 75) & (s % 3 == 1)), 1.0, 0.1))
     assert stages.doubts == []
     (notice,) = stages.warnings
-    assert (notice.kind, "they differ; " in notice.text, len(notice.stretches)) == (
+    assert (notice.kind, "; the ranges agree" in notice.text, len(notice.stretches)) == (
         "wheels-against-lidar", True, 2)  # fmt: skip
 
 

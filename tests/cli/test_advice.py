@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from helpers.room_recording import recording, two_rounds
 
-from uwblite.checks.recording import diagnose
+from uwblite.assessment.recording import diagnose
 from uwblite.cli import main
 from uwblite.cli.formats import read_recording
+from uwblite.cli.wording import with_options
 from uwblite.errors import DataError
 from uwblite.io.carmen import write_log
 from uwblite.screening.screen import screen
@@ -55,7 +56,7 @@ def test_a_unit_that_is_named_is_the_one_that_mends_the_recording(tmp_path, soun
         spoiled = spoiled.without(lidar=True)
     with pytest.raises(DataError) as refused:
         screen(spoiled)
-    command = re.search(r"uwblite convert (--[a-z]+-unit) (\S+?)\)", str(refused.value))
+    command = re.search(r"uwblite convert (--[a-z]+-unit)=(\S+?)`", with_options(str(refused.value)))
     assert command, str(refused.value)
     write_log(tmp_path / "spoiled.log", spoiled)
     assert main(["convert", str(tmp_path / "spoiled.log"), str(tmp_path / "mended.log"), *command.groups(), "-q"]) == 0
@@ -66,7 +67,7 @@ def test_a_unit_that_is_named_is_the_one_that_mends_the_recording(tmp_path, soun
     if mended.scans is not None:
         seen = [s.ranges[np.isfinite(s.ranges)] for s in (mended.scans, sound.scans)]
         np.testing.assert_allclose(*map(np.median, seen), rtol=1e-2)
-    assert not [f for f in diagnose(mended).serious if "look like" in f.what]
+    assert not [f for f in diagnose(mended).doubts if "look like" in f.text]
 
 
 def test_figures_are_printed_as_a_person_reads_them(tmp_path, sound, capsys):

@@ -8,7 +8,7 @@ import pytest
 from helpers import planted
 
 from uwblite import se2
-from uwblite.checks.recording import diagnose
+from uwblite.assessment.recording import diagnose
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
@@ -68,7 +68,7 @@ def recorded(place, legs):
 
 def said(log, result, folder):
     """Return all that check, map and watch say of a recording."""
-    found = [f"{f.what}: {f.advice}" for f in diagnose(log).findings]
+    found = [f"{f.text}: {f.cure}" for f in diagnose(log).findings]
     found += [f.text for f in (*result.warnings, *result.doubts)]
     write_result(folder, [log], result, RunRecord("uwblite map x", ""))
     return found + advice({}, {}, 0.0, 0.0, read_result(folder))

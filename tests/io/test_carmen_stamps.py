@@ -96,7 +96,7 @@ def test_stamps_that_stand_still_give_way_to_the_order_of_lines(tmp_path, stamp)
     np.testing.assert_allclose(log.odometry.travelled_at(log.ranges.stamps)[:-1], 0.4 * np.arange(59) + 0.1, atol=0.11)
     assert log.notes.one_clock
     done = screen(log.without(lidar=True, uwb=True))  # neither another unit, nor two robots, nor a clock that was set back
-    assert done.screening.findings == ()
+    assert done.screening.facts == ()
     np.testing.assert_array_equal(done.odometry.poses, log.odometry.poses)
 
 
@@ -160,5 +160,5 @@ def test_between_the_scans_of_a_corrected_log_nothing_is_silent(tmp_path):
         lines.append(f"FLASER 180 {' '.join(['2.5'] * 180)} {pose} {pose} {t} h {t}")
         lines.append(f"ODOM {pose} 0 0 0 -5.77 h -5.77")
     log = read(tmp_path, "\n".join(lines) + "\n")
-    assert not [r for r in screen(log.without(lidar=True)).screening.findings if r.kind == "odometry-gap"]
+    assert not [r for r in screen(log.without(lidar=True)).screening.facts if r.kind == "odometry-gap"]
     assert log.notes.one_clock

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers import planted
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.io.carmen import read_log, write_log
@@ -46,8 +47,8 @@ def test_a_perfect_gyro_makes_wheels_that_turn_wrongly_perfect():
     covered = stamps <= stamps[-1] - 0.01
     assert np.abs(log.odometry.poses - expected)[covered, :2].max() < 0.01  # chords of 0.1 s
     assert np.abs(se2.wrap_angle(log.odometry.poses[:, 2] - expected[:, 2]))[covered].max() < 2e-3
-    assert f"{BIAS:+.5f}" in remarks[0].text
-    assert "rests" in remarks[0].text
+    assert f"{BIAS:+.5f}" in told(remarks)[0].text
+    assert "rests" in told(remarks)[0].text
 
 
 def test_a_false_stamp_years_away_takes_no_memory():
@@ -66,7 +67,7 @@ def test_without_a_rest_the_bias_is_found_against_the_wheels():
     rng = np.random.default_rng(2)
     stamps, truth = planted.wander(rng, 60.0)
     log, remarks = heading_from_gyro(SensorLog(planted.odometry(stamps, truth), gyro=gyro_of(stamps, truth)))
-    assert "against the wheels" in remarks[0].text
+    assert "against the wheels" in told(remarks)[0].text
     turn = se2.wrap_angle(log.odometry.poses[:, 2] - (truth[:, 2] - truth[0, 2]))
     assert np.abs(turn).max() < 0.1 * BIAS * stamps[-1]
 
@@ -82,7 +83,7 @@ def test_where_the_gyro_is_silent_the_wheels_turn():
     silent = Gyro(np.array([1e6, 1e6 + 1.0]), np.zeros(2))
     same, remarks = heading_from_gyro(SensorLog(wheels, gyro=silent))
     assert same.odometry is wheels
-    assert "silent" in remarks[0].text
+    assert "silent" in told(remarks)[0].text
 
 
 def test_a_log_keeps_the_gyro(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.planted import NOMINAL, drive, odometry, ranges
 from helpers.planted_graphs import loop
+from helpers.told import doubted, warned
 
 from uwblite import se2
 from uwblite.arrays import rms_length
@@ -32,9 +33,9 @@ def test_heights_that_make_another_trajectory_are_a_doubt_without_a_lidar(apart,
     check_heights(
         SimpleNamespace(other_heights=other), SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar), stages=stages)
     )
-    assert [d.kind for d in stages.doubts] == ["anchor-heights"] * doubts
-    assert not stages.warnings
-    for doubt in stages.doubts:
+    assert [d.kind for d in doubted(stages)] == ["anchor-heights"] * doubts
+    assert not warned(stages)
+    for doubt in doubted(stages):
         assert "4.7 m above the tag" in doubt.text
         assert ("taken as high" in doubt.text) == taken
 

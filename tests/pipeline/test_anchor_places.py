@@ -8,6 +8,7 @@ import pytest
 from helpers.planted import odometry, ranges, wander
 from helpers.planted_graphs import relative_edges
 from helpers.room_recording import ANCHORS, recording, two_rounds
+from helpers.told import doubted, warned
 
 from uwblite import se2
 from uwblite.constraints import Constraints, GivenAnchor
@@ -107,14 +108,14 @@ def scans(poses, i, j):
 
 
 def told(task):
-    return [(w.kind, w.figures["anchor"], w.figures["new_id"]) for w in task.stages.warnings]
+    return [(w.kind, w.figures["anchor"], w.figures["new_id"]) for w in warned(task.stages)]
 
 
 @pytest.mark.parametrize("held", [True, False])
 def test_anchors_that_stay_keep_their_names_and_nothing_is_told(held):
     estimate, task = planted(held=held)
     assert decide_places(estimate, task) is estimate
-    assert (task.stages.warnings, task.stages.doubts) == ([], [])
+    assert (warned(task.stages), doubted(task.stages)) == ([], [])
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -123,11 +124,11 @@ def test_an_anchor_that_is_moved_has_two_places(held):
     found = decide_places(estimate, task)
     assert found.anchor_ids == (*NAMES, "B@2")
     assert told(task) == [("moved-anchor", "B", "B@2")]
-    assert task.stages.doubts == []
+    assert doubted(task.stages) == []
     np.testing.assert_allclose(found.graph.anchors[[1, 4]], [PLACES[1], PLACES[1] + [-2.0, 1.5]], atol=0.3)
     second = found.ranges.stamps[found.ranges.anchor == 4]
     assert abs(second.min() - 100.0) < 4.0
-    assert "from then on it is called B@2" in task.stages.warnings[0].text
+    assert "from then on it is called B@2" in warned(task.stages)[0].text
     # The constant error is the radio's, wherever it stands.
     assert len(set(found.ranges.calibration[np.isin(found.ranges.anchor, [1, 4]), 1].tolist())) == 1
 
@@ -138,7 +139,7 @@ def test_ranges_of_an_anchor_that_is_carried_do_not_count():
     assert found.anchor_ids == (*NAMES, "B@2")
     left_out = found.ranges.stamps[estimate.ranges.alive & ~found.ranges.alive]
     assert 75.0 < left_out.min() < 105.0 < left_out.max() < 135.0
-    assert f"(its {len(left_out)} ranges meanwhile were left out)" in task.stages.warnings[0].text
+    assert f"(its {len(left_out)} ranges meanwhile were left out)" in warned(task.stages)[0].text
 
 
 def torn(estimate, task, at, by, visits=False):
@@ -162,8 +163,8 @@ def test_where_the_path_is_torn_no_anchor_is_moved(by):
     estimate, task = planted()
     found = decide_places(torn(estimate, task, 120.0, np.array(by)), task)
     assert found.anchor_ids == NAMES
-    assert task.stages.warnings == []
-    (doubt,) = task.stages.doubts
+    assert warned(task.stages) == []
+    (doubt,) = doubted(task.stages)
     assert doubt.kind == "path-displaced"
     assert abs(doubt.figures["begin"] - 120.0) < 15.0
     assert doubt.figures["apart"] == pytest.approx(np.hypot(*by[:2]), abs=0.4)
@@ -174,11 +175,11 @@ def test_what_other_visits_saw_says_that_the_path_is_whole():
     together = [(0, k, (2.0, -1.0), 120.0, 120.0) for k in range(4)]
     estimate, task = planted(moves=together)
     assert decide_places(estimate, task).anchor_ids == NAMES
-    assert [doubt.kind for doubt in task.stages.doubts] == ["path-displaced"]
+    assert [doubt.kind for doubt in doubted(task.stages)] == ["path-displaced"]
     estimate, task = planted(moves=together)
     found = decide_places(torn(estimate, task, 120.0, np.zeros(3), visits=True), task)
     assert found.anchor_ids == (*NAMES, *(f"{name}@2" for name in NAMES))
-    assert task.stages.doubts == []
+    assert doubted(task.stages) == []
 
 
 def test_an_anchor_that_is_moved_between_recordings_has_a_place_in_each():
@@ -196,7 +197,7 @@ def test_places_that_joining_set_apart_and_that_agree_are_one():
     found = decide_places(estimate, task)
     assert found.anchor_ids == NAMES
     assert len(found.graph.anchors) == len(found.placed) == len(found.bootstrap.hypotheses) == 4
-    assert task.stages.warnings == []
+    assert warned(task.stages) == []
     # Prior knowledge refers to anchors by their present numbers.
     estimate, task = planted((0, 1), names=names, given=Constraints((GivenAnchor("A"),)))
     assert decide_places(estimate, task).anchor_ids == estimate.anchor_ids

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.told import warned
 
 from uwblite.graph.graph import Graph
 from uwblite.graph.range_edges import RangeEdges
@@ -42,7 +43,7 @@ class _Recordings(SimpleNamespace):
 def said(beginnings, heard, ids=("A", "B")):
     estimate, task = estimate_and_task(beginnings, heard, ids)
     assert name_new_and_absent_anchors(estimate, task) is estimate
-    return [(w.kind, w.figures["anchor"], w.figures["recording"], w.figures["silent"]) for w in task.stages.warnings]
+    return [(w.kind, w.figures["anchor"], w.figures["recording"], w.figures["silent"]) for w in warned(task.stages)]
 
 
 HERE, FAR = (0.0, 0.0), (0.0, 50.0)
@@ -70,7 +71,7 @@ def test_the_second_place_of_a_moved_anchor_is_no_new_anchor(other):
 
 def named(estimate, task):
     name_new_and_absent_anchors(estimate, task)
-    return list(task.stages.warnings)
+    return list(warned(task.stages))
 
 
 def test_readings_without_a_distance_are_no_hearing_and_ranges_without_weight_are():
@@ -80,8 +81,8 @@ def test_readings_without_a_distance_are_no_hearing_and_ranges_without_weight_ar
     of_a = first & (estimate.ranges.anchor == 0)
     estimate.ranges = replace(estimate.ranges, weights=np.where(of_a, 0.0, 1.0))
     assert [w.figures["anchor"] for w in named(estimate, task)] == ["B"]
-    task.stages.findings.clear()
+    task.stages.facts.clear()
     estimate.ranges = replace(estimate.ranges, ranges=np.where(of_a, 0.0, 1.0))
     name_new_and_absent_anchors(estimate, task)
-    assert sorted(w.figures["anchor"] for w in task.stages.warnings) == ["A", "B"]
-    assert "anchor B has ranges only from recording 2 on: recording 1 drove within its reach" in task.stages.warnings[1].text
+    assert sorted(w.figures["anchor"] for w in warned(task.stages)) == ["A", "B"]
+    assert "anchor B has ranges only from recording 2 on: recording 1 drove within its reach" in warned(task.stages)[1].text

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from helpers.laser_walks import HALL
 from helpers.planted import aligned_error, chain, odometry, ranges, scans, wander
+from helpers.told import told
 
 from uwblite import se2
+from uwblite.assessment.causes import explained
 from uwblite.constraints import Constraints
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.pose_edges import ScanEdges
@@ -59,7 +61,7 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0))
     estimate = refine_jointly(estimate, task)
     task.stages.done.clear()
-    task.stages.doubt("path-displaced", "the ranges fit another path")
+    task.stages.note("path-displaced", recording=1, stretch=(0.0, 9.0), start=0.0, anchors=["A"], apart=2.0, turned=0.0)
     return estimate, task, true
 
 
@@ -87,7 +89,7 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     assert aligned_error(mended.graph.poses[:, :2], true[:, :2]) < 0.05
     # Their heights and constant errors are unknown.
     np.testing.assert_allclose(mended.graph.anchors, ANCHORS, atol=0.4)
-    finding = task.stages.findings[-1]
+    finding = told(task.stages.facts)[-1]
     assert (finding.kind, finding.severity, finding.sensor, finding.recording) == ("worse-than-parts", "doubt", "lidar", 1)
     ((begin, end),) = finding.stretches
     assert SLIP - 2.0 < begin < end < SLIP + 4.0
@@ -99,9 +101,9 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
 def test_what_was_said_of_anchors_along_a_torn_path_names_its_cause():
     sound, task, _ = walked()
     estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
-    task.stages.warn("clock-offset", "another matter")
+    task.stages.note("clock-offset", offset=0.1)
     replace_broken_stretches(estimate, task)
-    by_kind = {finding.kind: finding.explained_by for finding in task.stages.findings}
+    by_kind = {finding.kind: finding.explained_by for finding in explained(told(task.stages.facts))}
     assert by_kind == {"path-displaced": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
 
 
@@ -113,30 +115,30 @@ def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
     assert gain > 0.0
     assert len(step.moves) >= 3
     assert replace_broken_stretches(estimate, task) is estimate
-    assert [finding.kind for finding in task.stages.findings] == ["path-displaced"]
+    assert [fact.kind for fact in task.stages.facts] == ["path-displaced"]
 
 
 def test_one_anchor_that_is_moved_breaks_no_path():
     estimate, task, _ = walked(shift=(2.5, -1.5), moved=(1,))
     assert replace_broken_stretches(estimate, task) is estimate
-    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
+    assert ([fact.kind for fact in task.stages.facts], task.stages.done) == (["path-displaced"], [])
 
 
 def test_a_sound_path_stays_and_costs_no_solution():
     """A slip that the scans followed rightly is no broken step."""
     estimate, task, _ = walked()
     assert replace_broken_stretches(estimate, task) is estimate
-    assert ([finding.kind for finding in task.stages.findings], task.stages.done) == (["path-displaced"], [])
+    assert ([fact.kind for fact in task.stages.facts], task.stages.done) == (["path-displaced"], [])
 
 
 def test_nothing_is_compared_where_one_anchor_moved_or_none():
     sound, task, _ = walked()
     estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
-    task.stages.findings.clear()
+    task.stages.facts.clear()
     assert replace_broken_stretches(estimate, task) is estimate
-    task.stages.warn("moved-anchor", "an anchor was moved")
+    task.stages.note("moved-anchor", anchor="A", distance=1.0)
     assert replace_broken_stretches(estimate, task) is estimate
-    task.stages.warn("moved-anchor", "another anchor was moved")
+    task.stages.note("moved-anchor", anchor="B", distance=1.0)
     assert replace_broken_stretches(estimate, task) is not estimate
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, returned
+from helpers.told import doubted
 
 from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.lidar.joint_refinement import RefinementConfig
@@ -29,8 +30,8 @@ def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
     stages = Stages(None, None)
     task = SimpleNamespace(recordings=recordings, config=SimpleNamespace(loop_closure=LoopClosureConfig()), stages=stages)
     _check_open_loops(graph, no_closures(), pieces, False, task)
-    assert [notice.kind for notice in stages.doubts] == kinds
-    for notice in stages.doubts:
+    assert [notice.kind for notice in doubted(stages)] == kinds
+    for notice in doubted(stages):
         assert abs(notice.figures["sigma"] - far) < 0.5 * far
         assert 0.0 <= notice.figures["first"] < notice.figures["second"] < len(truth)  # since the beginning, s
 

@@ -35,7 +35,7 @@ def test_a_map_larger_than_allowed_is_drawn_coarser_and_reported(room, most, kin
     assert result.grid.geometry.cells <= most
     (notice,) = [n for n in getattr(result, kind) if n.kind == "coarse-grid"]
     edge = result.grid.geometry.resolution
-    assert notice.figures == {"resolution": edge, "asked": 0.05}
+    assert notice.figures == {"resolution": edge, "asked": 0.05, "cells": most / 1e6}
     assert f"cells of {edge:g} m instead of 0.05 m" in notice.text
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import planted
+from helpers.told import warned
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -231,7 +232,7 @@ def test_a_distance_off_by_more_than_three_sigma_is_a_warning(length, named):
     graph = Graph(np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]))
     (figures,) = outcome(task, SimpleNamespace(edges=edges, measured=np.array([0])), graph)
     assert figures == {"landmarks": "a - b", "measured": 3.0, "map": length}
-    assert [n.kind for n in stages.warnings] == (["landmark-distance"] if named else [])
+    assert [n.kind for n in warned(stages)] == (["landmark-distance"] if named else [])
 
 
 def test_all_ties_of_a_distance_weigh_as_much_as_it_does():

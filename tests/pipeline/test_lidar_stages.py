@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.planted_graphs import loop
+from helpers.told import doubted
 
 from uwblite.graph.graph import Calibration, UnknownKey
 from uwblite.pipeline import lidar_stages
@@ -15,15 +16,15 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 
 
-@pytest.mark.parametrize(("share", "visits", "doubted"), [(0.051, 5, True), (0.05, 5, False), (0.9, 4, False), (0.0, 9, False)])
-def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(monkeypatch, share, visits, doubted):
+@pytest.mark.parametrize(("share", "visits", "said"), [(0.051, 5, True), (0.05, 5, False), (0.9, 4, False), (0.0, 9, False)])
+def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(monkeypatch, share, visits, said):
     """More than 5 % of the points, on five visits at least."""
     monkeypatch.setattr(lidar_stages.visibility, "free_space_violation", lambda *args: (share, visits))
     stages = Stages(None, None)
     estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=None), graph=SimpleNamespace(poses=None))
     task = SimpleNamespace(recordings=SimpleNamespace(path=None, of_keyframe=None), stages=stages)
     assert check_map_consistency(estimate, task) is estimate
-    assert [n.kind for n in stages.doubts] == (["free-space-violation"] if doubted else [])
+    assert [n.kind for n in doubted(stages)] == (["free-space-violation"] if said else [])
     assert stages.done[0].figures == {"visits": visits, "free_space_violation": share}
 
 

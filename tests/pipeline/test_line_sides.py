@@ -1,6 +1,5 @@
 """Trajectories caught on the wrong side of a line of anchors, and when another side is a doubt."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import gather
-from uwblite.problem.alternatives import Explanation
 from uwblite.sensor_log import SensorLog
 
 
@@ -72,20 +70,3 @@ def test_anchors_on_both_sides_leave_no_other_side():
     assert not line_sides.mirrored_tails(graph, estimate.placed)
     assert [each.graph for each in line_sides.sides(graph, estimate.placed, task.config.solver)] == [graph]
     assert estimate.other_side is None
-
-
-@pytest.mark.parametrize(
-    ("log_odds", "off", "lidar", "doubts"),
-    [(-4.9, 0.41, False, 1), (4.0, 0.41, False, 1), (-5.1, 0.41, False, 0), (-4.9, 0.39, False, 0), (-4.9, 0.41, True, 0)],
-)
-def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, log_odds, off, lidar, doubts):
-    here, there = Explanation("here", 0.0), Explanation("there", log_odds)
-    monkeypatch.setattr(line_sides, "sides", lambda *_: [here, there])
-    monkeypatch.setattr(line_sides, "apart", lambda one, other: off * (one != other))
-    stages = Stages(None, None)
-    recordings = type("One", (), {"have_scans": lidar, "__len__": lambda _: 1})()
-    task = SimpleNamespace(recordings=recordings, stages=stages, config=MappingConfig())
-    stages.findings.extend(
-        line_sides.check_other_side(SimpleNamespace(graph="here", other_side=None, placed=None), task)
-    )
-    assert [d.kind for d in stages.doubts] == ["other-side"] * doubts

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import plain_ranges
+from helpers.planted_graphs import plain_ranges, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
@@ -13,7 +13,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
-from uwblite.pipeline.mirror_images import _costs, _images, find_mirror_images
+from uwblite.pipeline.mirror_images import _costs, _images, find_mirror_images, mirrored_whole
 
 ANCHOR = np.array([4.0, 3.0])
 
@@ -191,3 +191,23 @@ def test_costs_are_those_of_the_ranges_and_of_the_priors_of_bias_and_height():
         squared[5] + of_priors[1],
     ]
     np.testing.assert_allclose(_costs(graph, replace(ranges, weights=worth)), expected)
+
+
+@pytest.mark.parametrize(("bend", "ambiguous"), [(0.0, True), (0.02, True), (3.0, False)])
+def test_a_path_and_its_anchors_have_a_mirror_image_together_unless_the_path_bends(bend, ambiguous):
+    """Three anchors on one side of it; the odometry's turns alone hold the sides."""
+    x = np.linspace(0.0, 10.0, 60)
+    tags = np.column_stack([x, bend * np.sin(0.3 * x)])
+    heading = np.append(np.arctan2(*np.diff(tags, axis=0).T[::-1]), 0.0)
+    poses, anchors = np.column_stack([tags, heading]), np.array([[2.0, 3.0], [5.0, 4.0], [8.0, 2.5]])
+    wheels = relative_edges(poses, np.arange(59), np.arange(1, 60), (0.01, 0.01, 0.005))
+    pose, anchor = np.repeat(np.arange(60), 3), np.tile(np.arange(3), 60)
+    noise = np.random.default_rng(2).normal(0.0, 0.1, 180)
+    measured = plain_ranges(pose, anchor, np.hypot(*(tags[pose] - anchors[anchor]).T) + noise, 0.1)
+    fixed = np.arange(60) == 0
+    graph = Graph(poses, anchors, (wheels, measured), fixed_poses=fixed)
+    best = optimize(graph, SolverConfig())[0]
+    image = mirrored_whole(best, measured, np.ones(3, dtype=bool), SolverConfig())
+    assert (image is not None) is ambiguous
+    if image is not None:
+        np.testing.assert_array_less(image.anchors[:, 1], 0.0)

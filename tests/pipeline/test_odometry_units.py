@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.told import doubted, warned
 
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, UnknownKey
@@ -23,19 +24,19 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
     """Of several recordings the one is named; no factor where the scale is no unknown."""
     values = [0.0 if e is None else e for e in errors]
     calibration = SimpleNamespace(index=lambda kind, recording: -1 if errors[recording] is None else recording, values=values)
-    each, stages = [SimpleNamespace(name=f"{n}.log", number=n) for n in range(len(errors))], Stages(None, None)
+    each, stages = [SimpleNamespace(name=f"{n}.log", number=n, has_scans=False) for n in range(len(errors))], Stages(None, None)
     recordings = type("Recordings", (), {"each": each, "__len__": lambda self: len(each)})()
     estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=None)
-    task = SimpleNamespace(recordings=recordings, config=None, stages=stages)
+    task = SimpleNamespace(recordings=recordings, config=None, stages=stages, given=Constraints())
     assert odometry_unit_factors(estimate, task).tolist() == factors
     wrong = [n for n, factor in enumerate(factors) if factor != 1.0]
-    assert [w.figures for w in stages.warnings] == [{"recording": n + 1, "factor": factors[n]} for n in wrong]
-    named = [w.text.startswith(f"{n}.log: ") for n, w in zip(wrong, stages.warnings, strict=True)]
+    assert [w.figures for w in warned(stages)] == [{"recording": n + 1, "factor": factors[n]} for n in wrong]
+    named = [w.text.startswith(f"{n}.log: ") for n, w in zip(wrong, warned(stages), strict=True)]
     assert named == [len(errors) > 1] * len(wrong)
 
 
 @pytest.mark.parametrize(
-    ("factor", "lidar", "given", "height", "warned", "doubted"),
+    ("factor", "lidar", "given", "height", "warnings", "doubts"),
     [
         (1.1, None, 0, None, 0, 0),
         (1.41, None, 0, None, 1, 0),
@@ -54,7 +55,7 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
         (0.7, None, 0, 4.7, 0, 1),
     ],
 )
-def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, height, warned, doubted):
+def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, height, warnings, doubts):
     """Twice, half and yards may be the radio's; anchors that hang high may look like either unit, where no lidar sees the ways.
 
     lidar: its ways by those of the wheels, nan where it shows none, None without.
@@ -69,9 +70,9 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
     other = None if height is None else OtherHeights(height, taken=False, apart=1.0)
     estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=other)
     factors = odometry_unit_factors(estimate, task)
-    assert factors == pytest.approx([factor if warned or doubted else 1.0])
-    assert (len(stages.warnings), len(stages.doubts)) == (warned, doubted)
-    assert all(("4.7 m above the tag" in notice.text) == (height is not None) for notice in stages.doubts)
+    assert factors == pytest.approx([factor if warnings or doubts else 1.0])
+    assert (len(warned(stages)), len(doubted(stages))) == (warnings, doubts)
+    assert all(("4.7 m above the tag" in notice.text) == (height is not None) for notice in doubted(stages))
 
 
 @pytest.mark.parametrize(("ways", "checked"), [

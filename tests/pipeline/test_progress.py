@@ -1,13 +1,10 @@
 """What the stages report: figures with their times, what is forgotten, and a caller who stops."""
 
-from types import SimpleNamespace
-
 import pytest
 
 from uwblite.errors import Cancelled
-from uwblite.findings import doubt, warning
+from uwblite.findings import Fact
 from uwblite.pipeline.progress import Stages
-from uwblite.sensor_log import OdometryBreaks, Screening
 
 
 def test_stages_take_the_time_since_the_one_before():
@@ -29,14 +26,11 @@ def test_a_callback_that_returns_false_stops_and_none_goes_on():
         Stages(lambda *call: False, None).report("one", 1, 2)
 
 
-@pytest.mark.parametrize(("count", "where"), [(1, ""), (2, "recording 2: ")])
-def test_what_the_screening_found_is_taken_over(count, where):
-    remarks = (warning("jump", "it jumps"), doubt("gap", "it is silent"))
-    logs = [SimpleNamespace(screening=None)] * (count - 1)
+def test_facts_are_kept_in_their_order():
     stages = Stages(None, None)
-    stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])
-    assert [(n.kind, n.text) for n in stages.warnings] == [("jump", where + "it jumps")]
-    assert [(n.kind, n.text) for n in stages.doubts] == [("gap", where + "it is silent")]
+    stages.note("clock-offset", offset=0.1)
+    stages.note("scans-astray", scans=1, used=2)
+    assert stages.facts == [Fact.of("clock-offset", offset=0.1), Fact.of("scans-astray", scans=1, used=2)]
 
 
 def test_passes_count_how_often_stages_ran():

@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
+from helpers.told import warned
 
 from uwblite import se2
+from uwblite.assessment.turn_scale_tests import check_turn_scales
 from uwblite.graph.calibration import (
     OMNI,
     CalibrationConfig,
@@ -26,7 +28,7 @@ from uwblite.graph.solver import optimize
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.turn_checks import check_turn_scales, with_constant_turn_scales, with_slip_in_turns
+from uwblite.pipeline.turn_checks import with_constant_turn_scales, with_slip_in_turns
 from uwblite.sensor_log import SensorMounting
 
 CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
@@ -61,12 +63,12 @@ def judged(true, used):
 @pytest.mark.parametrize("true", [0.0, 0.4])
 def test_a_constant_scale_is_left_to_the_estimate(true):
     value, fixed, stages = judged(true, true + 0.02)
-    assert (value, fixed, stages.warnings, stages.doubts) == (true + 0.02, False, [], [])
+    assert (value, fixed, warned(stages), stages.doubts) == (true + 0.02, False, [], [])
 
 
 def test_a_lidar_that_asks_for_the_larger_correction_is_doubted_only():
     value, fixed, stages = judged(-0.8, 0.0)
-    assert (value, fixed, stages.warnings) == (0.0, False, [])
+    assert (value, fixed, warned(stages)) == (0.0, False, [])
     assert [n.kind for n in stages.doubts] == ["turn-scale"]
 
 
@@ -75,10 +77,10 @@ def test_a_scale_that_single_turns_made_is_replaced_and_a_map_with_it_doubted(us
     value, fixed, stages = judged(0.05, used)
     assert value == pytest.approx(0.05, abs=0.02)
     assert fixed
-    assert [n.kind for n in stages.warnings] == ["turn-scale"]
+    assert [n.kind for n in warned(stages)] == ["turn-scale"]
     assert [n.kind for n in stages.doubts] == ["turn-scale"]
     assert stages.doubts[0].figures["by_all"] == used
-    figures = stages.warnings[0].figures
+    figures = warned(stages)[0].figures
     assert (figures["name"], figures["by_steps"]) == ("heading_scale", value)
     assert 0.0 < figures["sigma"] < 0.02
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite.errors import DataError
 from uwblite.screening import clocks
@@ -39,7 +40,8 @@ def test_stamps_of_receipt_are_named_with_their_sensors():
     queue, steady = 0.6 * (np.arange(200) // 6) + 0.001 * (np.arange(200) % 6), 0.1 * np.arange(200)
     cases = (queue, queue, ("odometry", "scans")), (queue, steady, ("odometry",)), (steady, queue, ("scans",))
     for odometry, lidar, named in (*cases, (steady, steady, ())):
-        sensors, remarks = clocks.in_bursts(SensorLog(moving(odometry), None, scans(lidar)))
+        sensors, facts = clocks.in_bursts(SensorLog(moving(odometry), None, scans(lidar)))
+        remarks = told(facts)
         assert sensors == named
         assert [(r.kind, r.severity) for r in remarks] == [("stamps-of-receipt", "warning")] * bool(named)
         assert all(" and ".join(named) in r.text for r in remarks)
@@ -60,16 +62,15 @@ def even(period, count, uneven=0.0):
     ],
 )  # fmt: skip
 def test_stamps_are_made_up_where_both_sensors_are_slow_and_even(odometry, lidar, period):
-    found = clocks.made_up(SensorLog(moving(odometry), None, scans(lidar)))
+    found = told(clocks.made_up(SensorLog(moving(odometry), None, scans(lidar))))
     assert len(found) == (period is not None)
     assert all(f"every {period} s" in r.text for r in found)
     assert clocks.made_up(SensorLog(moving(odometry))) == []
 
 
 def test_a_clock_set_back_by_more_than_a_second_is_named_with_its_sensor():
-    found = clocks.set_back(
-        SensorLog(moving([0.0, 1.0]), notes=LogNotes(set_back={"radio": 1.0, "lidar": 1.1, "odometry": 30.0}))
-    )
+    log = SensorLog(moving([0.0, 1.0]), notes=LogNotes(set_back={"radio": 1.0, "lidar": 1.1, "odometry": 30.0}))
+    found = told(clocks.set_back(log))
     assert [r.text.split(":")[0] for r in found] == [
         "the clock of the lidar was set back by up to 1.1 s", "the clock of the odometry was set back by up to 30.0 s",
     ]  # fmt: skip
@@ -89,20 +90,22 @@ def test_a_jump_forward_is_undone_where_the_sensors_end_together_without_it(whic
     if which == "odometry":
         jumping = other + by * (np.arange(401) > 100)
         log = SensorLog(moving(jumping), None, scans(own))
-        done, remarks = clocks.without_jumps(log)
+        done, facts = clocks.without_jumps(log)
+        remarks = told(facts)
         at, moved, what = 25.0 * end / 100.0, by, "odometry"
         expected, found = own + by * (own > at), done.scans.stamps
     else:
         jumped = own + by * (np.arange(201) > 50)
         log = SensorLog(moving(other), **{which: (scans if which == "scans" else ranges)(jumped)})
-        done, remarks = clocks.without_jumps(log)
+        done, facts = clocks.without_jumps(log)
+        remarks = told(facts)
         at, moved, what = own[50], -by, {"scans": "lidar", "ranges": "radio"}[which]
         expected, found = own, getattr(done, which).stamps
     if not undone:
         assert (done, remarks) == (log, [])
         return
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    (remark,) = remarks
+    (remark,) = told(remarks)
     assert f"the clock of the {what} was set forward by {by:.1f} s at t = {at:.0f} s" in remark.text
     assert f"moved by {moved:+.1f} s" in remark.text
 
@@ -111,7 +114,8 @@ def test_a_jump_between_two_bursts_is_undone_beside_the_usual_silence():
     """Eight ranges within 0.4 s and 7.6 s of silence, where a median over steps would move the rest by the silence too."""
     own = (8.0 * np.arange(13)[:, None] + 0.05 * np.arange(8)).ravel()
     jumped = own + 30.0 * (own > 45.0)
-    done, (remark,) = clocks.without_jumps(SensorLog(moving(np.linspace(0.0, 97.0, 401)), ranges(jumped)))
+    done, facts = clocks.without_jumps(SensorLog(moving(np.linspace(0.0, 97.0, 401)), ranges(jumped)))
+    (remark,) = told(facts)
     np.testing.assert_allclose(done.ranges.stamps, own, atol=1e-9)
     assert "set forward by 30.0 s" in remark.text
 
@@ -131,7 +135,8 @@ def test_scans_outside_the_odometry_s_time_are_left_out_and_ranges_counted(outsi
     stamps = np.linspace(0.0, 10.0, 100 - outside)
     late = np.append(stamps, np.full(outside, 12.0))
     log = SensorLog(moving(np.linspace(0.0, 10.0, 50)), ranges(late), scans(late))
-    done, remarks = clocks.within_odometry(log)
+    done, facts = clocks.within_odometry(log)
+    remarks = told(facts)
     assert done.ranges is log.ranges
     assert len(done.scans.stamps) == 100 - outside if said else done.scans is log.scans
     by_kind = {r.kind: r for r in remarks}
@@ -146,7 +151,8 @@ def test_the_time_of_the_odometry_begins_and_ends_a_little_beyond_its_stamps():
     edge = clocks.OUTSIDE
     stamps = np.array([-1.01, -1.0, 0.0, 11.0, 11.01]) * [edge, edge, 1.0, 1.0, 1.0]
     stamps[3:] = [10.0 + edge, 10.0 + 1.01 * edge]
-    done, (remark,) = clocks.within_odometry(SensorLog(moving(np.linspace(0.0, 10.0, 50)), None, scans(stamps)))
+    done, facts = clocks.within_odometry(SensorLog(moving(np.linspace(0.0, 10.0, 50)), None, scans(stamps)))
+    (remark,) = told(facts)
     np.testing.assert_array_equal(done.scans.stamps, stamps[1:4])
     assert remark.text.startswith("2 of 5 scans")
     late = replace(scans(stamps[1:4]), stamps=stamps[1:4])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.room_recording import recording, two_rounds
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.screening import cuts
@@ -52,7 +53,7 @@ def wheels_go_on(log, ahead):
 
 
 def carried(log):
-    return [r.kind for r in log.screening.findings if r.severity == "doubt"]
+    return [r.kind for r in told(log.screening.facts) if r.severity == "doubt"]
 
 
 @pytest.mark.parametrize("anchors", [NEAR, NEAR + FAR, NEAR[1:2]])
@@ -81,7 +82,7 @@ def test_a_reset_of_the_wheels_in_a_tunnel_is_no_cut():
     poses = np.where(late[:, None], se2.between(np.array([30.0, 2.0, 0.4]), log.odometry.poses), log.odometry.poses)
     done = screen(replace(log, odometry=Odometry(log.odometry.stamps, poses)))
     assert carried(done) == []
-    assert [r.kind for r in done.screening.findings] == ["odometry-breaks"]
+    assert [r.kind for r in told(done.screening.facts)] == ["odometry-breaks"]
 
 
 def test_scans_of_a_room_contradict_ranges_that_all_jump():

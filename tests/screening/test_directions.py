@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.screening import directions
@@ -27,7 +28,8 @@ def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
 @pytest.mark.parametrize("stuck", [0.0, 0.2])
 def test_pairs_along_bare_walls_do_not_hide_the_direction_of_the_laser(angle, stuck):
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), None, None)
-    turned, remarks = laser_ahead(log, pairs_of_a_laser_turned_by(angle, stuck))
+    turned, facts = laser_ahead(log, pairs_of_a_laser_turned_by(angle, stuck))
+    remarks = told(facts)
     assert [r.kind for r in remarks] == ["laser-turned-away"]
     assert abs(se2.wrap_angle(turned.mounting.T_base_laser[2] - angle)) < 0.1
 
@@ -45,7 +47,8 @@ def test_a_heading_against_its_path_is_mended_as_the_laser_shows(monkeypatch, se
         return seen["heading" if np.array_equal(log.odometry.poses[:, 1], odometry.poses[:, 1]) else "y"]
 
     monkeypatch.setattr(directions, "_fits_laser", fits)
-    done, (remark,) = heading_with_the_path(SensorLog(odometry))
+    done, facts = heading_with_the_path(SensorLog(odometry))
+    (remark,) = told(facts)
     sign = [1.0, 1.0, -1.0] if "heading" in changed else [1.0, -1.0, 1.0]
     np.testing.assert_array_equal(done.odometry.poses, odometry.poses * sign)
     assert (remark.kind, f"path: {changed} was inverted" in remark.text) == ("heading-against-path", True)
@@ -73,7 +76,8 @@ def test_turns_show_whether_the_laser_or_the_way_of_driving_is_turned(angle, aro
     laser = se2.compose(se2.compose(se2.inverse(mount), wheels), mount)
     lidar = se2.compose(se2.compose(given, laser), se2.inverse(given))
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), mounting=SensorMounting(given, tag_position=tag))
-    done, (remark,) = laser_ahead(log, Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count)))
+    done, facts = laser_ahead(log, Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count)))
+    (remark,) = told(facts)
     # The median direction over turns, at which the lever arm shows itself, is known to some hundredths.
     np.testing.assert_allclose(done.mounting.T_base_laser[:2], mount[:2], atol=0.02)
     assert abs(se2.wrap_angle(done.mounting.T_base_laser[2] - mount[2])) < 0.05

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import planted
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.screening.late_scans import displaced, with_late_scans_placed
@@ -32,7 +33,8 @@ def turning():
 
 def test_late_scans_alone_get_the_poses_that_they_show(turning):
     log, taken = turning
-    done, remarks = with_late_scans_placed(log)
+    done, facts = with_late_scans_placed(log)
+    remarks = told(facts)
     assert [r.kind for r in remarks] == ["late-scans"]
     assert f"{len(LATE)} of {len(taken)} scans" in remarks[0].text
     others = np.setdiff1d(np.arange(len(taken)), LATE)

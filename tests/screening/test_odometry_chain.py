@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.errors import DataError
@@ -53,7 +54,8 @@ def test_a_break_is_joined_by_the_motion_before_and_after_it(at, gap):
     stamps = true.stamps + gap * (np.arange(200) > at)
     broken = true.poses.copy()
     broken[at + 1 :] = se2.compose(np.array([9.0, -5.0, 2.0]), broken[at + 1 :])
-    joined, breaks, (remark,) = rejoined(Odometry(stamps, broken))
+    joined, breaks, facts = rejoined(Odometry(stamps, broken))
+    (remark,) = told(facts)
     factor = min(0.1 + gap, 1.0) / 0.1
     expected = se2.between(true.poses[:-1], true.poses[1:]) * np.where(np.arange(199) == at, factor, 1.0)[:, None]
     np.testing.assert_allclose(se2.between(joined.poses[:-1], joined.poses[1:]), expected, atol=1e-12)
@@ -69,7 +71,8 @@ def test_only_steps_near_a_break_and_no_other_break_predict_its_motion():
     steps = np.tile([0.04, 0.0, 0.0], (60, 1))
     steps[:24] = steps[37:] = 0.0
     steps[[30, 32]] = [20.0, 0.0, 0.0], [0.0, -30.0, 0.0]
-    joined, breaks, (remark,) = rejoined(Odometry(0.1 * np.arange(61), se2.chain(np.zeros(3), steps)))
+    joined, breaks, facts = rejoined(Odometry(0.1 * np.arange(61), se2.chain(np.zeros(3), steps)))
+    (remark,) = told(facts)
     found = se2.between(joined.poses[:-1], joined.poses[1:])
     # Of the steps 24 to 36 but 30 and 32 all drive; of 26 to 38 the last two stand.
     np.testing.assert_allclose(found[[30, 32], 0], [0.04, 0.04 * 9 / 11], rtol=1e-9)
@@ -86,7 +89,8 @@ def test_a_chain_of_two_readings_that_jumps_stands():
 def test_many_breaks_are_listed_to_the_fifth():
     steps = np.tile([0.04, 0.0, 0.0], (199, 1))
     steps[20::20] = [5.0, 0.0, 0.0]
-    _, breaks, (remark,) = rejoined(Odometry(0.1 * np.arange(200), se2.chain(np.zeros(3), steps)))
+    _, breaks, facts = rejoined(Odometry(0.1 * np.arange(200), se2.chain(np.zeros(3), steps)))
+    (remark,) = told(facts)
     assert len(breaks.stamps) == 9
     assert "t = 2.0, 4.0, 6.0, 8.0, 10.0 ... s" in remark.text
 
@@ -105,7 +109,8 @@ def glitch(first, count, off=(40.0, 0.0, 0.0)):
 def test_readings_off_for_less_than_a_second_are_left_out(first, count, left_out):
     """The last one may as well be a jump."""
     bad = glitch(first, count)
-    done, remarks = without_glitches(bad)
+    done, facts = without_glitches(bad)
+    remarks = told(facts)
     kept = np.delete(np.arange(200), np.arange(first, first + count) if left_out else [])
     np.testing.assert_array_equal(done.stamps, bad.stamps[kept])
     np.testing.assert_array_equal(done.poses, bad.poses[kept])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite.screening.own_body import without_own_body
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
@@ -36,7 +37,8 @@ def test_a_post_of_the_robot_is_left_out(distance, noise, found):
     readings[:, 10:14] = distance + noise * rng.standard_normal((200, 4))
     readings[::25, 12] = np.inf  # a lost echo now and then
     log = seen(rounds(), readings)
-    done, remarks = without_own_body(log)
+    done, facts = without_own_body(log)
+    remarks = told(facts)
     assert len(remarks) == found
     if not found:
         assert done is log

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite.screening.shared_names import _driven, without_shared_names
 from uwblite.screening.stuck_sensors import quiet_noise, resolution_of
@@ -43,7 +44,8 @@ def renamed(log):
 @pytest.mark.parametrize("seed", range(5))
 def test_two_anchors_with_one_name_are_left_out(seed):
     log = renamed(recording(seed))
-    done, (remark,) = without_shared_names(log)
+    done, facts = without_shared_names(log)
+    (remark,) = told(facts)
     assert remark.kind == "shared-name"
     assert remark.severity == "warning"
     assert "two anchors seem to have the name A:" in remark.text
@@ -61,7 +63,7 @@ def test_the_number_of_leaps_is_told():
     for k in range(1, len(own.ranges)):
         driven = 0.2 * (own.stamps[k] - own.stamps[k - 1])
         count += abs(own.ranges[k] - own.ranges[k - 1]) > 1.5 * driven + 0.5 + 5.0 * noise
-    (remark,) = without_shared_names(log)[1]
+    (remark,) = told(without_shared_names(log)[1])
     assert f"({count} of {len(own.ranges) - 1} times" in remark.text
 
 

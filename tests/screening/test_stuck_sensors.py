@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.told import told
 
+from uwblite.assessment.repairs import spans
 from uwblite.screening.stuck_sensors import (
     _in_runs,
     _mark,
@@ -53,7 +55,8 @@ def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spre
 def test_bursts_of_both_sensors_are_named_and_single_stamps_stay():
     late = np.repeat(np.arange(1.0, 11.0), 5)
     odometry = Odometry(late, np.zeros((50, 3)))
-    done, remarks = without_bursts(SensorLog(odometry, None, scans(np.ones((50, 3)), late)))
+    done, facts = without_bursts(SensorLog(odometry, None, scans(np.ones((50, 3)), late)))
+    remarks = told(facts)
     np.testing.assert_allclose(done.odometry.stamps, 0.2 * np.arange(1, 51))
     np.testing.assert_allclose(done.scans.stamps, 0.2 * np.arange(1, 51))
     assert [r.text.split(",")[0] for r in remarks] == [
@@ -99,7 +102,8 @@ def test_a_scan_that_stands_three_times_was_not_measured_again(repeats, seen, le
     readings[:, :seen] = rng.uniform(1.0, 2.0, (20, seen))
     readings[5 : 6 + repeats] = readings[5]
     log = SensorLog(driving(), None, scans(readings))
-    done, remarks = without_repeated_scans(log)
+    done, facts = without_repeated_scans(log)
+    remarks = told(facts)
     np.testing.assert_array_equal(done.scans.stamps, np.delete(np.arange(20.0), np.arange(6, 6 + left_out)))
     assert [r.text.split(" (t =")[0] for r in remarks] == [f"{left_out} of 20 scans equal the scan before"] * bool(left_out)
     assert all(f"t = 6 to {5 + left_out} s" in r.text for r in remarks)
@@ -111,7 +115,8 @@ def test_scans_that_a_driver_sends_again_and_again_are_left_out(count, left_out)
     readings = np.random.default_rng(3).uniform(1.0, 2.0, (100, 40))
     again = 1 + 2 * np.arange(count)
     readings[again] = readings[again - 1]
-    done, remarks = without_repeated_scans(SensorLog(driving(), None, scans(readings)))
+    done, facts = without_repeated_scans(SensorLog(driving(), None, scans(readings)))
+    remarks = told(facts)
     np.testing.assert_array_equal(done.scans.stamps, np.delete(np.arange(100.0), again[:left_out]))
     assert [r.text.partition(" scans")[0] for r in remarks] == [f"{left_out} of 100"] * bool(left_out)
     assert all("the driver sends scans again" in r.text for r in remarks)
@@ -120,7 +125,8 @@ def test_scans_that_a_driver_sends_again_and_again_are_left_out(count, left_out)
 def test_a_scan_written_twice_is_left_out_without_a_word():
     readings = np.random.default_rng(2).uniform(1.0, 2.0, (10, 40))
     log = SensorLog(driving(), None, scans(np.repeat(readings, 2, axis=0), np.repeat(np.arange(10.0), 2)))
-    done, remarks = without_repeated_scans(log)
+    done, facts = without_repeated_scans(log)
+    remarks = told(facts)
     np.testing.assert_array_equal(done.scans.stamps, np.arange(10.0))
     assert remarks == []
     few = SensorLog(driving(), None, scans(np.ones((2, 40)), [1.0, 1.0]))
@@ -141,7 +147,8 @@ def test_a_range_that_stands_while_the_robot_moves(count, speed, value, left_out
     other = 3.0 + 0.01 * np.arange(60)
     stamps, anchor = np.repeat(np.arange(60.0), 2), np.tile([0, 1], 60)
     log = SensorLog(driving(speed), ranges(stamps, np.stack([values, other], axis=1).ravel(), anchor))
-    done, remarks = without_repeated_ranges(log)
+    done, facts = without_repeated_ranges(log)
+    remarks = told(facts)
     wrong = (anchor == 0) & (stamps >= 10) & (stamps < 10 + count) & left_out
     np.testing.assert_array_equal(done.ranges.stamps, stamps[~wrong])
     np.testing.assert_array_equal(done.ranges.anchor, anchor[~wrong])
@@ -162,7 +169,8 @@ def test_a_range_stands_when_it_scatters_far_less_than_the_radio(noise, rounded,
     stands = (anchor == 1) & (stamps >= 40.0) & (stamps < 80.0)
     values[stands] = 4.0 + rng.uniform(-jitter, jitter, stands.sum())
     log = SensorLog(driving(0.5), ranges(stamps, np.round(values / rounded) * rounded, anchor))
-    done, remarks = without_repeated_ranges(log)
+    done, facts = without_repeated_ranges(log)
+    remarks = told(facts)
     assert len(remarks) == found
     assert abs(len(done.ranges.stamps) - (400 - found * stands.sum())) <= 2
 
@@ -181,11 +189,13 @@ def test_a_robot_on_a_circle_about_an_anchor_measures_rightly(rounded):
 
 def test_ranges_written_twice_count_once_and_where_all_are_stuck_none_is_left():
     log = SensorLog(driving(), ranges([1.0, 1.0, 1.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0, 6.0]))
-    done, remarks = without_repeated_ranges(log)
+    done, facts = without_repeated_ranges(log)
+    remarks = told(facts)
     np.testing.assert_array_equal(done.ranges.stamps, [1.0, 1.0, 2.0])
     np.testing.assert_array_equal(done.ranges.ranges, [5.0, 6.0, 6.0])
     assert remarks == []
-    done, remarks = without_repeated_ranges(SensorLog(driving(), ranges(np.arange(20.0), np.full(20, 4.2), ids=("A",))))
+    done, facts = without_repeated_ranges(SensorLog(driving(), ranges(np.arange(20.0), np.full(20, 4.2), ids=("A",))))
+    remarks = told(facts)
     assert done.ranges is None
     assert len(remarks) == 1
     one = SensorLog(driving(), ranges([1.0], [5.0]))
@@ -216,12 +226,13 @@ def test_marks_that_are_most_of_the_ranges_are_a_doubt_without_a_lidar():
     log, values = at_places(30)
     fewer = replace(log, ranges=log.ranges.rows((values > 60.0) | (np.arange(len(values)) % 4 == 0)))
     seen = replace(fewer, scans=scans(np.ones((5, 8))))
-    assert [without_marks(one)[1][0].severity == "doubt" for one in (log, fewer, seen)] == [False, True, False]
+    assert [told(without_marks(one)[1])[0].severity == "doubt" for one in (log, fewer, seen)] == [False, True, False]
 
 
 def test_a_mark_counts_once_at_each_place_and_of_each_anchor():
     log, values = at_places(10)
-    done, (remark,) = without_marks(log)
+    done, facts = without_marks(log)
+    (remark,) = told(facts)
     np.testing.assert_array_equal(done.ranges.ranges, values[values < 60.0])
     assert remark.text.startswith("20 of 40 ranges are exactly 65.5 m")
     for other in (at_places(9)[0], at_places(40, standing=True)[0]):
@@ -242,7 +253,8 @@ def test_readings_of_the_lidar_that_are_marks():
         readings = rng.uniform(1.0, 9.0, (places, 50)).astype(np.float32)
         readings[:, ::10] = 5.5
         log = SensorLog(driving(), None, scans(readings))
-        done, remarks = without_lidar_marks(log)
+        done, facts = without_lidar_marks(log)
+        remarks = told(facts)
         assert len(remarks) == found
         if found:
             assert remarks[0].text.startswith(f"{places * 5} of {places * 50} readings of the lidar are exactly 5.5 m")
@@ -251,7 +263,8 @@ def test_readings_of_the_lidar_that_are_marks():
             assert done.scans.range_max == 30.0
             np.testing.assert_array_equal(np.delete(done.scans.ranges, np.s_[::10], 1), np.delete(readings, np.s_[::10], 1))
             farthest = replace(log, scans=replace(log.scans, ranges=np.where(readings == 5.5, np.float32(9.5), readings)))
-            done, remarks = without_lidar_marks(farthest)
+            done, facts = without_lidar_marks(farthest)
+            remarks = told(facts)
             assert "reports its reach where it sees nothing" in remarks[0].text
             assert np.isposinf(done.scans.ranges[:, ::10]).all()
             assert done.scans.range_max == 9.5
@@ -267,6 +280,6 @@ def test_when_is_said_of_three_stretches():
     for first in (10, 30, 50):
         flags[first : first + 5] = True
     stamps = 2.0 * np.arange(100.0)
-    assert _when(stamps, flags, 4.0) == "t = 16 to 24 s, t = 56 to 64 s, t = 96 to 104 s"
+    assert spans(_when(stamps, flags, 4.0)) == "t = 16 to 24 s, t = 56 to 64 s, t = 96 to 104 s"
     flags[[70, 80]] = True
-    assert _when(stamps, flags, 4.0).endswith("104 s, and 2 more stretches")
+    assert spans(_when(stamps, flags, 4.0)).endswith("104 s, and 2 more stretches")

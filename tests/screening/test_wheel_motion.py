@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.screening import wheel_motion
@@ -179,7 +180,7 @@ def test_rounding_of_either_sensor_hardly_changes_the_way_ratio(rounded, factor)
 @pytest.mark.parametrize(("share", "said"), [(0.39, True), (0.41, False)])
 def test_scans_do_not_match_where_one_pair_in_ten_does_not_either(share, said):
     shares = np.linspace(0.0, share / 0.9, 301)[1:]
-    found = unmatched(pairs(400, share=np.append(shares, np.zeros(100))))
+    found = told(unmatched(pairs(400, share=np.append(shares, np.zeros(100)))))
     assert len(found) == said
     assert all(f"less than {100 * share:.0f} %" in r.text for r in found)
     assert len(unmatched(pairs(24, share=np.full(24, 0.1)))) == 1
@@ -202,7 +203,7 @@ def test_a_motion_that_noise_does_not_explain_for_long_is_a_doubt(off, said, fac
     if not said:
         assert disagreeing(found, 0.0) == []
         return
-    (remark,) = disagreeing(found, 10.0)
+    (remark,) = told(disagreeing(found, 10.0))
     assert remark.severity == "doubt"
     first, last = (int(word) for word in (remark.text.split("t = ")[1].split()[0], remark.text.split(" to ")[1].split()[0]))
     assert abs(first - 30) <= 2
@@ -228,7 +229,7 @@ def test_of_many_stretches_three_are_said():
     found = pairs(400)
     for first in range(20, 400, 80):
         found.lidar[first : first + 12, 1] = 0.5
-    (remark,) = disagreeing(found, 0.0)
+    (remark,) = told(disagreeing(found, 0.0))
     assert remark.text.count("t = ") == 3
     assert "and 2 more stretches" in remark.text
 
@@ -243,7 +244,7 @@ def test_another_ratio_for_a_stretch_is_a_doubt(kind, ratio, said, first, last):
     # Everywhere the wheels count too much: that is calibration.
     found.lidar[:] *= 0.7 * (1.0 + 0.01 * rng.standard_normal((240, 1)))
     found.lidar[first:last] *= ratio
-    remarks = disagreeing(found, 0.0)
+    remarks = told(disagreeing(found, 0.0))
     assert len(remarks) == said
     if said:
         stretch = [int(word) for word in remarks[0].text.split("t = ")[1].split(" s)")[0].split(" to ")]

@@ -6,7 +6,8 @@ estimated once more, each with a calibration of its own, from the joint estimate
 scan to scan, such a change is seen directly (screening/wheel_motion.py).
 
 Turns whose sign changed (wheels swapped, a gyro turned over) are not near the joint estimate. There each half is
-bootstrapped on its own: their anchors are then mirror images of each other.
+bootstrapped on its own: their anchors are then mirror images of each other, and seem to have been moved. A half that fits its
+own mirror image about as well, as along a straight way past all anchors, says nothing.
 """
 
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.mirror_images import mirrored_whole
 from ..pipeline.progress import Stages
 from ..pipeline.radio_stages import bootstrapped, dead_reckoning
 from ..pipeline.recordings import Recording, gather
@@ -101,7 +103,8 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
     """Doubt where anchors by either half alone are mirror images of each other."""
     stamps = recording.frames.stamps
     middle = float(stamps[len(stamps) // 2])
-    one, other = (_anchors_alone(recording, *ends, task) for ends in ((-np.inf, middle), (middle, np.inf)))
+    halves = (_anchors_alone(recording, *ends, task) for ends in ((-np.inf, middle), (middle, np.inf)))
+    one, other = (_radios_at_one_place(anchors) for anchors in halves)
     both = sorted(one.keys() & other.keys())
     if len(both) < _TRIANGLE:
         return
@@ -113,6 +116,12 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> Iterator[Finding]:
             f"apart, {mirrored:.1f} m when mirrored): the odometry's turns are wrong in one of the halves"
         )
         yield doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
+
+
+def _radios_at_one_place(anchors: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the places (2,) of the radios that have one place, from those of anchors, by the name of the radio."""
+    names = [radio_name(name) for name in anchors]
+    return {name: place for name, place in zip(names, anchors.values(), strict=True) if names.count(name) == 1}
 
 
 def _with_places(recording: Recording, estimate: Estimate) -> Recording:
@@ -148,7 +157,11 @@ def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -
     if found.ranges is None or spread[1] < _WIDE * spread[0]:
         return {}
     often = np.bincount(found.ranges.anchor, found.ranges.alive, minlength=len(found.anchor_ids)) >= _FEW
-    return {found.anchor_ids[k]: found.graph.anchors[k] for k in np.flatnonzero(found.placed & often)}
+    shown = found.placed & often
+    best = optimize(found.problem, task.config.solver)[0]
+    if mirrored_whole(best, found.ranges, shown & ~best.fixed_anchors, task.config.solver) is not None:
+        return {}
+    return {found.anchor_ids[k]: found.graph.anchors[k] for k in np.flatnonzero(shown)}
 
 
 def _misfit(p: Floats, q: Floats) -> float:

@@ -8,22 +8,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..findings import Finding, doubt, kinds, warning
+from ..findings import WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, warning
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.line_sides import check_other_side
-from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
+from .causes import explained
 from .certainty import check_certainty
-from .displaced_stretches import check_displaced_stretches
+from .decisions import RULES
 from .drift_tests import check_drifts
 from .half_tests import check_halves
+from .other_side import check_other_side
 from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
+from .repairs import check_recordings, say
 from .residual_tests import check_residuals
+from .turn_scale_tests import check_turn_scales
 from .untied_parts import check_untied_parts
 from .untied_recordings import check_untied_recordings
 
@@ -45,7 +47,7 @@ def judge(
     estimate: Estimate, anchors: Sequence[AnchorEstimate], calibrated: Sequence[CalibrationEstimate],
     usual: Mapping[UnknownKey, Unknown], table: dict[str, Floats], grid: OccupancyGrid | None, sigma: float, task: Task,
 ) -> None:
-    """Add the warnings and doubts that a finished estimate gives rise to.
+    """Add the findings that the recordings, the stages and the finished estimate give rise to, causes before consequences.
 
     Parameters
     ----------
@@ -55,6 +57,8 @@ def judge(
     residuals = table["residual"] if table else np.zeros(0)
     # A rule may look at what those before it found.
     rules: tuple[Callable[[], Iterable[Finding]], ...] = (
+        lambda: say(task.stages.facts, RULES),
+        lambda: check_repairs(task),
         lambda: check_certainty(estimate, sigma, task),
         lambda: check_anchors(anchors, task),
         lambda: check_moved_together(anchors, table, task),
@@ -62,7 +66,6 @@ def judge(
         lambda: check_closures(estimate, anchors, grid, task),
         lambda: check_calibration(calibrated, usual, task),
         lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
-        lambda: check_displaced_stretches(table, anchors, task) if table else (),
         lambda: check_residuals(estimate, residuals, grid, task),
         lambda: check_unit(anchors, task),
         lambda: check_short_ranges(anchors, estimate, sigma, task),
@@ -78,6 +81,13 @@ def judge(
     )
     for rule in rules:
         task.stages.findings.extend(rule())
+    task.stages.findings[:] = explained(task.stages.findings)
+
+
+def check_repairs(task: Task) -> list[Finding]:
+    """Say what the screening of the recordings found, but for what only a finished map can judge."""
+    found = check_recordings([recording.log for recording in task.recordings.each])
+    return [finding for finding in found if finding.kind != WHEELS_AGAINST_LIDAR]
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
@@ -205,7 +215,7 @@ def check_closures(
         yield add("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
-        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them in uwblite view"
+        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them"
         yield doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
@@ -266,7 +276,7 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
             wrong = factor < 0.0
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
-                "is the laser upside down (--laser-flipped), or has the odometry's heading the wrong sign?"
+                "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
             )
         else:
             wrong = True

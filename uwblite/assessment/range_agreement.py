@@ -9,9 +9,9 @@ from ..arrays import Bools, Floats, runs_of
 from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, of_severity, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.progress import of_recordings
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .certainty import allowed_error
+from .repairs import check_recordings
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -89,7 +89,7 @@ def check_wheels_against_lidar(
     ----------
     table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
-    recorded = of_recordings([recording.log for recording in task.recordings.each])
+    recorded = check_recordings([recording.log for recording in task.recordings.each])
     against = [finding for finding in recorded if finding.kind == WHEELS_AGAINST_LIDAR]
     used = bool(len(table.get("stamp", ()))) and not any(name_and_number(a.id)[1] > 1 for a in anchors)
     if not against or not used:

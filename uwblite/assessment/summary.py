@@ -55,7 +55,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
         for r in recordings.each
         for u in unknowns(task.config.calibration, r.anchor_ids, heights_given(r), r.number, tag_rises(r))
     }
-    by_steps = {n.figures["name"]: n.figures["sigma"] for n in stages.warnings if n.kind == "turn-scale"}
+    by_steps = {fact.figures["name"]: fact.figures["sigma"] for fact in stages.facts if fact.kind == "turn-scale"}
     calibrated = tuple(
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
     )

@@ -9,7 +9,7 @@ from .options import add_bag_arguments, add_mounting_arguments
 from .wording import calibration_text, signed
 
 if TYPE_CHECKING:
-    from ..checks.recording import Diagnosis
+    from ..assessment.recording import Diagnosis
     from ..sensor_log import SensorLog
 
 HELP = "say what is wrong with a recording and what to do about it, before mapping it"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..checks.recording import diagnose
+    from ..assessment.recording import diagnose
     from . import console
     from .cost import model_seconds
     from .formats import read_recording
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         diagnosis, seconds = diagnose(log, repaired=repaired), model_seconds(log)
     cost = expected_cost(repaired or log, seconds)
     console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost, mapped=args.map))
-    return 3 if diagnosis.serious else 0
+    return 3 if diagnosis.doubts else 0
 
 
 def screened(log: "SensorLog") -> "SensorLog | None":
@@ -64,7 +64,7 @@ def screened(log: "SensorLog") -> "SensorLog | None":
 
 
 def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "tuple[Diagnosis, float]":
-    """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this finds serious.
+    """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this doubts.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "t
     -------
     The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
     """
-    from ..checks.recording import diagnose
+    from ..assessment.recording import diagnose
     from ..errors import UwbliteError
     from ..mapping import MappingConfig, build_map
     from ..pipeline.scan_selection import thinned
@@ -86,8 +86,7 @@ def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "t
     except UwbliteError as error:
         return diagnose(log, refused=str(error), repaired=repaired), SECONDS_AT_LEAST
     seconds = SECONDS_AT_LEAST + time.perf_counter() - began
-    found = diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts, repaired=repaired)
-    return found, seconds
+    return diagnose(log, result=made, repaired=repaired), seconds
 
 
 def expected_cost(log: "SensorLog", seconds: float) -> dict[str, float]:
@@ -111,16 +110,20 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> d
         "findings": [dataclasses.asdict(f) for f in diagnosis.findings],
         "figures": diagnosis.figures,
         "expected cost of map": cost,
-        "exit_code": 3 if diagnosis.serious else 0,
+        "exit_code": 3 if diagnosis.doubts else 0,
     }
 
 
 def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, mapped: bool = True) -> list[str]:
-    """Return the findings and figures as lines of text."""
+    """Return the findings and figures as lines of text; what a finding explains stands below it."""
+    from ..findings import folded
+
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
-    for finding in diagnosis.findings:
-        lines.append(f"{finding.rank.upper():<8} {finding.topic}: {finding.what}")
-        lines += [f"         -> {finding.advice}"] if finding.advice else []
+    for finding, explains in folded(diagnosis.findings):
+        sensor = f"{finding.sensor}: " if finding.sensor else ""
+        lines.append(f"{finding.severity.upper():<8} {sensor}{finding.text}")
+        lines += [f"         -> {finding.cure}"] if finding.cure else []
+        lines += [f"         explains {other.severity}: {other.text}" for other in explains]
     if not diagnosis.findings:
         lines.append("nothing to complain about")
     lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
@@ -129,10 +132,10 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, m
         lines.append(f"expected cost: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
     if not mapped:
         lines.append(_ONLY_A_MAP)
-    serious = len(diagnosis.serious)
+    doubts = len(diagnosis.doubts)
     lines.append(
-        f"fix the {serious} serious finding{'s' if serious > 1 else ''} first"
-        if serious
+        f"fix the {doubts} doubt{'s' if doubts > 1 else ''} first"
+        if doubts
         else f"next: uwblite map {name} --out map/"
     )
     return lines
@@ -150,7 +153,8 @@ def _counts(figures: dict[str, Any]) -> str:
     parts = [f"{span}, {odometry['path m']:.1f} m by {readings}"]
     parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
     if "uwb" in figures:
-        parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")
+        many = len(figures["uwb"]["anchors"])
+        parts.append(f"{figures['uwb']['count']} ranges to {many} anchor{'s' if many != 1 else ''}")
     if "lidar" in figures:
         lidar = figures["lidar"]
         parts.append(

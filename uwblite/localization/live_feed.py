@@ -113,7 +113,7 @@ class LiveFeed:
             localizer.add_gyro(measured.stamp, measured.heading)
         elif isinstance(measured, LiveRange):
             yield self._aged(localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag))
-        else:
+        elif isinstance(measured, LiveScan):
             if not self._sees and localizer.scanner is None and "lidar" in self._reported:
                 # It comes late: only now the log has said where the laser sits.
                 self._localizer = localizer = Localizer(self._known, self._mounting(self._reader.mounting))

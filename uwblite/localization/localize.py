@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats
+from ..assessment.repairs import check_recording
 from ..errors import Cancelled, DataError
 from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..screening.screen import screen
@@ -121,8 +122,7 @@ def _findings(
     log: SensorLog, known: KnownMap, passes: tuple[Pass, Pass], localized: float, agreed: float, overlap: float
 ) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """Return warnings and doubts."""
-    remarks = () if log.screening is None else log.screening.findings
-    found = [*remarks]
+    found = check_recording(log)
     shared = len(_shared(log, known))
     if shared < 2:
         text = f"it has ranges to {shared} of the map's anchors: its place is from the walls alone"

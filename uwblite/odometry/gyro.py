@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..graph.calibration import CalibrationConfig
 from ..sensor_log import Gyro, Odometry, SensorLog
 from .wheels import OdometryNoiseConfig
@@ -57,7 +57,7 @@ def settings(
     return calibration, replace(noise, heading_per_turn=per_turn, heading_per_metre=per_metre)
 
 
-def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the gyro's heading, corrected by its bias, in its odometry; and a remark.
 
     A heading with the wrong sign or in degrees is recognised by the wheels and corrected; one that is not correlated with their
@@ -73,11 +73,11 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     steps = odometry.steps
     factor, why = reading_of(gyro, odometry)
     if not factor:
-        return log, [warning("gyro", why)]
+        return log, [Fact.of("gyro", why=why)]
     gyro = Gyro(gyro.stamps, factor * gyro.heading)
     covered = _covered(gyro, odometry.stamps)
     if not covered.any():
-        return log, [warning("gyro", "the gyro was silent while the wheels were read: their heading is taken")]
+        return log, [Fact.of("gyro", why="the gyro was silent while the wheels were read: their heading is taken")]
     bias, standing = bias_of(gyro, odometry)
     heading = np.interp(odometry.stamps, gyro.stamps, gyro.heading) - bias * (odometry.stamps - odometry.stamps[0])
     turn = np.where(covered, np.diff(heading), steps[:, 2])
@@ -86,9 +86,8 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     along = np.cumsum(se2.rotate(theta[:-1], shift), axis=0)
     xy = odometry.poses[0, :2] + np.concatenate([np.zeros((1, 2)), along])
     poses = np.column_stack([xy, se2.wrap_angle(theta)])
-    how = "by the robot's rests" if standing else "against the wheels"
-    text = f"the heading is the gyro's in {covered.mean():.0%} of the odometry; its bias is {bias:+.5f} rad/s {how}"
-    return replace(log, odometry=Odometry(odometry.stamps, poses)), [warning("gyro", f"{text}; {why}" if why else text)]
+    fact = Fact.of("gyro", used=float(covered.mean()), bias=bias, rests=standing, why=why)
+    return replace(log, odometry=Odometry(odometry.stamps, poses)), [fact]
 
 
 def _covered(gyro: Gyro, stamps: Floats) -> Bools:

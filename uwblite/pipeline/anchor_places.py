@@ -7,11 +7,12 @@ are decided on the path that results, until they stay.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..graph.optimizer import Optimizer
 from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
@@ -27,19 +28,19 @@ def decide_places(estimate: Estimate, task: Task) -> Estimate:
     """Give every anchor the places of greatest evidence, each with a name, and tell which were moved."""
     if estimate.ranges is None or not estimate.placed.any():
         return estimate
-    before, said = estimate, list[Finding]()
+    before, said = estimate, list[Fact]()
     for _ in range(BreakPolicy.rounds):
         radios = radio_tracks(estimate, task)
         found, broken = without_moves_of_path(estimate, task, radios, [explain(radio.model) for radio in radios])
         other, moves = _with_places(estimate, task, radios, found)
-        said = [*moves, *(step.finding() for step in broken)]
+        said = [*moves, *(step.fact() for step in broken)]
         if _same(other, estimate):
             break
         if not estimate.rests_on_ranges:
             estimate = with_range_noise(other, task.config)
             break
         estimate = _reoptimised(other, task)
-    task.stages.findings.extend(said)
+    task.stages.facts.extend(said)
     if estimate is not before:
         task.stages.end("places of anchors", places=len(estimate.anchor_ids))
     return estimate
@@ -62,12 +63,12 @@ def _reoptimised(estimate: Estimate, task: Task) -> Estimate:
 
 def _with_places(
     estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation]
-) -> tuple[Estimate, list[Finding]]:
+) -> tuple[Estimate, list[Fact]]:
     """Return the estimate with the places that were found, each as an anchor, and what is said of moves.
 
     Ranges made on the way from place to place have no weight.
     """
-    ranges, bootstrap, moves = estimate.ranges, estimate.bootstrap, list[Finding]()
+    ranges, bootstrap, moves = estimate.ranges, estimate.bootstrap, list[Fact]()
     assert ranges is not None
     assert bootstrap is not None
     recording = task.recordings.of_keyframe[ranges.pose]
@@ -114,8 +115,8 @@ def _names(radio: str, place: Ints, recording: Ints) -> list[str]:
 
 def _moves(
     task: Task, positions: Floats, place: Ints, names: Sequence[str], stamps: Floats, recording: Ints
-) -> Iterator[Finding]:
-    """Warn of each change of a radio's place.
+) -> Iterator[Fact]:
+    """Tell of each change of a radio's place.
 
     Parameters
     ----------
@@ -128,13 +129,11 @@ def _moves(
         number, way = int(recording[first]), first - last - 1
         name, now = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        text = f"anchor {name} was moved: in recording {number + 1} it stands {distance:.2f} m away, and is called {now}"
+        figures: dict[str, Any] = {
+            "anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now,
+        }  # fmt: skip
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
-            begin, end = (float(stamps[row] - start) for row in (last + 1, first))
-            when = f"between t = {begin:.0f} and {end:.0f} s" if way else f"at about t = {end:.0f} s"
-            less = f" (its {way} ranges meanwhile were left out)" if way else ""
-            where = f"recording {number + 1}: " if len(task.recordings) > 1 else ""
-            text = f"{where}anchor {name} was moved by {distance:.1f} m {when}{less}; from then on it is called {now}"
-        figures = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now}
-        yield warning("moved-anchor", text, **figures)
+            between = [float(stamps[row] - start) for row in (last + 1, first)]
+            figures |= {"between": between, "way": way, "several": len(task.recordings) > 1}
+        yield Fact("moved-anchor", figures)

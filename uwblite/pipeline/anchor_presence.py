@@ -30,7 +30,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
         rate = within[own].sum() / max(int(near[present].sum()), 1)
         absent = np.flatnonzero(~present & (rate * near >= _EXPECTED))
         first, last = np.flatnonzero(present)[[0, -1]].tolist()
-        _warn_of_absence(task, estimate.anchor_ids[k], first, last, absent)
+        _note_absence(task, estimate.anchor_ids[k], first, last, absent)
     return estimate
 
 
@@ -38,25 +38,10 @@ _EXPECTED = 10.0
 """An anchor is absent from a recording that should have so many ranges to it, by other recordings at the same places."""
 
 
-def _warn_of_absence(task: Task, anchor: str, first: int, last: int, absent: Ints) -> None:
-    """Warn of an anchor to which recordings before the first or after the last with ranges (0, 1, ...) should have ranges."""
+def _note_absence(task: Task, anchor: str, first: int, last: int, absent: Ints) -> None:
+    """Tell of an anchor to which recordings before the first or after the last with ranges (0, 1, ...) should have ranges."""
     before, after = ([int(n) + 1 for n in absent[side]] for side in (absent < first, absent > last))
     if before:
-        task.stages.warn(
-            "new-anchor",
-            f"anchor {anchor} has ranges only from recording {first + 1} on: {_drove_there(before)}, so it is new or was off",
-            anchor=anchor, recording=first + 1, silent=before,
-        )  # fmt: skip
+        task.stages.note("new-anchor", anchor=anchor, recording=first + 1, silent=before)
     if after:
-        task.stages.warn(
-            "absent-anchor",
-            f"anchor {anchor} has no ranges after recording {last + 1}: {_drove_there(after)}, so it was taken away "
-            "or is off",
-            anchor=anchor, recording=last + 1, silent=after,
-        )  # fmt: skip
-
-
-def _drove_there(numbers: list[int]) -> str:
-    """Return which recordings passed within reach of an anchor but have no ranges to it."""
-    which = ", ".join(map(str, numbers))
-    return f"recording{'s' if len(numbers) > 1 else ''} {which} drove within its reach without hearing it"
+        task.stages.note("absent-anchor", anchor=anchor, recording=last + 1, silent=after)

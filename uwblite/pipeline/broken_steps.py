@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..findings import Finding, doubt
+from ..findings import Fact
 from ..radio.place_evidence import Explanation, MovePolicy, intervals_of
 from ..radio.place_intervals import explain
 from .estimate import Estimate, Task
@@ -241,15 +241,13 @@ class BrokenStep:
         """
         return replace(self.estimate.graph, poses=poses).with_edges(self.estimate.closures.edges).chi2()
 
-    def finding(self) -> Finding:
-        """Return the doubt: a stretch of the path is displaced."""
+    def fact(self) -> Fact:
+        """Return that a stretch of the path is displaced."""
         stamps, start = self.recording.frames.stamps, float(self.recording.log.odometry.stamps[0])
         begin, end = (float(stamps[k - self.recording.first]) for k in (self.begin, self.end - 1))
-        names = ", ".join(sorted({self.radios[move.radio].name for move in self.moves}))
+        names = sorted({self.radios[move.radio].name for move in self.moves})
         off, turned = float(np.hypot(*self.motion[:2])), float(np.rad2deg(abs(self.motion[2])))
-        text = (
-            f"from t = {begin - start:.0f} to {end - start:.0f} s the ranges to {names} fit a path that lies {off:.1f} m and "
-            f"{turned:.0f} deg from the map's: a step is broken at the beginning, by slip or a wrong match of scans; drive "
-            "there again, or map the parts before and after separately"
-        )
-        return doubt("path-displaced", text, recording=self.recording.number + 1, begin=begin, end=end, apart=off)
+        return Fact.of(
+            "path-displaced", recording=self.recording.number + 1, stretch=(begin, end), start=start, anchors=names, apart=off,
+            turned=turned,
+        )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Ints
-from ..findings import Finding, doubt
+from ..findings import Fact
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.registration import Registration, matched_by_chance
 from ..lidar.scan_matching import pair_points
@@ -37,12 +37,12 @@ _AROUND = 2.0
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
-    said = [finding.kind for finding in task.stages.findings if finding.kind in _SYMPTOMS]
+    said = [fact.kind for fact in task.stages.facts if fact.kind in _SYMPTOMS]
     if said in ([], ["moved-anchor"]):
         return estimate
     if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
-    wheels, found = estimate.odometry, list[Finding]()
+    wheels, found = estimate.odometry, list[Fact]()
     while len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
         stretch = _stretch(estimate, task, step.begin)
         other = _released(estimate, task, step, stretch)
@@ -50,12 +50,11 @@ def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
         task.stages.end("broken stretch", begin=round(float(task.recordings.stamps[stretch[0]]), 2), gain=round(gain, 1))
         if gain <= 0.0:
             break
-        found.append(_finding(estimate, other, step, stretch, task))
+        found.append(_fact(estimate, other, step, stretch, task))
         estimate = other
     if not found:
         return estimate
-    _explain(task)
-    task.stages.findings += found
+    task.stages.facts += found
     estimate = lidar_stages.solve_by_own_errors(decide_places(estimate, task), task)
     return surface_adjustment.adjust_surfaces(estimate, task)
 
@@ -65,13 +64,6 @@ def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
     steps = broken_steps(estimate, task, _suspects(estimate, task))
     gain, step = max(steps, key=lambda each: each[0], default=(0.0, None))
     return step if gain > 0.0 else None
-
-
-def _explain(task: Task) -> None:
-    """Name the cause of what was said of anchors that seemed to move along the broken path."""
-    for k, finding in enumerate(task.stages.findings):
-        if finding.kind in _SYMPTOMS:
-            task.stages.findings[k] = replace(finding, explained_by=("worse-than-parts",))
 
 
 _SYMPTOMS = ("moved-anchor", "path-displaced")
@@ -161,24 +153,12 @@ def _registration(estimate: Estimate, task: Task) -> Registration:
     return Registration(clouds, raster, nearest_by_bearing(clouds), config.sigma, chance)
 
 
-def _finding(
-    estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task
-) -> Finding:
+def _fact(estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task) -> Fact:
     """Return what the user is told of a stretch that was replaced."""
     stamps, start = task.recordings.stamps, float(step.recording.log.odometry.stamps[0])
     begin, end = (float(stamps[k]) for k in stretch)
     before, after = (se2.between(*e.graph.poses[list(stretch)]) for e in (estimate, other))
     off = float(np.hypot(*(after - before)[:2]))
     turned = float(np.rad2deg(abs(se2.wrap_angle(after[2] - before[2]))))
-    told = doubt(
-        "worse-than-parts",
-        f"from t = {begin - start:.0f} to {end - start:.0f} s the lidar is not understood: with its matches there left out and "
-        f"all scans matched anew, the robot moves {off:.1f} m and {turned:.0f} deg differently, and ranges, wheels and rays "
-        "together are more probable; the map follows that",
-        off=off, turned=turned,
-    )  # fmt: skip
-    cure = (
-        f"`uwblite convert run.log before.log --end {begin - start:.0f}` gives the part that is supported best; map that, or "
-        "`uwblite map run.log --without lidar` for what wheels and ranges alone say"
-    )
-    return replace(told, sensor="lidar", recording=step.recording.number + 1, stretches=((begin, end),), cure=cure)
+    number = step.recording.number + 1
+    return Fact.of("worse-than-parts", recording=number, stretch=(begin, end), start=start, off=off, turned=turned)

@@ -125,7 +125,7 @@ def _with_long_stretches_tied(
 
 
 def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ranges: bool, task: Task) -> None:
-    """Doubt a map in which stretches that may show the same place are still too uncertain for any search."""
+    """Note stretches that may show the same place and are still too uncertain for any search."""
     recordings, rules = task.recordings, task.config.loop_closure
     covariance = JointCovariance(base.with_edges(found.edges), stretches.reference)
     left = long_stretches.likely(long_stretches.uncertain_pairs(
@@ -135,12 +135,7 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
         return
     a, b = (float(recordings.stamps[stretches.reference[k[0]]] - recordings.stamps[0]) for k in (left.target, left.source))
     sigma = float(left.spread[0]) / 3.0
-    text = (
-        f"the scans at t = {a:.0f} s and at t = {b:.0f} s may show the same place, but their relative position is known to "
-        f"{sigma:.1f} m only and no scan match confirms it ({len(left.target)} such pairs): drive there once more in the same "
-        "direction, or force the closure (uwblite view)"
-    )
-    task.stages.doubt("open-loops", text, pairs=len(left.target), first=a, second=b, sigma=sigma)
+    task.stages.note("open-loops", pairs=len(left.target), first=a, second=b, sigma=sigma)
 
 
 _WIDE_ROUNDS = 12

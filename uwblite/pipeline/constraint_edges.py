@@ -35,10 +35,7 @@ def apply_given(estimate: Estimate, task: Task) -> Estimate:
         raise ConfigError("given places say where the map lies; leave out align, or the places")
     done = apply(given, estimate.graph, estimate.anchor_ids, estimate.placed, task.recordings.clock)
     for anchor, off in done.moved.items():
-        task.stages.warn(
-            "moved-anchor", f"anchor {anchor} stands {off:.2f} m from its earlier place: it was moved",
-            anchor=anchor, distance=off,
-        )  # fmt: skip
+        task.stages.note("moved-anchor", anchor=anchor, distance=off)
     solved = optimize(done.graph.with_edges(*estimate.odometry_and_ranges), config.solver)[0]
     shift = [round(v, 4) for v in done.motion.tolist()]
     task.stages.end("constraints", moved=sorted(done.moved), shift=shift)

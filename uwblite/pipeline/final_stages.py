@@ -21,7 +21,6 @@ from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
 from ..problem.parts import at_given_poses
-from ..problem.solution import with_nonnegative_heights
 from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
@@ -169,35 +168,14 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     reporter = stages.reporter("occupancy grid")
     grid = from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
     if grid.scans_astray:
-        stages.doubt(
-            "scans-astray",
-            f"{grid.scans_astray} of {grid.scans_astray + grid.scans_used} scans are so far from the others that no grid"
-            " can hold both; they are not drawn",
-            scans=grid.scans_astray,
-        )
-    _check_resolution(grid.geometry, config.grid.resolution, task)
+        stages.note("scans-astray", scans=grid.scans_astray, used=grid.scans_used)
+    if grid.geometry.resolution > config.grid.resolution:
+        cells = config.grid.max_cells / 1e6
+        stages.note("coarse-grid", resolution=grid.geometry.resolution, asked=config.grid.resolution, cells=cells)
     if config.crop is not None:
         grid = cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
     return grid
-
-
-def _check_resolution(geometry: GridGeometry, asked: float, task: Task) -> None:
-    """Warn where the map is drawn with larger cells than requested; a map larger than any building is a doubt."""
-    edge = geometry.resolution
-    if edge <= asked:
-        return
-    most = task.config.grid.max_cells / 1e6
-    text = (
-        f"the map is drawn with cells of {edge:g} m instead of {asked:g} m: there would be more than {most:g} million; "
-        "raise grid.max_cells where there is memory (12 bytes each), or set --crop or a smaller grid.max_range"
-    )
-    say = task.stages.warn if edge <= _COARSEST * asked else task.stages.doubt
-    say("coarse-grid", text, resolution=edge, asked=asked)
-
-
-_COARSEST = 10.0
-"""Ratio of the cell size to the requested one, up to which a map counts as large; beyond it, poses or readings are wrong."""
 
 
 def _sweeps(recording: Recording, graph: Graph) -> Sweeps:

@@ -145,7 +145,7 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
 
 
 def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
-    """Return the distances in the map, ready for a report; warn of those that differ from the measured ones."""
+    """Return the distances in the map, ready for a report; note those that differ from the measured ones."""
     lengths = tied.edges.lengths(graph)
     figures: list[dict[str, object]] = []
     for number, given in enumerate(task.given.landmark_distances):
@@ -153,10 +153,5 @@ def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
         names = " - ".join(given.landmarks)
         figures.append({"landmarks": names, "measured": given.distance, "map": round(length, 4)})
         if abs(length - given.distance) > 3.0 * given.sigma:
-            task.stages.warn(
-                "landmark-distance",
-                f"the distance {names} is {length:.3f} m in the map, not the {given.distance:.3f} m that were measured: "
-                "all other measurements contradict it",
-                **figures[-1],
-            )
+            task.stages.note("landmark-distance", **figures[-1])
     return figures

@@ -112,11 +112,7 @@ def _without_offset(estimate: Estimate, delay: float, task: Task) -> tuple[Estim
     """
     estimate = _at_delay(_with_clock_at(estimate, 0.0), -delay, 0.0, task)
     now = task.following(estimate)
-    task.stages.warn(
-        "clock-offset",
-        f"an offset of the lidar's clock ({delay:+.3f} s) grows when it is corrected: it is no constant, and none is used",
-        offset=delay,
-    )
+    task.stages.note("clock-offset", offset=delay)
     estimate, steps = _descended(estimate, now)
     track = _followed(estimate, steps, now)
     return _match_neighbours(replace(estimate, odometry=track.wheels), track, now), track
@@ -334,17 +330,12 @@ def solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer | None
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
-    """Compare the free space of one visit to a place with the points of another; doubt a map that contradicts itself."""
+    """Compare the free space of one visit to a place with the points of another."""
     recordings, poses = task.recordings, estimate.graph.poses
     share, visits = visibility.free_space_violation(estimate.lidar.clouds, poses, recordings.path, recordings.of_keyframe)
     task.stages.end("map consistency", visits=visits, free_space_violation=round(share, 4))
     if share > _VIOLATION and visits >= _ENOUGH_VISITS:
-        task.stages.doubt(
-            "free-space-violation",
-            f"{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
-            "parts of the map are misplaced to each other; look at the closures in report.html",
-            share=round(share, 4), visits=visits,
-        )  # fmt: skip
+        task.stages.note("free-space-violation", share=round(share, 4), visits=visits)
     return estimate
 
 

@@ -6,7 +6,6 @@ and its covariance does not contain the other side. So wherever the trajectory c
 on the other side once, and the same problem is solved from there; and again from each optimum found in this way.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -14,10 +13,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, runs_of
-from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
-from ..problem.alternatives import Alternative, Explanation, apart, explanations
+from ..problem.alternatives import Alternative, Explanation, explanations
 from ..problem.evidence import log_density
 from .estimate import Estimate, Task
 
@@ -43,25 +41,6 @@ def with_likeliest_side(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
     best, *others = sides(estimate.problem, estimate.placed, task.config.solver)
     return replace(estimate.with_estimates_of(best.graph), other_side=others[0].graph) if others else estimate
-
-
-def check_other_side(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
-    graph, other = estimate.graph, estimate.other_side
-    if task.recordings.have_scans or len(task.recordings) > 1:
-        return
-    known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
-    further = graph.with_estimates_of(other) if other is not None and known else None
-    for there in sides(graph, estimate.placed, task.config.solver, further):
-        off = apart(there.graph, graph)
-        if there.open and off > LinePolicy.elsewhere:
-            text = (
-                f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
-                f"{off:.1f} m (rms) away (odds {np.exp(there.log_odds):.2g}): place an anchor off that line, or give the "
-                "places of the anchors"
-            )
-            yield doubt("other-side", text, apart=off, log_odds=there.log_odds)
-            return
 
 
 def sides(graph: Graph, placed: Bools, config: SolverConfig, further: Graph | None = None) -> list[Explanation]:

@@ -61,12 +61,42 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
         other = _along_another_path(best, ranges, k, images[k], task)
         if other is not None:
             as_well[k], others[k] = True, other
+    if not task.recordings.have_scans and not as_well[free].all() and as_well[free].any():
+        # The side of the anchor that seems clear may be that of all of them: the path and all anchors have a mirror image.
+        image = mirrored_whole(best, ranges, free, config)
+        if image is not None:
+            others = np.where((free & ~as_well)[:, None], image.anchors, others)
+            as_well = free | as_well
     ambiguous = np.where(free, as_well, found.ambiguous)
     hypotheses = list(found.hypotheses)
     for k in np.flatnonzero(free & ambiguous).tolist():
         if hypotheses[k]:
             hypotheses[k] = (hypotheses[k][0], replace(hypotheses[k][0], position=others[k]))
     return replace(estimate, bootstrap=replace(found, ambiguous=ambiguous, hypotheses=tuple(hypotheses)))
+
+
+def mirrored_whole(graph: Graph, ranges: RangeEdges, free: Bools, config: SolverConfig) -> Graph | None:
+    """Return the optimum with all anchors on the other side of the path, which bends with them; None where it is refuted.
+
+    Only the odometry's turns distinguish it from the given optimum, and along a nearly straight path they hardly do.
+
+    Parameters
+    ----------
+    graph : with all measurements, at its optimum. free : (a,) anchors that may move.
+    """
+    tags = ranges.tag_positions(graph.poses)[ranges.alive]
+    across = np.linalg.eigh(np.cov(tags.T))[1][:, 0]
+    anchors = graph.anchors.copy()
+    anchors[free] -= 2.0 * ((anchors[free] - tags.mean(axis=0)) @ across)[:, None] * across
+
+    def mirrored(at: Graph) -> list[Alternative]:
+        return [Alternative(replace(graph, anchors=anchors))] if at is graph else []
+
+    for each in explanations(graph, mirrored, lambda start: optimize(start, config)[0], log_density):
+        apart = np.hypot(*(each.graph.anchors - graph.anchors)[free].T)
+        if each.open and apart.min(initial=np.inf) > MirrorPolicy.apart:
+            return each.graph
+    return None
 
 
 def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, task: Task) -> Floats | None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats
-from ..screening.units import likely_unit
 from ..sensor_log import SensorLog
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -43,7 +42,7 @@ def with_given_mounting_and_clock(config: MappingConfig, logs: Sequence[SensorLo
 
 
 def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
-    """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres; warn of it.
+    """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres.
 
     It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
     """
@@ -54,21 +53,12 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     other = estimate.other_heights
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
-            double = abs(abs(np.log2(abs(factor))) - 1.0) < _DOUBLE
-            unit = likely_unit(factor)
-            either = double or "yards" in unit
-            unclear = either and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
-            reason = _TWICE if unclear and double else "the odometry has a wrong unit and was multiplied by that"
-            whose = f"{recording.name}: " if len(recordings) > 1 else ""
-            text = (
-                f"{whose}by the ranges (times of flight) the robot drove {factor:.3f} times the distance that its "
-                f"odometry counts: {reason}{unit}"
-            )
             high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
-            if other is not None and high:
-                text += f"; or the odometry is right and the anchors are {other.high:.1f} m above the tag: give their heights"
-            add = task.stages.doubt if unclear or high else task.stages.warn
-            add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
+            task.stages.note(
+                "odometry-unit", recording=recording.number + 1, name=recording.name if len(recordings) > 1 else "",
+                factor=factor, checked=recording.has_scans or len(task.given.anchors) > 1 or bool(task.given.distances),
+                high=other.high if other is not None and high else None,
+            )  # fmt: skip
     return factors
 
 
@@ -81,10 +71,3 @@ def _lidar_agrees(recording: Recording, factor: float) -> bool:
 
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
-_DOUBLE = 0.1
-"""A factor is 2 or 1/2 up to this, by its logarithm to the base 2."""
-_TWICE = (
-    "either the wheels' radius and diameter were mistaken for each other, or the radio reports twice or half "
-    "the distance, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
-    "between two anchors"
-)

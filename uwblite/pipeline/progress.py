@@ -1,13 +1,11 @@
-"""Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
+"""Summaries of the stages, facts for the rules, and the caller's progress callback and clock."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 
 from ..errors import Cancelled
-from ..findings import DOUBT, WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, of_severity, warning
+from ..findings import DOUBT, WARNING, Fact, Finding, of_severity
 from ..graph.solver import SolverSummary
 from ..map_result import StageSummary
-from ..sensor_log import SensorLog
 
 
 class Stage(str):
@@ -32,12 +30,13 @@ Progress = Callable[[Stage, int, int], object]
 
 
 class Stages:
-    """Collects figures, warnings and doubts of the stages; calls the caller's progress callback."""
+    """Collects figures and facts of the stages, and what the rules find; calls the caller's progress callback."""
 
     def __init__(self, progress: Progress | None, clock: Callable[[], float] | None) -> None:
         self._progress, self._clock = progress, clock
         self._since = clock() if clock else 0.0
         self.done: list[StageSummary] = []
+        self.facts: list[Fact] = []
         self.findings: list[Finding] = []
 
     @property
@@ -50,23 +49,15 @@ class Stages:
         """The findings that are doubts."""
         return list(of_severity(self.findings, DOUBT))
 
-    def note(self, logs: Sequence[SensorLog]) -> None:
-        """Take over what the screening of the recordings found, but for what only a finished map can judge."""
-        self.findings += [finding for finding in of_recordings(logs) if finding.kind != WHEELS_AGAINST_LIDAR]
-
     def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
         stage = stage if isinstance(stage, Stage) else Stage(stage)
         if self._progress is not None and self._progress(stage, done, total) is False:
             raise Cancelled(f"stopped by the caller during {stage}")
 
-    def warn(self, kind: str, text: str, **figures: object) -> None:
-        """Add a warning."""
-        self.findings.append(warning(kind, text, **figures))
-
-    def doubt(self, kind: str, text: str, **figures: object) -> None:
-        """Add a reason not to trust the result."""
-        self.findings.append(doubt(kind, text, **figures))
+    def note(self, kind: str, **figures: object) -> None:
+        """Add a fact, of which the rule of its kind (assessment/decisions.py) makes a finding."""
+        self.facts.append(Fact(kind, figures))
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
@@ -83,16 +74,6 @@ class Stages:
     def reporter(self, stage: str) -> Callable[[int, int], None]:
         """Return a callback (done, total) for one stage."""
         return lambda done, total: self.report(stage, done, total)
-
-
-def of_recordings(logs: Sequence[SensorLog]) -> list[Finding]:
-    """Return what the screening found in recordings, each with its recording's number and, where there are several, name."""
-    found = []
-    for number, log in enumerate(logs):
-        where = f"recording {number + 1}: " if len(logs) > 1 else ""
-        own = () if log.screening is None else log.screening.findings
-        found += [replace(finding, text=where + finding.text, recording=number + 1) for finding in own]
-    return found
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:

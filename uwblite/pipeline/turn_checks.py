@@ -1,17 +1,14 @@
 """The odometry in turns: its scale, which must be one constant that no single wrong turn changes; and the point about which
 the robot turns."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from ..findings import Finding, doubt
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
-from ..graph.pose_edges import ScanEdges
-from ..odometry.turn_scale import TurnScale, turn_scales
+from ..odometry.turn_scale import turn_scales
 from ..problem.evidence import prior_sigma, with_prior_sigma
 from .estimate import Estimate, Task
 
@@ -30,50 +27,10 @@ def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
         if fixed[index]:
             values[index] = found.value
         elif found.contradicts(used := float(values[index])) and abs(found.value) < abs(used):
-            task.stages.warn(
-                "turn-scale",
-                f"from step to step the lidar turns {_shown(found)} times as much as the odometry, but the whole fits best "
-                f"with {1.0 + used:.2f}: single turns of the odometry are wrong; the steps' scale is used",
-                name=graph.calibration.keys[index].label, by_steps=found.value, sigma=found.sigma, by_all=used,
-            )  # fmt: skip
+            label = graph.calibration.keys[index].label
+            task.stages.note("turn-scale", name=label, by_steps=found.value, sigma=found.sigma, by_all=used)
             values[index], fixed[index] = found.value, True
     return replace(estimate, graph=replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed))
-
-
-def check_turn_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map whose scale of turns is not that of the lidar's own steps, or differs between parts of the recording."""
-    for edges in estimate.graph.edges:
-        if isinstance(edges, ScanEdges):
-            for index, found in turn_scales(estimate.odometry, edges, estimate.graph).items():
-                yield from _judge(found, float(estimate.graph.calibration.values[index]), task)
-
-
-def _judge(found: TurnScale, used: float, task: Task) -> Iterator[Finding]:
-    """Return the text about what is wrong with the scale that a map uses."""
-    if found.varies:
-        parts = ", ".join(f"{1.0 + value:.2f}" for value in found.stretches)
-        yield doubt(
-            "turn-scale",
-            f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no calibration "
-            "changes so; the map's heading is wrong, or the odometry failed",
-            stretches=found.stretches.tolist(),
-        )  # fmt: skip
-    elif abs(used - found.value) > _WRONG and found.contradicts(used):
-        yield doubt(
-            "turn-scale",
-            f"the map multiplies the odometry's turns by {1.0 + used:.2f}, but from step to step the lidar turns "
-            f"{_shown(found)} times as much: a turn of the map or a loop closure is wrong",
-            by_steps=found.value, sigma=found.sigma, by_all=used,
-        )  # fmt: skip
-
-
-def _shown(found: TurnScale) -> str:
-    """Return the factor of turns with its standard deviation."""
-    return f"{1.0 + found.value:.2f} \u00b1 {found.sigma:.2f}"
-
-
-_WRONG = 0.1
-"""Difference of the scale of turns that noise does not explain: a tenth of all turns missing or too much."""
 
 
 def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Floats, weighted_median
 from ..errors import DataError
-from ..findings import Finding, doubt, warning
+from ..findings import Fact
 from ..odometry.attached import OUTSIDE
 from ..sensor_log import LaserScans, SensorLog, UwbRanges, odometry_in_bursts
 from ..sensor_log import in_bursts as stamps_in_bursts
@@ -21,9 +21,8 @@ _JUMP = 10.0
 """A clock that was set forward by less cannot be distinguished from a sensor that was silent, s."""
 _SAME_END = 2.0
 """Sensors of one recording end within so much of each other, s."""
-_SOME, _MOST = 0.02, 0.5
-"""Share of scans outside the odometry's time from which on it is reported; share of any readings from which on it is a
-doubt."""
+_SOME = 0.02
+"""Share of scans outside the odometry's time from which on it is reported."""
 
 
 def stand_still(stamps: Floats, travelled: Floats) -> bool:
@@ -63,7 +62,7 @@ def refuse_without_stamps(log: SensorLog) -> None:
         )
 
 
-def made_up(log: SensorLog) -> list[Finding]:
+def made_up(log: SensorLog) -> list[Fact]:
     """Report stamps on a grid too coarse for a sensor's clock: they were made by counting messages."""
     if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
         return []
@@ -71,41 +70,27 @@ def made_up(log: SensorLog) -> list[Finding]:
     period = min(float(np.median(s)) for s in steps)
     if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
         return []
-    text = (
-        f"odometry and scans are stamped exactly every {period:g} s: these stamps were generated, not measured, so speeds, "
-        "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock"
-    )
-    return [warning("made-up-stamps", text)]
+    return [Fact.of("made-up-stamps", period=period)]
 
 
-def in_bursts(log: SensorLog) -> tuple[tuple[str, ...], list[Finding]]:
-    """Return the sensors (odometry, scans) whose stamps are times of receipt in bursts, and a remark that says so."""
+def in_bursts(log: SensorLog) -> tuple[tuple[str, ...], list[Fact]]:
+    """Return the sensors (odometry, scans) whose stamps are times of receipt in bursts."""
     names = ["odometry"] if odometry_in_bursts(log.odometry) else []
     names += ["scans"] if log.scans is not None and stamps_in_bursts(log.scans.stamps) else []
-    if not names:
-        return (), []
-    text = (
-        f"the stamps of {' and '.join(names)} come in bursts: they are times of receipt behind a queue, not of measurement, so "
-        "no clock offset is estimated, and speeds mean little; stamp each reading when it is measured"
-    )
-    return tuple(names), [warning("stamps-of-receipt", text)]
+    return tuple(names), [Fact.of("stamps-of-receipt", sensors=names)] if names else []
 
 
-def set_back(log: SensorLog) -> list[Finding]:
-    """Return a doubt for each sensor whose clock was set back."""
-    return [
-        doubt("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there")
-        for sensor, by in log.notes.set_back.items()
-        if by > 1.0
-    ]
+def set_back(log: SensorLog) -> list[Fact]:
+    """Return each sensor whose clock was set back."""
+    return [Fact.of("clock-set-back", sensor=sensor, by=by) for sensor, by in log.notes.set_back.items() if by > 1.0]
 
 
-def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Undo jumps forward of one clock: gaps without which odometry and sensor end together, and with which they do not.
 
     The odometry's stamps stay: where its own clock jumped, those of the other sensors follow.
     """
-    odometry, remarks = log.odometry.stamps, []
+    odometry, facts = log.odometry.stamps, []
     for name, what, sensor in _sensors(log):
         own = sensor.stamps
         ahead, behind = _jump(own, float(odometry[-1])), _jump(odometry, float(own[-1]))
@@ -114,12 +99,9 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
         at, by = ahead or behind or (0.0, 0.0)
         moved = -by if ahead else by
         log = replace(log, **{name: replace(sensor, stamps=np.where(own > at, own + moved, own))})  # type: ignore[arg-type]
-        text = (
-            f"the clock of the {what if ahead else 'odometry'} was set forward by {by:.1f} s at t = {at - odometry[0]:.0f} s, "
-            f"as the ends of the sensors show: the {what}'s later stamps were moved by {moved:+.1f} s"
-        )
-        remarks.append(warning("clock-jump", text))
-    return log, remarks
+        clock, since = what if ahead else "odometry", at - float(odometry[0])
+        facts.append(Fact.of("clock-jump", clock=clock, sensor=what, by=by, at=since, moved=moved))
+    return log, facts
 
 
 def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
@@ -137,13 +119,13 @@ def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
     return (float(stamps[longest]), by) if abs(stamps[-1] - by - end) < _SAME_END else None
 
 
-def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
-    """Leave out scans outside the odometry's time; report how many, and how many ranges. Doubt the recording where most are.
+def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
+    """Leave out scans outside the odometry's time; report how many, and how many ranges.
 
     Ranges outside it stay in the recording; a map gives them no weight.
     """
     first, last = log.odometry.stamps[[0, -1]]
-    remarks = []
+    facts = []
     for name, _, sensor in _sensors(log):
         outside = (sensor.stamps < first - OUTSIDE) | (sensor.stamps > last + OUTSIDE)
         share = float(np.mean(outside))
@@ -152,13 +134,8 @@ def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
         if isinstance(sensor, LaserScans):
             log = replace(log, scans=sensor.rows(~outside))
         off = float(np.median(sensor.stamps) - 0.5 * (first + last))
-        differ = f"the clocks differ by about {off:.0f} s; " if share > _MOST else ""
-        text = (
-            f"{np.sum(outside)} of {len(outside)} {name} were stamped outside the odometry's time and left out: {differ}"
-            "start the odometry first and stop it last, and use one clock"
-        )
-        remarks.append((doubt if share > _MOST else warning)(f"{name}-outside-odometry", text))
-    return log, remarks
+        facts.append(Fact.of("outside-odometry", sensor=name, count=int(outside.sum()), total=len(outside), off=off))
+    return log, facts
 
 
 def _sensors(log: SensorLog) -> list[tuple[str, str, UwbRanges | LaserScans]]:

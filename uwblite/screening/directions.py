@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..findings import Finding, doubt, warning
+from ..findings import Fact
 from ..lidar import laser_mounting
 from ..sensor_log import Odometry, SensorLog
 from .units import heading_agreement
@@ -24,7 +24,7 @@ _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
 _LEAST_PAIRS = 15
 
 
-def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the heading's sign that agrees with the path; a lidar decides which is right."""
     plain, varied = heading_agreement(log.odometry)
     if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
@@ -33,11 +33,7 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     tried = {what: replace(log, odometry=_scaled(log.odometry, sign)) for what, sign in mirrors.items()}
     fits = {what: _fits_laser(other) for what, other in tried.items()}
     best = max(fits, key=lambda what: fits[what])
-    one_fits = fits[best] > 0.0
-    text = f"the odometry's heading turns against its path: {best} was inverted"
-    if not one_fits:
-        text += "; nothing in the recording shows whether the map is mirrored, so compare it with the building"
-    return tried[best], [warning("heading-against-path", text)]
+    return tried[best], [Fact.of("heading-against-path", inverted=best, settled=fits[best] > 0.0)]
 
 
 def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
@@ -52,7 +48,7 @@ def _fits_laser(log: SensorLog) -> float:
     return -1.0 if seen.turned_over else 1.0
 
 
-def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the laser mounted upright or upside down, as its turns show.
 
     A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in
@@ -62,15 +58,11 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     if _fits_laser(log) >= 0.0:
         return log, []
     flipped = not log.mounting.laser_flipped
-    text = (
-        "laser and wheels turn in opposite directions: the laser was taken as mounted "
-        f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
-        f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
-    )
-    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [doubt("laser-turned-over", text)]
+    log = replace(log, mounting=replace(log.mounting, laser_flipped=flipped))
+    return log, [Fact.of("laser-turned-over", flipped=flipped)]
 
 
-def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Finding]]:
+def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the direction of the laser that the driving shows, where that is far from the given one."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
     clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
@@ -90,12 +82,9 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Finding]]
     mount, tags = turned, log.mounting.tags
     if _lever_error(pairs, clear, given, around) < _lever_error(pairs, clear, given, turned):
         mount, tags = around, np.column_stack([se2.rotate(np.full(len(tags), angle), tags[:, :2]), tags[:, 2]])
-    text = (
-        f"the laser's direction differs by {np.degrees(angle):+.0f} degrees from its given pose, by the motion that both "
-        f"measure; corrected: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
-    )
     mounting = replace(log.mounting, T_base_laser=mount, laser_is_base=False, tag_position=tags[0], more_tags=tags[1:])
-    return replace(log, mounting=mounting), [warning("laser-turned-away", text)]
+    fact = Fact.of("laser-turned-away", degrees=float(np.degrees(angle)), pose=mount.tolist())
+    return replace(log, mounting=mounting), [fact]
 
 
 def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> float:

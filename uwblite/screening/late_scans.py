@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import MAD_TO_SIGMA, Bools, Floats
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import Odometry, SensorLog, in_bursts
 
@@ -20,7 +20,7 @@ _CANCELS = 0.5
 """Share of either step's difference that is left in their sum where a scan alone is displaced, at most."""
 
 
-def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Give the scans that came late the poses at which they were taken; only where scans came through a queue, in bursts.
 
     The odometry of such a recording is tied to the scans by their order. A scan that was overtaken fits neither the pose
@@ -35,11 +35,8 @@ def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
         return log, []
     times = scans.middles
     poses = se2.compose(log.odometry.at(times[late - 1]), steps[late - 1])
-    text = (
-        f"{len(late)} of {len(times)} scans came late: they show where the robot was before, as their neighbours prove; their "
-        "poses are those that they show"
-    )
-    return replace(log, odometry=_with_poses(log.odometry, times[late], poses)), [warning("late-scans", text)]
+    log = replace(log, odometry=_with_poses(log.odometry, times[late], poses))
+    return log, [Fact.of("late-scans", count=len(late), total=len(times))]
 
 
 def _steps(log: SensorLog) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..errors import DataError
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..sensor_log import Odometry, OdometryBreaks
 from .units import FASTEST
 
@@ -63,7 +63,7 @@ class Motion:
         return (length > _LEAST_JUMP + self.speed[0] * time) | (turn > _LEAST_SPIN + self.speed[1] * time)
 
 
-def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Finding]]:
+def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Fact]]:
     """Leave out readings whose removal makes the chain continuous again.
 
     Raises
@@ -91,11 +91,11 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Finding]]:
     if not wrong.any():
         return odometry, []
     first = float(odometry.stamps[np.argmax(wrong)] - odometry.stamps[0])
-    text = f"{int(wrong.sum())} odometry readings lie far from the path (the first at t = {first:.1f} s) and were left out"
-    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [warning("odometry-glitches", text)]
+    fact = Fact.of("odometry-glitches", count=int(wrong.sum()), first=first)
+    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [fact]
 
 
-def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Finding]]:
+def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Fact]]:
     """Join the two sides of each jump by predicted motion, and return its uncertainty."""
     motion = Motion.of(odometry)
     jumps = motion.jumps()
@@ -110,14 +110,10 @@ def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Finding
         unsure = 0.5 * motion.speed * float(motion.span[k])
         sigma.append([0.05 + unsure[0], 0.05 + unsure[0], 0.05 + unsure[1]])
     at = np.flatnonzero(jumps)
-    where = ", ".join(f"{odometry.stamps[k] - odometry.stamps[0]:.1f}" for k in at[:5])
-    largest = float(np.hypot(*motion.steps[at, :2].T).max())
-    text = (
-        f"the odometry jumps at t = {where}{' ...' if len(at) > 5 else ''} s (by up to {largest:.2f} m): only other "
-        "sensors connect the path before and after"
-    )
+    times, largest = (odometry.stamps[at] - odometry.stamps[0]).tolist(), float(np.hypot(*motion.steps[at, :2].T).max())
     joined = Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))
-    return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [warning("odometry-breaks", text)]
+    breaks = OdometryBreaks(odometry.stamps[at], np.array(sigma))
+    return joined, breaks, [Fact.of("odometry-breaks", at=times, largest=largest)]
 
 
 def without_repeats(odometry: Odometry) -> tuple[Odometry, int]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Ints, runs_of
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..sensor_log import LaserScans, SensorLog
 
 _SECTOR = np.deg2rad(30.0)
@@ -19,7 +19,7 @@ _STEADY, _SHARE, _ENOUGH = 0.04, 0.8, 500
 the median."""
 
 
-def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Remove readings that stay the same at all places and headings of the robot."""
     scans = log.scans
     if scans is None or not len(scans.stamps) or log.odometry.travelled_at(scans.stamps[-1:])[0] < _WAY:
@@ -31,13 +31,10 @@ def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     if not own.any():
         return log, []
     ranges = np.where(own, np.float32(np.nan), scans.ranges)
-    where, runs = np.rad2deg(scans.angles), runs_of(own)
-    parts = ", ".join(f"{where[a]:.0f} to {where[b - 1]:.0f}" for a, b in runs[:3]) + " ..." * (len(runs) > 3)
-    text = (
-        f"{int(own.sum())} of {len(own)} beams of the lidar (at {parts} degrees) see the same nearby however the robot is "
-        "turned: the robot itself; they were left out"
-    )
-    return replace(log, scans=replace(scans, ranges=ranges)), [warning("repeated-readings", text)]
+    where = np.rad2deg(scans.angles)
+    sectors = [(float(where[a]), float(where[b - 1])) for a, b in runs_of(own)]
+    fact = Fact.of("own-body", count=int(own.sum()), total=len(own), sectors=sectors)
+    return replace(log, scans=replace(scans, ranges=ranges)), [fact]
 
 
 def _steady(scans: LaserScans, sector: Ints) -> Bools:

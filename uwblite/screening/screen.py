@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..findings import DOUBT, Finding, doubt, warning
+from ..findings import Fact
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
@@ -34,7 +34,7 @@ UNKNOWN = 3.0
 
 
 def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
-    """Return the recording repaired, with the findings in its `screening`; a recording screened before is returned unchanged.
+    """Return the recording repaired, with the facts in its `screening`; a recording screened before is returned unchanged.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
         return log
     clocks.refuse_without_stamps(log)
     units.refuse_wrong_times(log)
-    remarks = [*clocks.set_back(log), *clocks.made_up(log)]
+    facts = [*clocks.set_back(log), *clocks.made_up(log)]
     log, set_right = clocks.without_jumps(log)
     log, outside = clocks.within_odometry(log)
-    remarks += [*set_right, *outside]
+    facts += [*set_right, *outside]
     units.refuse_wrong_lengths(log)
     odometry, repeats = odometry_chain.without_repeats(log.odometry)
     log, spread = stuck_sensors.without_bursts(replace(log, odometry=odometry))
@@ -61,24 +61,26 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     units.refuse_degrees(odometry)
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
-    remarks += [*_repeats(repeats), *spread, *times, *glitches, *broken, *turned]
+    facts += [Fact.of("repeated-odometry", count=repeats)] if repeats else []
+    facts += [*spread, *times, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks, without_own_body]
     repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
     repairs += [directions.heading_with_the_path] + [directions.laser_upright] * turn_laser + [with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)
-        remarks += more
+        facts += more
     log, gaps, more = _gaps(log)
     log, pairs, turned = _looking_ahead(log)
     units.refuse_other_ranges(range_motion.change_by_way(log), _way_ratio(pairs))
     log, pairs, lost, standing = _lost_wheels(log, pairs)
-    remarks += [*more, *turned, *standing]
+    facts += [*more, *turned, *standing]
     cut, more = _cuts(log, jumps.stamps, OdometryBreaks.of_all([gaps, lost]).stamps)
     if pairs is not None:
         more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]), log)
     more += _hardly_moving(log.odometry)
     breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
-    return replace(log, screening=Screening((*remarks, *more), breaks, _way_ratio(pairs), bursts))
+    turns = (float("nan"), float("nan")) if pairs is None else wheel_motion.turn_ratio(pairs)
+    return replace(log, screening=Screening((*facts, *more), breaks, _way_ratio(pairs), turns, bursts))
 
 
 def _way_ratio(pairs: Pairs | None) -> float:
@@ -86,48 +88,37 @@ def _way_ratio(pairs: Pairs | None) -> float:
     return float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
 
 
-def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Finding]]:
+def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Fact]]:
     """Compare wheels and lidar, with the laser in the direction that the driving shows."""
     pairs = wheel_motion.compare(log)
     if pairs is None:
         return log, None, []
     if not pairs.measured.any():
         return log, None, wheel_motion.unmatched(pairs)
-    log, remarks = directions.laser_ahead(log, pairs)
-    return log, wheel_motion.compare(log) if remarks else pairs, remarks
+    log, facts = directions.laser_ahead(log, pairs)
+    return log, wheel_motion.compare(log) if facts else pairs, facts
 
 
-def _hardly_moving(odometry: Odometry) -> list[Finding]:
-    """Doubt a recording of a robot that stands: nothing can be placed from one spot."""
+def _hardly_moving(odometry: Odometry) -> list[Fact]:
+    """Tell of a robot that stands: nothing can be placed from one spot."""
     path = float(np.sum(np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T)))
     if path >= _SHORTEST_PATH:
         return []
     turned = float(np.ptp(np.unwrap(odometry.poses[:, 2])))
-    text = (
-        f"the robot hardly moves: {path:.2f} m in {np.ptp(odometry.stamps):.0f} s (turning {turned:.1f} rad); does the base "
-        "report its wheels, in metres? Drive through the building"
-    )
-    return [doubt("hardly-moving", text)]
+    return [Fact.of("hardly-moving", way=path, seconds=float(np.ptp(odometry.stamps)), turned=turned)]
 
 
-def _repeats(count: int) -> list[Finding]:
-    text = f"{count} odometry readings are in the log twice; one of each was left out"
-    return [warning("repeated-odometry", text)] if count else []
-
-
-def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
+def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Fact]]:
     """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?
 
     A gap in the messages is none in the odometry: the pose after it counts, with the noise of the way and turn that it shows,
     unless other sensors find the robot elsewhere. What they measured while it drove has no place between the two poses.
     """
     stamps, poses = log.odometry.stamps, log.odometry.poses
-    if log.notes.one_clock:  # each scan brings the odometry's pose: between two of them nothing is silent
-        return log, OdometryBreaks.none(), []
     span = np.diff(stamps)
     period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
     gaps = np.flatnonzero((span > max(_GAP, 20.0 * period)) & ~_as_between_others(log.odometry))
-    at, remarks, silent = list[float](), list[Finding](), list[tuple[float, float]]()
+    at, facts, silent = list[float](), list[Fact](), list[tuple[float, float]]()
     for k in gaps.tolist():
         a, b = float(stamps[k]), float(stamps[k + 1])
         step = se2.between(poses[k], poses[k + 1])
@@ -136,19 +127,17 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Finding]]:
         seen = any(_inside(sensor.stamps, a, b).any() for sensor in (log.ranges, log.scans) if sensor is not None)
         # A gyro may have turned with the robot while no sensor measured its distance.
         elsewhere = held and _elsewhere(log, a, b)
-        when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
+        begin = a - float(stamps[0])
         if elsewhere:
-            text = f"{when}, but the robot was moved meanwhile: only other sensors connect the path before and after"
-            remarks.append(doubt("carried", text))
+            facts.append(Fact.of("carried", at=[begin], silent=b - a))
         elif not stood and seen:
-            text = f"{when}, while the robot drove on; ranges and scans of that time were left out"
-            remarks.append(warning("odometry-gap", text))
+            facts.append(Fact.of("odometry-gap", begin=begin, seconds=b - a))
         if elsewhere or not stood:
             silent.append((a, b))
         if elsewhere:
             at.append(a)
     found = OdometryBreaks(np.array(at), np.tile(_ANYWHERE, (len(at), 1))) if at else OdometryBreaks.none()
-    return _without(log, silent), found, remarks
+    return _without(log, silent), found, facts
 
 
 def _as_between_others(odometry: Odometry) -> Bools:
@@ -198,26 +187,20 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
     return replace(log, ranges=ranges, scans=scans)
 
 
-def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Finding]]:
+def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Fact]]:
     """Find stretches in which the wheels stand and other sensors move, and replace the wheels there."""
     start = float(log.odometry.stamps[0])
     unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if pairs is None or not wheel_motion.seen(pairs, *s)]
     unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
-    text = "the trajectory there rests on ranges alone"
-    remarks = [replace(_lost_remark(a - start, b - start, text), severity=DOUBT) for a, b in unseen]
+    facts = [Fact.of("wheels-stand-still", begin=a - start, end=b - start, by_scans=False) for a, b in unseen]
     unknown = _unknown_steps(log.odometry, unseen)
     stretches = [] if pairs is None else wheel_motion.lost(log, pairs)
     if not stretches:
-        return log, pairs, unknown, remarks
+        return log, pairs, unknown, facts
     odometry, breaks = replaced_wheels.replaced(log, stretches)
-    remarks += [_lost_remark(a - start, b - start, "the motion between scans is used instead") for a, b in stretches]
+    facts += [Fact.of("wheels-stand-still", begin=a - start, end=b - start, by_scans=True) for a, b in stretches]
     log = replace(log, odometry=odometry)
-    return log, wheel_motion.compare(log), OdometryBreaks.of_all([unknown, breaks]), remarks
-
-
-def _lost_remark(a: float, b: float, outcome: str) -> Finding:
-    text = f"the wheels count nothing from t = {a:.0f} to {b:.0f} s while the robot moves: {outcome}"
-    return warning("wheels-stand-still", text)
+    return log, wheel_motion.compare(log), OdometryBreaks.of_all([unknown, breaks]), facts
 
 
 def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:
@@ -230,7 +213,7 @@ def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> 
     return OdometryBreaks(odometry.stamps[before], sigma)
 
 
-def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Finding]]:
+def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Fact]]:
     """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s; jumps may be such."""
     times = cuts.found(log, jumps)
     stamps, start = log.odometry.stamps, log.odometry.stamps[0]
@@ -239,9 +222,5 @@ def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks
     if not len(times):
         return OdometryBreaks.none(), []
     before = stamps[np.clip(np.searchsorted(stamps, times) - 1, 0, len(stamps) - 1)]
-    where = ", ".join(f"t = {t - start:.0f} s" for t in times[:4])
-    text = (
-        f"at {where}{' ...' if len(times) > 4 else ''} the robot is suddenly elsewhere: it was carried, or the log was cut; "
-        "only other sensors connect the path before and after"
-    )
-    return OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1))), [doubt("carried", text)]
+    breaks = OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1)))
+    return breaks, [Fact.of("carried", at=(times - start).tolist())]

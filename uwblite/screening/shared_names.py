@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..findings import Finding, warning
+from ..findings import Fact
 from ..sensor_log import SensorLog
 from .odometry_chain import Motion
 from .stuck_sensors import quiet_noise, resolution_of
@@ -28,7 +28,7 @@ _STEADY, _VARIES = 0.9, 0.7
 have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
 
 
-def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Leave out the ranges of each name that two anchors have: the place of none of them is known."""
     ranges = log.ranges
     if ranges is None or len(log.odometry.stamps) < 2:
@@ -39,20 +39,16 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
         return log, []
     noise = quiet_noise([ranges.ranges[own] for _, own in each], resolution_of(ranges.ranges[usable]))
     driven = np.interp(ranges.stamps, log.odometry.stamps, _driven(log))
-    wrong, remarks = np.zeros(len(ranges.stamps), dtype=bool), []
+    wrong, facts = np.zeros(len(ranges.stamps), dtype=bool), []
     for anchor, own in each:
         leaps = np.abs(np.diff(ranges.ranges[own])) > _most(np.diff(driven[own]), noise)
         if _two_distances(ranges.ranges[own], driven[own], leaps, noise) and not wrong[own].any():
-            text = (
-                f"two anchors seem to have the name {ranges.anchor_ids[anchor]}: its ranges jump between two distances "
-                f"({int(leaps.sum())} of {len(leaps)} times by more than the robot drove); they were left out, "
-                "give each anchor its own name"
-            )
-            remarks.append(warning("shared-name", text))
+            name = ranges.anchor_ids[anchor]
+            facts.append(Fact.of("shared-name", anchor=name, jumps=int(leaps.sum()), total=len(leaps)))
             wrong |= ranges.anchor == anchor
-    if not remarks:
+    if not facts:
         return log, []
-    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), remarks
+    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), facts
 
 
 def _driven(log: SensorLog) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, runs_of, white_noise
-from ..findings import Finding, doubt, warning
+from ..findings import Fact
 from ..sensor_log import SensorLog
 
 _SAME_RANGES = 12
@@ -36,17 +36,17 @@ _LEAST_SEEN = 10
 """Least number of beams with a reading; scans without readings may be equal."""
 
 
-def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Spread readings of odometry and lidar that share one stamp because they waited in a buffer.
 
     Each burst is spread evenly over the time since the one before; the remaining delay is calibrated.
     """
-    remarks = []
+    facts = []
     for name, what, sensor in (("odometry", "odometry readings", log.odometry), ("scans", "scans", log.scans)):
         if sensor is not None and (spread := _spread(sensor.stamps)) is not None:
             log = replace(log, **{name: replace(sensor, stamps=spread[0])})  # type: ignore[arg-type]
-            remarks.append(_burst_remark(what, *spread[1:]))
-    return log, remarks
+            facts.append(Fact.of("stamps-in-bursts", readings=what, size=spread[1], period=spread[2]))
+    return log, facts
 
 
 def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
@@ -62,19 +62,11 @@ def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
     return stamps - gap[group] * (1.0 - (place + 1.0) / size[group]), usual, between
 
 
-def _burst_remark(what: str, size: float, between: float) -> Finding:
-    text = (
-        f"{what} come in bursts of about {size:.0f} with one stamp, every {between:.2f} s: they were spread over the time "
-        "since the previous burst; stamp each reading when it is made"
-    )
-    return warning("stamps-in-bursts", text)
-
-
 _BURST, _LEAST_BURSTS = 4, 5
 """Readings with one stamp that make a burst (two or three are a coarse clock), and bursts that must be."""
 
 
-def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Leave out scans that repeat the one before to the last digit.
 
     Two in a row may be alike by chance. A driver that sends at twice the lidar's rate repeats many: each is a step of the
@@ -91,14 +83,11 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     wrong = twice | stuck
     if not wrong.any():
         return log, []
-    remarks = []
+    facts = []
     if stuck.any():
-        start = float(log.odometry.stamps[0])
-        when = _when(scans.stamps, stuck, start)
-        share = f"{int(stuck.sum())} of {len(stuck)} scans equal the scan before ({when})"
-        why = "the driver sends scans again" if often else "the lidar or its driver was stuck"
-        remarks.append(warning("repeated-scans", f"{share}: {why}; they were left out"))
-    return replace(log, scans=scans.rows(~wrong)), remarks
+        when = _when(scans.stamps, stuck, float(log.odometry.stamps[0]))
+        facts.append(Fact.of("repeated-scans", count=int(stuck.sum()), total=len(stuck), stretches=when, often=often))
+    return replace(log, scans=scans.rows(~wrong)), facts
 
 
 def _repeats(readings: NDArray[np.floating]) -> Bools:
@@ -115,7 +104,7 @@ _FEW_BEAMS = 32
 """Beams that are compared first."""
 
 
-def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Leave out ranges that stand still while the robot moves, and ranges written twice.
 
     Noise lets n ranges in a row lie within a width w with a probability of at most (w / (sigma sqrt(2 pi)))^n, wherever the
@@ -126,7 +115,7 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     if ranges is None or len(ranges.stamps) < 2:
         return log, []
     travelled = log.odometry.travelled_at(ranges.stamps)
-    wrong, remarks, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
+    wrong, facts, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
     for anchor in range(len(ranges.anchor_ids)):
         own = np.flatnonzero(ranges.anchor == anchor)
         wrong[own[1:]] = (np.diff(ranges.ranges[own]) == 0.0) & (np.diff(ranges.stamps[own]) == 0.0)
@@ -137,13 +126,11 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     for name, own in zip(ranges.anchor_ids, each, strict=True):
         stuck = _standing(ranges.ranges[own], travelled[own], resolution, sigma)
         if stuck.any():
-            when = _when(ranges.stamps[own], stuck, start)
-            text = f"anchor {name} repeats one range while the robot moves ({when}); these were left out"
-            remarks.append(warning("repeated-ranges", text))
+            facts.append(Fact.of("repeated-ranges", anchor=name, stretches=_when(ranges.stamps[own], stuck, start)))
         wrong[own[stuck]] = True
     if not wrong.any():
         return log, []
-    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), remarks
+    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), facts
 
 
 def _standing(values: Floats, travelled: Floats, resolution: float, sigma: float) -> Bools:
@@ -187,7 +174,7 @@ def quiet_noise(each: list[Floats], resolution: float) -> float:
     return float(np.sqrt(max(np.quantile(found, _QUIET) ** 2 - (0.5 * resolution) ** 2, _LEAST_NOISE**2)))
 
 
-def without_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_marks(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Leave out a value that stands for no distance: what a radio reports beyond its reach, or when it missed its partner."""
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < _MARKS:
@@ -201,16 +188,11 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
     wrong = ranges.ranges == mark
     if len(np.unique(ranges.anchor[wrong])) < 2:  # one that is stuck
         return log, []
-    text = (
-        f"{int(wrong.sum())} of {len(wrong)} ranges are exactly {mark:g} m, wherever the robot is: the radio reports "
-        "this value where it has no measurement; they were left out"
-    )
-    # Few are left to constrain a trajectory that no lidar does.
-    most = log.scans is None and bool(wrong.mean() > _MOST_MARKS)
-    return replace(log, ranges=ranges.rows(~wrong)), [(doubt if most else warning)("repeated-ranges", text)]
+    fact = Fact.of("marked-ranges", count=int(wrong.sum()), total=len(wrong), value=mark, lidar=log.scans is not None)
+    return replace(log, ranges=ranges.rows(~wrong)), [fact]
 
 
-def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
+def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Remove a reading that stands for no distance: for example the value of a lidar or its driver beyond its reach."""
     scans = log.scans
     if scans is None or not len(scans.stamps):
@@ -223,11 +205,10 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Finding]]:
         return log, []
     wrong = scans.ranges == np.float32(mark)
     farthest = mark == float(apart[holds].max())
-    what = "the lidar reports its reach where it sees nothing" if farthest else "a code, or a part of the robot in view"
-    share = f"{int(wrong.sum())} of {wrong.size} readings of the lidar are exactly {mark:g} m, wherever the robot is"
+    fact = Fact.of("repeated-readings", count=int(wrong.sum()), total=wrong.size, value=mark, reach=farthest)
     ranges = np.where(wrong, np.float32(np.inf if farthest else np.nan), scans.ranges)
     scans = replace(scans, ranges=ranges, range_max=mark if farthest else scans.range_max)
-    return replace(log, scans=scans), [warning("repeated-readings", f"{share}: {what}; they are not taken as walls")]
+    return replace(log, scans=scans), [fact]
 
 
 def _mark(values: Floats | NDArray[np.float32]) -> float | None:
@@ -244,10 +225,6 @@ def _mark(values: Floats | NDArray[np.float32]) -> float | None:
 _MARKS, _MARK_SHARE, _TIMES_OTHERS = 20, 0.03, 8.0
 """Readings (of a lidar: scans with readings) of one value at different places, their share of all, and how much more frequent
 than others it must be. No value of seven recorded lidars, in steps of 1 mm to 1 cm, is more than 0.7 % of their readings."""
-_MOST_MARKS = 0.5
-"""Share of a radio's readings that stand for no distance, from which on the rest is too little where no lidar is."""
-
-
 def _in_runs(flags: Bools, least: int) -> Bools:
     """Return which set flags stand in runs of at least so many."""
     long = np.zeros(len(flags), dtype=bool)
@@ -256,8 +233,6 @@ def _in_runs(flags: Bools, least: int) -> Bools:
     return long
 
 
-def _when(stamps: Floats, flags: Bools, start: float) -> str:
-    """Return when the flags are set, in words."""
-    runs = runs_of(flags)
-    text = ", ".join(f"t = {stamps[a] - start:.0f} to {stamps[b - 1] - start:.0f} s" for a, b in runs[:3])
-    return text + (f", and {len(runs) - 3} more stretches" if len(runs) > 3 else "")
+def _when(stamps: Floats, flags: Bools, start: float) -> list[tuple[float, float]]:
+    """Return when the flags are set, first and last time of each stretch, s since the start."""
+    return [(float(stamps[a] - start), float(stamps[b - 1] - start)) for a, b in runs_of(flags)]

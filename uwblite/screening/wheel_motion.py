@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median, spread_about_median
-from ..findings import DOUBT, Finding, doubt
+from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, SensorLog
 from .motion_ratios import ratios, undiluted
@@ -202,8 +202,8 @@ _CLEARLY_WORSE = 2.0
 """Factor between the mean square distances of matches at two motions from which one of them is wrong."""
 
 
-def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Finding]:
-    """Return a doubt where wheels and lidar measure different motions for long, one factor for all taken out.
+def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Fact]:
+    """Tell where wheels and lidar measure different motions for long, one factor for all taken out.
 
     Along a bare wall any motion matches two scans of few rays, that of the wheels as well as that which the lidar seems to
     measure; such pairs show nothing, where the log with their scans is given.
@@ -223,31 +223,20 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
     runs = [(own.start[a], own.end[b - 1]) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
     runs = runs or _other_scale(own, start)
-    if not runs:
-        return []
-    when = ", ".join(f"t = {a - start:.0f} to {b - start:.0f} s" for a, b in runs[:3])
-    more = f", and {len(runs) - 3} more stretches" if len(runs) > 3 else ""
-    text = (
-        f"wheels and lidar measure different motions ({when}{more}): one of the two is stuck, slips or has another scale there "
-        "than elsewhere; cut that part off, or drive it again"
-    )
-    return [Finding("wheels-against-lidar", DOUBT, text, stretches=tuple((float(a), float(b)) for a, b in runs))]
+    stretches = [(float(a), float(b)) for a, b in runs]
+    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches)] if runs else []
 
 
 _WORSE_BY_WHEELS = 1.2
 """Factor between the mean square distances of matches as wheels and lidar measure the motion from which the lidar shows it."""
 
 
-def unmatched(pairs: Pairs) -> list[Finding]:
-    """Return a doubt where scans a short time apart hardly ever match; pairs with too few readings do not count."""
+def unmatched(pairs: Pairs) -> list[Fact]:
+    """Tell where scans a short time apart hardly ever match; pairs with too few readings do not count."""
     seen = pairs.share[pairs.share > 0.0]
     if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
         return []
-    text = (
-        f"successive scans do not match (nine of ten pairs share less than {100 * most:.0f} % of their "
-        "points): the readings are noise, or beam order or angles are not as stated; check the lidar's driver"
-    )
-    return [doubt("scans-do-not-match", text)]
+    return [Fact.of("scans-do-not-match", share=most)]
 
 
 _NOISE_SHARE = 0.4

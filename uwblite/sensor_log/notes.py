@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arrays import Floats
-from ..findings import Finding
+from ..findings import Fact
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,9 +61,12 @@ class OdometryBreaks:
 class Screening:
     """What was found and repaired in a recording before it is mapped."""
 
-    findings: tuple[Finding, ...]
+    facts: tuple[Fact, ...]
+    """Of each of them a rule makes a finding."""
     breaks: OdometryBreaks
     lidar_by_wheels: float = float("nan")
     """Distance by the lidar / distance by the wheels; nan where nothing shows it."""
+    turn_ratio: tuple[float, float] = (float("nan"), float("nan"))
+    """Turn by the lidar / turn by the wheels, and its standard deviation; nan where nothing shows it."""
     in_bursts: tuple[str, ...] = ()
     """Sensors whose stamps are times of receipt in bursts: no clock offset can be estimated against them."""

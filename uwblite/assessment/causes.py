@@ -1,0 +1,110 @@
+"""Causes before consequences: which finding explains which, and the order in which they are told.
+
+A fault of the data shows in many places: a clock that was set back bends the path, moves anchors and scatters ranges. Each rule
+says what it sees; here every consequence names its cause. Nothing is left out, and no severity changes: removing the cause
+from the data would remove the consequence as well, unless it has another cause besides.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from ..findings import SEVERITIES, Finding
+
+_TIMES = frozenset({"silences", "equal-stamps", "laser-delay", "slow-odometry", "odometry-gap", "clock-offset", "no-turns"})
+"""What stamps that are no times look like."""
+_PLACES = frozenset({
+    "anchor-distrusted", "anchor-mirror-ambiguous", "anchor-unplaced", "no-anchor", "moved-anchor", "anchors-moved-together",
+    "sustained-outliers", "ranges-disagree", "short-ranges",
+})  # fmt: skip
+"""What anchors seem to do along a path that is wrong, or by ranges that are no distances."""
+_BY_RANGES = _PLACES | {
+    "range-scatter", "odometry-unit", "odometry-slips", "drift", "halves-disagree", "other-side", "anchor-heights", "mirrored",
+    "unusual-calibration", "uncertain", "poor-fit", "path-displaced",
+}
+"""What a map by ranges and wheels alone shows of a fault of either."""
+_BY_SCANS = frozenset({
+    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-steps",
+    "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
+    "unusual-calibration", "mirrored",
+})  # fmt: skip
+"""What a map shows of a fault of lidar or wheels."""
+_ALL = _BY_RANGES | _BY_SCANS | {"wheels-against-lidar", "range-scatter", "carried", "wheels-stand-still"}
+
+EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
+    "refused": frozenset({"odometry-alone"}),
+    "clock-set-back": _TIMES | _ALL,
+    "scans-outside-odometry": _TIMES | {"no-lidar"},
+    "ranges-outside-odometry": _TIMES | {"no-ranges"},
+    "made-up-stamps": _TIMES,
+    "stamps-of-receipt": _TIMES,
+    "stamps-in-bursts": _TIMES,
+    "hardly-moving": _PLACES | {"uncertain", "straight-path", "no-turns", "moves-across-heading"},
+    "scans-do-not-match": _BY_SCANS | {"wheels-against-lidar", "range-scatter", "odometry-alone"},
+    "laser-turned-over": _BY_SCANS | {"wheels-against-lidar", "range-scatter", "anchors-moved-together"},
+    "carried": _BY_SCANS | _BY_RANGES,
+    "wheels-stand-still": _BY_RANGES | _BY_SCANS,
+    "marked-ranges": _PLACES | {"uncertain", "odometry-alone", "untied-parts", "few-in-reach", "few-ranges"},
+    "shared-name": _PLACES | {"spikes"},
+    "repeated-ranges": frozenset({"few-ranges", "anchor-unplaced", "no-anchor", "odometry-alone", "uncertain"}),
+    "repeated-scans": frozenset({"odometry-alone", "untied-parts", "silences"}),
+    "worse-than-parts": _PLACES | {"path-displaced", "odometry-steps", "free-space-violation"},
+    "wheels-against-lidar": _BY_SCANS | {"range-scatter", "anchors-moved-together", "moved-anchor"},
+    "halves-disagree": _BY_RANGES - {"halves-disagree"},
+    "turn-factor": frozenset({"unusual-calibration"}),
+    "mirrored": frozenset({"unusual-calibration", "odometry-unit"}),
+    "loose-links": frozenset({
+        "free-space-violation", "no-closure", "untied-parts", "anchors-moved-together", "path-displaced",
+    }),
+    "path-displaced": _PLACES,
+    "range-scatter": _BY_RANGES - {"range-scatter", "path-displaced"},
+    "drift": _PLACES | {"odometry-slips", "odometry-unit", "unusual-calibration"},
+    "odometry-slips": _PLACES | {"unusual-calibration", "odometry-unit"},
+    "anchors-moved-together": frozenset({
+        "moved-anchor", "anchor-distrusted", "ranges-disagree", "short-ranges", "sustained-outliers",
+    }),
+    "anchor-distrusted": frozenset({"sustained-outliers", "short-ranges", "spikes"}),
+    "straight-path": frozenset({"anchor-mirror-ambiguous"}),
+    "few-ranges": frozenset({"anchor-unplaced"}),
+})  # fmt: skip
+"""By the kind of a cause, the kinds that it explains; a cause stands before those causes that it explains."""
+_SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType({
+    "radio": _TIMES | _BY_RANGES | {
+        "carried", "spikes", "few-in-reach", "few-ranges", "no-ranges", "untied-parts", "odometry-alone",
+    },
+    "lidar": _TIMES | _BY_SCANS | {"wheels-against-lidar", "carried", "no-lidar", "range-scatter", "anchors-moved-together"},
+})  # fmt: skip
+"""What a fault of one sensor alone can explain; one of the odometry may explain all."""
+_RANK = {kind: number for number, kind in enumerate(EXPLAINS)}
+
+
+def explained(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings with their causes named, in the order in which they are told.
+
+    Worst first; among those of one severity causes come before what they explain, and a finding that nothing explains before
+    those that something does.
+    """
+    given = tuple(findings)
+    named = [replace(f, explained_by=_causes(f, given)) for f in given]
+    return tuple(sorted(named, key=_place))
+
+
+def _causes(finding: Finding, findings: Iterable[Finding]) -> tuple[str, ...]:
+    """Return the kinds of the findings that explain one, the first cause first."""
+    causes = {cause.kind for cause in findings if _explains(cause, finding)}
+    return tuple(sorted(causes, key=_RANK.__getitem__))
+
+
+def _explains(cause: Finding, finding: Finding) -> bool:
+    """Return whether a finding is a consequence of another one, of the same recording, anchor and time where they have such."""
+    if finding.kind not in EXPLAINS.get(cause.kind, ()) or _RANK[cause.kind] >= _RANK.get(finding.kind, len(_RANK)):
+        return False
+    if finding.kind not in _SHOWN_BY.get(cause.sensor, (finding.kind,)):
+        return False
+    if cause.recording and finding.recording and cause.recording != finding.recording:
+        return False
+    return not (cause.anchor and finding.anchor and cause.anchor != finding.anchor)
+
+
+def _place(finding: Finding) -> tuple[int, bool, int]:
+    return SEVERITIES.index(finding.severity), bool(finding.explained_by), _RANK.get(finding.kind, len(_RANK))

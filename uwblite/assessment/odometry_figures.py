@@ -1,0 +1,62 @@
+"""Figures of the wheels before a map is made, and what they show."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..findings import NOTE, WARNING, Finding
+from ..screening.units import heading_agreement
+from ..sensor_log import Odometry
+from .rhythm import check_equal_stamps, check_silences, rhythm
+
+STRAIGHT = 0.02
+"""Width of the path by its length below which the two sides of it cannot be distinguished."""
+_SLOWEST = 5.0
+"""Hz; ranges and rays between two readings that are farther apart are placed badly at usual speeds."""
+_ACROSS, _CLEARLY = 0.7, 0.2
+"""Agreement of heading and motion below which a robot moves across its heading, and by which a unit or a sign explains it."""
+
+
+def odometry_figures(odometry: Odometry) -> dict[str, Any]:
+    """Return rhythm, path and speed of the wheels."""
+    figures: dict[str, Any] = rhythm(odometry.stamps, expected_gap=0.5)
+    steps = odometry.steps
+    length, span = np.hypot(steps[:, 0], steps[:, 1]), np.diff(odometry.stamps)
+    moving = (length > 1e-6) & (span > 0)
+    speed = float(np.median(length[moving] / span[moving])) if moving.any() else 0.0
+    figures["path m"] = round(float(length.sum()), 3)
+    figures["turned rad"] = round(float(np.abs(steps[:, 2]).sum()), 3)
+    figures["speed m/s"] = round(speed, 4)
+    figures["heading"] = {"agreement with the motion": round(heading_agreement(odometry)[0], 3)}
+    figures["width of the path by its length"] = round(straightness(odometry.poses[:, :2]), 4)
+    return figures
+
+
+def check_odometry(odometry: Odometry, figures: dict[str, Any]) -> Iterator[Finding]:
+    """Yield what the figures of the wheels show; the screening says whether the robot drove on during a silence."""
+    yield from (replace(finding, severity=NOTE) for finding in check_silences("odometry", figures))
+    yield from check_equal_stamps("odometry", figures)
+    yield from check_motion_along_heading(odometry)
+    if figures["rate Hz"] and figures["rate Hz"] < _SLOWEST:
+        text = f"only {figures['rate Hz']:.1f} readings a second"
+        cure = "ranges and rays are placed between them by interpolation; 10 Hz or more is better"
+        yield Finding("slow-odometry", WARNING, text, cure, "odometry")
+
+
+def check_motion_along_heading(odometry: Odometry) -> Iterator[Finding]:
+    """Warn of a robot that moves across its heading, where neither another sign nor another unit explains that."""
+    plain, varied = heading_agreement(odometry)
+    others = (heading_agreement(odometry, -1.0)[0], heading_agreement(odometry, np.pi / 180.0)[0])
+    if varied and plain < _ACROSS and max(others) < plain + _CLEARLY:
+        text = f"the robot often moves across its heading (agreement {plain:.2f} of 1)"
+        cure = "right for an omnidirectional base; otherwise check the heading's unit and sign, and the axes"
+        yield Finding("moves-across-heading", WARNING, text, cure, "odometry")
+
+
+def straightness(xy: Floats) -> float:
+    """Return the width of the path by its length: ratio of the standard deviations along its principal axes."""
+    values = np.linalg.eigvalsh(np.cov(xy.T)) if len(xy) > 2 else np.zeros(2)
+    return float(np.sqrt(max(values[0], 0.0) / values[1])) if values[1] > 0 else 0.0

@@ -1,0 +1,161 @@
+"""Findings about a recording before it is mapped: faults, their size, and what to do about them.
+
+A doubt spoils the map or prevents it, a warning costs accuracy, a note is good to know. No map is needed; where the recording
+itself shows a fault (heading in degrees, a laser upside down, clocks that differ), the screening has used it. With a map, its
+findings are those of the recording as well.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..errors import DataError
+from ..findings import DOUBT, NOTE, WARNING, WHEELS_AGAINST_LIDAR, Finding, of_severity, ranked
+from ..lidar.laser_mounting import Turning
+from ..map_result import MapResult
+from ..screening.screen import screen
+from ..sensor_log import LogNotes, SensorLog
+from .causes import explained
+from .lidar_figures import check_lidar, check_turning, lidar_figures, shows_turns, turning_figures
+from .odometry_figures import check_odometry, odometry_figures
+from .radio_figures import calibration_figures, check_radio, radio_figures
+from .repairs import check_recording
+
+_BROKEN = 0.001
+"""Share of broken lines from which on a disk, cable or writer is bad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Result of the checks."""
+
+    findings: tuple[Finding, ...]
+    """Worst first."""
+    figures: dict[str, Any] = field(default_factory=dict)
+    """By sensor: rates, gaps, shares, counts (JSON-ready)."""
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """The findings that spoil the map or prevent it."""
+        return of_severity(self.findings, DOUBT)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordingView:
+    """What the rules about a recording look at."""
+
+    log: SensorLog
+    """As it was read."""
+    repaired: SensorLog | None
+    """Screened; None where the screening refuses it."""
+    result: MapResult | None
+    """The map that was made for the check, where one was."""
+    refusal: str
+    """Why no map can be made."""
+    figures: dict[str, Any]
+    """See Diagnosis."""
+    turning: Turning | None
+    """Turns by laser and wheels."""
+
+    @property
+    def turn_ratio(self) -> tuple[float, float]:
+        """Turn by the laser / turn by the wheels with its standard deviation, as the screening measured it."""
+        return _turn_ratio(self.repaired)
+
+
+def diagnose(
+    log: SensorLog, *, result: MapResult | None = None, refused: str = "", repaired: SensorLog | None = None
+) -> Diagnosis:
+    """Examine a recording.
+
+    Parameters
+    ----------
+    result : a map made for the check, where there is one: it shows the wheels' scale, the delay of the radio, the bias of each
+        anchor, and whether the sensors agree.
+    refused : why no map could be made; empty where it was, or was not tried.
+    repaired : the recording screened, where that has been done.
+    """
+    view = _view(log, result, refused, repaired)
+    rules = (_check_notes, _check_map, _check_sensors, _check_each_sensor)
+    found = [finding for rule in rules for finding in rule(view)]
+    return Diagnosis(explained(ranked(found)), view.figures)
+
+
+def _view(log: SensorLog, result: MapResult | None, refused: str, repaired: SensorLog | None) -> RecordingView:
+    try:
+        repaired = repaired or screen(log)
+    except DataError as error:
+        refused = refused or str(error)
+    figures: dict[str, Any] = {"odometry": odometry_figures(log.odometry)}
+    turning = None
+    if log.ranges is not None and len(log.ranges.stamps):
+        figures["uwb"] = radio_figures(log)
+        made = ((), ()) if result is None else (result.anchors, result.calibration)
+        figures["radio calibration"] = calibration_figures(*made)
+    if log.scans is not None and len(log.scans.stamps):
+        figures["lidar"] = lidar_figures(log)
+        figures["lidar"]["turning"], turning = turning_figures(log, _turn_ratio(repaired))
+    return RecordingView(log, repaired, result, refused, figures, turning)
+
+
+def _turn_ratio(repaired: SensorLog | None) -> tuple[float, float]:
+    screening = None if repaired is None else repaired.screening
+    return (float("nan"), float("nan")) if screening is None else screening.turn_ratio
+
+
+def _check_notes(view: RecordingView) -> Iterator[Finding]:
+    """Say what the reader saw: lines that are broken, oddities."""
+    notes: LogNotes = view.log.notes
+    if notes.broken:
+        first = "; ".join(f"line {number}: {why}" for number, why in notes.broken_lines[:3])
+        text = f"{notes.broken} of {notes.lines} lines are broken and were skipped ({first})"
+        cure = "a recorder that was cut off leaves one; more point to a bad disk, cable or writer"
+        yield Finding("broken-lines", WARNING if notes.broken > _BROKEN * max(notes.lines, 1) else NOTE, text, cure, "log")
+    for text in notes.warnings:
+        yield Finding("reader", WARNING, text, sensor="log")
+
+
+def _check_map(view: RecordingView) -> Iterator[Finding]:
+    """Say what the screening repaired or doubts, and what a map doubts or refuses; a map says what the screening found, too."""
+    if view.refusal:
+        yield Finding("refused", DOUBT, view.refusal, "no map is made before that is fixed", "log")
+    if view.result is not None:
+        yield from view.result.findings
+    elif view.repaired is not None:
+        for finding in check_recording(view.repaired):
+            if finding.kind == WHEELS_AGAINST_LIDAR:
+                cure = "a map is doubted for it, unless its ranges agree with the lidar there"
+                yield replace(finding, severity=WARNING, cure=cure)
+            elif finding.severity == DOUBT:
+                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there")
+            else:
+                yield replace(finding, cure="a map repairs it so; the files stay as they are")
+
+
+def _check_sensors(view: RecordingView) -> Iterator[Finding]:
+    """Say which sensors are missing."""
+    log, repaired = view.log, view.repaired
+    sensors = () if repaired is None else (s for s in (repaired.ranges, repaired.scans) if s is not None and len(s.stamps) > 1)
+    if repaired is not None and not any(True for _ in sensors):
+        text = "neither ranges nor scans are left to constrain the trajectory"
+        yield Finding("odometry-alone", DOUBT, text, "odometry alone drifts", "log")
+    if "uwb" not in view.figures:
+        cure = "the map rests on wheels and lidar; check the tag if that is not meant"
+        if log.notes.unread:
+            unread = ", ".join(log.notes.unread)
+            cure = f"there may be some in what was not read: {unread}; `mappings` say where (see above)"
+        yield Finding("no-ranges", NOTE, "there are no UWB ranges", cure, "radio")
+    if "lidar" not in view.figures:
+        cure = "there will be a trajectory and anchors, but no map"
+        yield Finding("no-lidar", NOTE, "there are no laser scans", cure, "lidar")
+
+
+def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
+    """Say what the figures of each sensor show."""
+    yield from check_odometry(view.log.odometry, view.figures["odometry"])
+    if "uwb" in view.figures:
+        yield from check_radio(view.figures["uwb"])
+    if "lidar" in view.figures:
+        yield from check_lidar(view.figures["lidar"])
+        if shows_turns(view.log.scans):
+            yield from check_turning(view.turning, view.turn_ratio)

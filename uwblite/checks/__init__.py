@@ -1,1 +1,0 @@
-"""Findings about a recording before it is mapped: ``uwblite check``."""
