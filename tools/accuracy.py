@@ -1,17 +1,15 @@
 #!/usr/bin/env python3
-"""How accurate the defaults are, what each ingredient buys, and what false measurements cost; writes docs/lab/accuracy.md.
+"""How accurate the defaults are, and what false measurements cost; writes docs/lab/accuracy.md.
 
     python tools/accuracy.py                                     everything, about an hour on two cores
     python tools/accuracy.py simulated --seeds 1 --only hall,lab a part of it
     python tools/accuracy.py simulated --quick --print           recordings of 6 min, nothing written
-    python tools/accuracy.py ablation --set keyframes.scans=3
 
 Parts: simulated (buildings x seeds against bars), oracle (against what the measurements allow, and the Cramer-Rao bound),
 fusion (all sensors against some of them), real (recordings of others, where they are: UWBLITE_SHARED_DATA; with it benchmark:
-two of them against relations and published figures; --perturb N: N perturbed runs of each that has a lidar as well), ablation
-(each ingredient switched off in turn), raw (the same without a radio, recordings of others first), injection (false closures
-and ranges into a good graph). How true the stated uncertainties are is measured by tools/consistency.py, which writes into the
-same page.
+two of them against relations and published figures; --perturb N: N perturbed runs of each that has a lidar as well), injection
+(false closures and ranges into a good graph). What each ingredient buys is measured by tools/ablation.py, and how true the
+stated uncertainties are by tools/consistency.py; both write into the same page.
 """
 
 import one_thread  # noqa: F401
@@ -29,10 +27,23 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import oracle
 from simulation.laser import NARROW, SPINNING
-from simulation.radio import RadioModel
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings, simulate
-from trials import ROOT, SHARED, Figures, Trial, as_read, judged, made, spread_out, table, write_section
+from trials import (
+    MIRRORED,
+    ROOT,
+    SHARED,
+    Figures,
+    Trial,
+    as_read,
+    judged,
+    made,
+    real_error,
+    spread_out,
+    table,
+    true_path,
+    write_section,
+)  # fmt: skip
 
 from uwblite import se2
 from uwblite.config import override
@@ -44,12 +55,12 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.io.carmen import read_log
-from uwblite.io.tum import read_relations, read_tum
+from uwblite.io.tum import read_relations
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
-PARTS = ("simulated", "oracle", "fusion", "real", "benchmark", "ablation", "raw", "injection")
+PARTS = ("simulated", "oracle", "fusion", "real", "benchmark", "injection")
 WORST = 1.6
 """The worst seed may exceed the bar on the mean by this factor."""
 
@@ -92,43 +103,6 @@ ROWS = {
     "radio off": Row("hall, no UWB", Settings(world="hall"), 0.10, 0.15, ("use_uwb=false",)),
 }
 
-MOUNTING = Settings(world="lab", laser_error=(0.03, -0.02, 0.03), laser_delay=0.03, uwb_delay=0.08)
-POOR_RADIO = Settings(world="hall", radio=RadioModel(bias_sd=0.8, scale=1.05))
-ABLATION_RECORDINGS = {
-    **{k: ROWS[k].settings for k in ("hall", "corridor", "lab", "nlos", "slips", "heights")},
-    "mounting": MOUNTING,
-    "poor radio": POOR_RADIO,
-}
-"""mounting: a laser mounted 3 cm and 1.7 degrees off, and clocks 30 and 80 ms off. poor radio: anchors wrong by 0.8 m each,
-ranges 5 % long."""
-
-INGREDIENTS: dict[str, tuple[str, ...]] = {
-    "nothing (the defaults)": (),
-    "calibration of the wheels": tuple(
-        f"calibration.{n}=0" for n in ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
-    ),
-    "calibration of the range bias": ("calibration.range_bias=0",),
-    "calibration of the range scale": ("calibration.range_scale=0",),
-    "unknown anchor heights": ("calibration.anchor_height=0",),
-    "calibration of the laser's place": ("calibration.laser_offset=0", "calibration.laser_angle=0"),
-    "calibration of the tag's place": ("calibration.tag_offset=0",),
-    "calibration of the clocks": ("calibration.range_delay=0", "calibration.laser_delay=0"),
-    "noise of ranges learnt": ("ranges.learn=false",),
-    "correlation of ranges": ("ranges.learn=false", "ranges.slow_share=0"),
-    "errors steady by direction": ("ranges.steady=0",),
-    "marginal likelihood for the radio's priors": ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8"),
-    "robust kernels of wheels and ranges": ("odometry.kernel.name=none", "ranges.kernel.name=none"),
-    "scan-to-scan matching": ("scan_to_scan.on=false",),
-    "loop closures of sub-maps": ("loop_closure.rounds=0",),
-    "free space of closures": ("loop_closure.through=1",),
-    "joint refinement": ("refinement.rounds=0",),
-    "second scan per keyframe": ("keyframes.scans=1",),
-    "corners": ("clouds.linearity=0.85",),
-    "deskewing": ("deskew",),
-}
-"""What is left out, and how; 'deskew' is done to the recording: all rays of a sweep at its middle."""
-
-
 @dataclass(frozen=True)
 class Task:
     """A recording, simulated and read once, and the settings to map it with."""
@@ -141,23 +115,13 @@ class Task:
     """Changes common to all, from --set."""
 
 
-def flat(log: SensorLog) -> SensorLog:
-    """Return the recording as if all rays of a sweep had been taken at its middle."""
-    scans = log.scans
-    if scans is None:
-        return log
-    middle = scans.stamps + 0.5 * scans.time_increment * (scans.ranges.shape[1] - 1)
-    return replace(log, scans=replace(scans, stamps=middle, time_increment=0.0))
-
-
 def work(task: Task) -> list[tuple[str, str, Figures]]:
     """Make all maps of a recording and compare them with the truth."""
     trial = made(task.settings)
     done = []
     for name, changes in task.runs:
-        log = flat(trial.log) if "deskew" in changes else trial.log
-        config = override(MappingConfig(), (*task.also, *(c for c in changes if c != "deskew")))
-        done.append((task.name, name, judged(build_map(log, config, clock=time.perf_counter), trial)))
+        config = override(MappingConfig(), (*task.also, *changes))
+        done.append((task.name, name, judged(build_map(trial.log, config, clock=time.perf_counter), trial)))
     return done
 
 
@@ -311,9 +275,6 @@ def fusion(args: argparse.Namespace) -> str:
 
 REAL = {"plaza1": 0.30, "labyrinth": 0.20, "intel_raw": 0.11, "carmen/freiburg-101": 0.055, "carmen/belgioioso": 0.195}
 """m, bars on the ATE; the references of the last three are estimates of other SLAM programs."""
-MIRRORED = ("labyrinth",)
-"""Recordings that are doubted with reason, and judged up to the mirror image: without lidar the odometry's turns alone decide
-between the two, and here they are counted the other way round (tests/test_mapping.py)."""
 KASDORF = "kasdorf_2017-11-17-12-31-28"
 
 
@@ -329,7 +290,7 @@ def real(args: argparse.Namespace) -> str:
         truth = true_path(folder, log)
         wheels = evaluate_trajectory(log.odometry.stamps, log.odometry.poses, *truth, max_gap=30.0).ate.rmse
         seeds = range(1 + (args.perturb if log.scans is not None else 0))
-        runs = [raw_error(folder, perturbed(log, seed), config, truth) for seed in seeds]
+        runs = [_error(folder, perturbed(log, seed), config, truth) for seed in seeds]
         for seed, (error, doubts) in enumerate(runs):
             print(f"{name}, perturbed {seed}: {error:.4f} {', '.join(doubts)}", file=sys.stderr, flush=True)
         bars = [REAL[name] * (PERTURBED if seed else 1.0) for seed in seeds]
@@ -338,6 +299,14 @@ def real(args: argparse.Namespace) -> str:
     text = table(["recording", "odometry ATE", "ATE", "bar", "kept", *PERTURBED_HEAD, "doubts"], rows)
     more = "" if args.only else "\n" + halves(config)
     return f"## Recordings of others\n\nDefaults, from the raw logs; m. {PERTURBATION}\n\n{text}{more}"
+
+
+def _error(
+    folder: Path, log: SensorLog, config: MappingConfig, truth: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, list[str]]:
+    """Return the error of the map of a recording against the truth, m, and the kinds of its doubts."""
+    result = build_map(log, config)
+    return real_error(folder, log, result, truth), [finding.kind for finding in result.doubts]
 
 
 BENCHMARK = {
@@ -414,17 +383,6 @@ def benchmark(args: argparse.Namespace) -> str:
     )
 
 
-def true_path(folder: Path, log: SensorLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps and poses of the reference."""
-    for name in ("truth.tum", "truth_position.tum"):
-        if (folder / name).exists():
-            return read_tum(folder / name)
-    assert log.scans is not None
-    rows = np.loadtxt(folder / "reference_poses_matched.csv", delimiter=",", skiprows=1)
-    # Its steps count the scans of this log; its scan index those of the thinned log it was matched with.
-    return log.scans.stamps[rows[:, 0].astype(int)], rows[:, 2:5]
-
-
 def halves(config: MappingConfig) -> str:
     """Return how the anchors' biases of the two halves of a recording agree."""
     log = read_log(SHARED / KASDORF / "run.log.gz")
@@ -450,93 +408,6 @@ def halves(config: MappingConfig) -> str:
         "at the anchors' places in the whole map; the last two columns are of maps of either half alone.\n\n"
         + table(["anchor", "whole", "first half", "second half", "difference", "first alone", "second alone"], rows)
     )
-
-
-def ablation(args: argparse.Namespace) -> str:
-    """Leave each ingredient out in turn; return the tables and what buys nothing."""
-    names = asked(args, list(ABLATION_RECORDINGS))
-    runs = tuple(INGREDIENTS.items())
-    tasks = [
-        Task(n, replace(ABLATION_RECORDINGS[n], seed=args.seed, minutes=6.0 if args.quick else None), runs, tuple(args.set))
-        for n in names
-    ]
-    found = {(drive, run): f for rows in follow(tasks, args) for drive, run, f in rows}
-    base = next(iter(INGREDIENTS))
-    text = ""
-    for title, value in (("ATE", lambda f: f.ate), ("anchors", lambda f: f.anchors)):
-        rows = [[run, *(value(found[n, run]) for n in names)] for run in INGREDIENTS]
-        text += f"\n{title}, m:\n\n" + table(["left out", *names], rows)
-    useless = []
-    for run in INGREDIENTS:
-        worse = [
-            n for n in names
-            if found[n, run].ate > 1.05 * found[n, base].ate or found[n, run].anchors > 1.05 * found[n, base].anchors
-        ]
-        if run != base and not worse:
-            useless.append(run)
-    verdict = (
-        f"Buys nothing on any of these recordings (less than a twentieth in ATE and anchors): {', '.join(useless) or 'none'}."
-    )
-    length = ", recordings of 6 min" if args.quick else ""
-    return f"## What each ingredient buys\n\nEach left out in turn, seed {args.seed}{length}.\n{text}\n{verdict}"
-
-
-WITHOUT_RADIO = (
-    "nothing (the defaults)", "calibration of the wheels", "calibration of the laser's place", "calibration of the clocks",
-    "robust kernels of wheels and ranges", "scan-to-scan matching", "loop closures of sub-maps", "free space of closures",
-    "joint refinement", "second scan per keyframe", "corners", "deskewing",
-)  # fmt: skip
-"""Ingredients that matter to recordings of wheels and lidar."""
-RAW = ("kummerle/mit-csail", "kummerle/fr079", "intel_raw", "carmen/freiburg-101", "carmen/belgioioso")
-RAW_SIMULATED = {
-    "hall, bad wheels": Settings(world="hall", seed=10, minutes=4.0, rooms=RealRooms(), odometry_scale=2.0, slips=3),
-    "warehouse": Settings(world="warehouse", seed=7, minutes=6.0, rooms=RealRooms()),
-    "arena": Settings(world="arena", seed=7, minutes=6.0, rooms=RealRooms(), speed=0.4),
-}
-"""Buildings with errors of real rooms, mapped without their ranges."""
-
-
-def raw(args: argparse.Namespace) -> str:
-    """Leave each ingredient out in turn on recordings without a radio; return the table."""
-    names = [n for n in asked(args, (*RAW, *RAW_SIMULATED)) if n in RAW_SIMULATED or (SHARED / n).is_dir()]
-    found = {}
-    for name in names:
-        trial = made(RAW_SIMULATED[name]) if name in RAW_SIMULATED else None
-        log = read_log(SHARED / name / "run.log.gz") if trial is None else trial.log
-        truth = None if trial is None else (trial.stamps, trial.poses)
-        for run in WITHOUT_RADIO:
-            changes = INGREDIENTS[run]
-            config = override(MappingConfig(), ("use_uwb=false", *args.set, *(c for c in changes if c != "deskew")))
-            error, doubts = raw_error(SHARED / name, flat(log) if "deskew" in changes else log, config, truth)
-            found[run, name] = f"{error:.3f}{' *' if doubts else ''}"
-            print(f"{name}, without {run}: {found[run, name]}", file=sys.stderr, flush=True)
-    rows = [[run, *(found[run, n] for n in names)] for run in WITHOUT_RADIO]
-    text = table(["left out", *(Path(n).name for n in names)], rows)
-    return (
-        "## What each ingredient buys without a radio\n\nWheels and lidar alone, defaults otherwise; m: mean error over "
-        "relations (mit-csail, fr079), ATE against the reference\n(the other recordings of others), true ATE (simulated: hall, "
-        "warehouse, arena). * = doubted.\n\n" + text
-    )
-
-
-def raw_error(
-    folder: Path, log: SensorLog, config: MappingConfig, truth: tuple[np.ndarray, np.ndarray] | None = None
-) -> tuple[float, list[str]]:
-    """Return the error of the map of a recording, m, by relations where there are any, and the kinds of its doubts.
-
-    truth : stamps and poses of the reference; None = those of the folder, whose steps count all scans.
-    """
-    result = build_map(log, config)
-    doubts = [notice.kind for notice in result.doubts]
-    if (folder / "truth.relations.gz").exists():
-        relations = Relations(*read_relations(folder / "truth.relations.gz"))
-        delay = result.graph.calibration.get("laser_delay")
-        return evaluate_relations(result.stamps, result.trajectory, relations, delay).translations.mean, doubts
-    truth = true_path(folder, log) if truth is None else truth
-    sides = [(1.0, 1.0, 1.0), (1.0, -1.0, -1.0)][: 2 if folder.name in MIRRORED else 1]
-    # Some of them have one odometry pose in many seconds.
-    errors = [evaluate_trajectory(result.stamps, result.trajectory * side, *truth, max_gap=30.0).ate.rmse for side in sides]
-    return min(errors), doubts
 
 
 def injection(args: argparse.Namespace) -> str:
@@ -590,8 +461,6 @@ def solved(graph: Graph, trial: Trial, stamps: np.ndarray) -> float:
 
 NAMES = {
     "simulated": ROWS, "oracle": ORACLE_ROWS, "fusion": FUSION_ROWS, "real": REAL, "benchmark": BENCHMARK,
-    "ablation": ABLATION_RECORDINGS,
-    "raw": (*RAW, *RAW_SIMULATED),
 }  # fmt: skip
 """Recordings of each part."""
 
@@ -605,14 +474,14 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--out", type=Path, default=ROOT / "docs" / "lab" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings per row (3)")
-    p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation, first of fusion (1)")
+    p.add_argument("--seed", type=int, default=1, metavar="N", help="first seed of fusion (1)")
     p.add_argument("--only", default="", metavar="NAMES", help="recordings, separated by commas")
     p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     p.add_argument("--perturb", type=int, default=0, metavar="N", help="perturbed runs of each benchmark recording (0)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
-    parts = (simulated, oracles, fusion, real, benchmark, ablation, raw, injection)
+    parts = (simulated, oracles, fusion, real, benchmark, injection)
     made_by = dict(zip(PARTS, parts, strict=True))
     if not args.print and not args.out.exists():
         args.out.write_text(HEAD)

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from simulation.laser import NARROW, RIGHT_ANGLE, SPINNING, UNSTATED
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings
 from trials import ROOT, Trial, made, spread_out, table, write_section
@@ -55,6 +56,15 @@ RECORDINGS = {
     "arena, nearly empty": Settings(world="arena", speed=0.4),
     "hall, bad wheels": Settings(world="hall", odometry_scale=2.0),
     "hall, bad radio": Settings(world="hall", nlos="heavy", nlos_anchors=(3, 4), outliers=0.03),
+    "rotunda": Settings(world="rotunda"),
+    "orchard": Settings(world="orchard"),
+    "supermarket": Settings(world="supermarket"),
+    "shed": Settings(world="shed"),
+    "hall, spinning lidar": Settings(world="hall", laser=SPINNING),
+    "hall, time of rays not stated": Settings(world="hall", laser=UNSTATED),
+    "lab, time of rays not stated": Settings(world="lab", laser=UNSTATED),
+    "lab, 120 deg": Settings(world="lab", laser=NARROW),
+    "lab, 90 deg": Settings(world="lab", laser=RIGHT_ANGLE),
     **{f"hall, {name}": Settings(world="hall", **changes) for name, changes in SENSORS.items()},
 }
 LONGER = {"warehouse": 3.0}

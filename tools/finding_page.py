@@ -31,7 +31,8 @@ A finding says what is wrong in a recording, in a map or in a live pose. Its kin
 scripts (`kind` in `report.json` and in `--json`). A **doubt** is a reason not to trust the result: the files are written and
 the exit code is 3. A **warning** was repaired or costs accuracy; a **note** is good to know. No rule takes back what another
 found; what is a consequence of another finding names it (`explained_by`) and is told below it. Where a doubt is about stretches
-of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states.
+of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states. Settings and
+arguments stand in backticks; the command line puts its options there.
 
 *Planted faults* are those of `tools/faults.py` in a simulated laboratory and in a real recording: the faults after which this
 kind was the only doubt. A kind without such a fault is named by other rules at the same time, or needs a recording of another

@@ -145,7 +145,7 @@ def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     folder = tmp_path / "map"
     check_target(folder, force=False)
     write_result(folder, [small_log()], small_result(), RECORD)
-    with pytest.raises(ConfigError, match="--force"):
+    with pytest.raises(ConfigError, match="`force`"):
         check_target(folder, force=False)
     check_target(folder, force=True)
     with pytest.raises(ConfigError, match="not a folder"):
@@ -190,7 +190,7 @@ def killed_behind(what, folder):
 
 
 @pytest.mark.usefixtures("small_picture")
-@pytest.mark.parametrize("what", ["write_png", "write_pyfg", "_write_trajectories", "render", "summary"])
+@pytest.mark.parametrize("what", ["write_png", "write_pyfg", "write_tum", "render", "summary"])
 @pytest.mark.parametrize("fresh", [True, False])
 def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
     folder = tmp_path / "map"

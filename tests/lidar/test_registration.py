@@ -15,10 +15,10 @@ SIGMA = 0.02
 SOUND, SLIPPED = np.array([0.01, 0.01, 0.01]), np.array([0.4, 0.4, 0.3])
 
 
-def registered(clouds, mean, sound=SOUND):
+def registered(clouds, mean, sound=SOUND, slipped=SLIPPED):
     """Register cloud 1 in cloud 0 where the odometry counts a motion."""
     covariance, raster = np.diag(sound**2)[None], rasterize(clouds, 0.1, 0.5)
-    prior = Prior(np.array([mean]), covariance, covariance + np.diag(SLIPPED**2))
+    prior = Prior(np.array([mean]), covariance, covariance + np.diag(slipped**2))
     one, points = np.array([0]), pair_points(clouds, np.array([1]), 150)
     chance = matched_by_chance(clouds, raster, one, points, prior.mean)
     registration = Registration(clouds, raster, nearest_by_bearing(clouds), SIGMA, chance)
@@ -40,6 +40,15 @@ def test_clouds_tell_a_slip_from_none(room, slip, sign):
     assert sign * found.log_odds[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
     (pose,) = found.chosen(np.array([float(sign > 0)])).pose
     assert np.abs(se2.between(step, pose)).max() < 0.015
+
+
+def test_a_search_is_no_wider_than_clouds_can_overlap(room):
+    """Wheels that count 24 m over one step: the window of two such slips would have a billion poses."""
+    truth, clouds = room
+    step = se2.between(truth[0], truth[1])
+    *_, found = registered(clouds, np.array([24.0, -3.0, 0.4]), slipped=np.array([24.5, 24.5, 0.6]))
+    assert found.log_odds[0] > 0.0
+    assert np.abs(se2.between(step, found.slipped.pose[0])).max() < 0.015
 
 
 def test_what_is_measured_leaves_the_prior_out(room):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.loop_closure.candidates import Candidates, _among, _best_per_submap, _near, missed, uncertain
+from uwblite.loop_closure.candidates import Candidates, _among, _best_per_submap, _near, missed, overlap_probability, uncertain
 from uwblite.loop_closure.closures import LoopClosureConfig
 
 
@@ -47,6 +47,25 @@ def test_pairs_that_may_be_tried_are_those_of_a_loop(seed):
             if apart < config.reach + config.search_limit and (b - a > 1 or recording[a] != recording[b]):
                 expected.append((a, b, pytest.approx(apart)))
     assert list(zip(*(part.tolist() for part in _near(poses, recording, config)), strict=True)) == expected
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_probability_of_an_overlap_is_about_the_share_of_draws_within_reach(seed):
+    """Where the uncertainty is larger than the reach, which is where it orders the pairs; likelier ones come first."""
+    rng, reach = np.random.default_rng(seed), 15.0
+    root = np.diag(rng.uniform(15.0, 40.0, 2)) @ rng.standard_normal((2, 2))
+    covariance = np.zeros((2, 3, 3))
+    covariance[:, :2, :2] = root @ root.T + 100.0 * np.eye(2)
+    guess = np.column_stack([rng.uniform(-40.0, 40.0, (2, 2)), np.zeros(2)])
+    draws = rng.multivariate_normal(np.zeros(2), covariance[0, :2, :2], 20_000)
+    shares = [np.mean(np.hypot(*(draws + g[:2]).T) < reach) for g in guess]
+    np.testing.assert_allclose(overlap_probability(guess, covariance, reach), shares, rtol=0.25, atol=0.02)
+
+
+def test_the_overlap_of_a_certain_pair_is_certain():
+    near = overlap_probability(np.array([[1.0, 0.0, 0.5], [60.0, 0.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)), 15.0)
+    assert near[0] > 0.98
+    assert near[1] < 1e-6
 
 
 @pytest.mark.parametrize(("sigma", "found"), [(1.0 / 3.0 + 1e-6, True), (1.0 / 3.0 - 1e-6, False)])

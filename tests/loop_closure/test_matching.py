@@ -70,6 +70,7 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
 
     monkeypatch.setattr(matching, "search", search)
     monkeypatch.setattr(matching, "_prepare", lambda clouds, k, prepared: k)
+    monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
     spread = np.array([config.direct, 1.0, 2.0, config.search_limit + 1.0])
     sigma = np.array([1.0, 0.01, 0.1, 9.0])
     candidates = SimpleNamespace(
@@ -83,3 +84,26 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
     assert steps == [fine, fine, coarse]
     assert rows.tolist() == [0] + [1] * config.places + [2] * config.places + [3] * matching._MANY_PLACES
     np.testing.assert_array_equal(guesses, candidates.guess[rows])
+
+
+@pytest.mark.parametrize("guess", [(0.0, 0.0, 0.2), (35.0, -80.0, 1.0), (-4.0, 15.0, 0.0)])
+def test_a_search_leaves_out_only_places_at_which_two_clouds_do_not_overlap(guess):
+    """Of places all over the uncertainty, those left out have less than a twentieth of the points within the other's extent."""
+    rng, half_width = np.random.default_rng(0), 100.0
+    target = scanned(np.array([[0.0, 0.0, 0.0]]), HALL)
+    source = scanned(np.array([[2.0, 1.0, 0.7]]), HALL)
+    centre, (wide, tall, turn) = matching._window(np.array(guess), half_width, 0.4, target, source)
+    assert (centre[2], turn) == (guess[2], 0.4)
+    assert wide * tall < half_width**2 / 4.0
+    places = np.array(guess) + rng.uniform(-1.0, 1.0, (2000, 3)) * [half_width, half_width, np.pi]
+    out = np.any(np.abs(places - centre)[:, :2] > [wide, tall], axis=1)
+    low, high = np.quantile(target.points, [0.05, 0.95], axis=0)
+    for place in places[out]:
+        points = se2.transform(place, source.points)
+        assert np.mean(np.all((points > low) & (points < high), axis=1)) <= 0.05
+
+
+def test_where_clouds_cannot_overlap_nothing_is_searched():
+    cloud = scanned(np.array([[0.0, 0.0, 0.0]]), HALL)
+    _, half_widths = matching._window(np.array([900.0, 0.0, 0.0]), 10.0, 0.1, cloud, cloud)
+    assert half_widths[0] == 0.0

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OCCUPIED, OccupancyGrid
-from uwblite.navigation import steps
+from uwblite.navigation import regions, steps
 from uwblite.navigation.planner import NoPathError, make_planner
 from uwblite.navigation.steps import STEPS
 
@@ -98,7 +98,8 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     grid.log_odds[20:30, 20:26] = 0.0
     whole = make_planner(grid, RADIUS, unknown="price")
     monkeypatch.setattr(steps, "_AT_ONCE", 5000)
-    monkeypatch.setattr(steps, "_BLOCK", block[0])
+    for module in (steps, regions):
+        monkeypatch.setattr(module, "BLOCK", block[0])
     parts = make_planner(grid, RADIUS, unknown="price")
     assert parts.steps.regions is not None
     nodes = whole.steps.nodes()

@@ -91,6 +91,22 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     assert reestimate_wheel_noise(wheels, few, graph) is wheels
 
 
+def test_errors_that_telescope_are_not_the_wheels():
+    """Clouds that are turned each by itself, four times the wheels' noise of a step, are in two steps with opposite signs."""
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    exact = wheel_edges(frames, NOISE, Calibration())
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    turned = np.concatenate([np.zeros((1, 3)), rng.standard_normal((len(exact), 3)) * [0.0, 0.0, 4.0 * np.median(sigma[:, 2])]])
+    wheels = replace(exact, motion=se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma))
+    steps = RelativePoseEdges(exact.i, exact.j, exact.motion + np.diff(turned, axis=0), 10.0 * exact.end_sqrt_information)
+    learnt = reestimate_wheel_noise(wheels, steps, Graph(frames.odometry))
+    factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
+    # Of the sum over eight steps, two of 4 sigma are left of the clouds: a variance of 8 + 32 for 8.
+    assert factor == pytest.approx([1.0, 1.0, np.sqrt(5.0)], rel=0.25)
+
+
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     """Steps in a corridor repeat what the wheels count along it; across and in heading the wheels err four times as much."""
     rng = np.random.default_rng(2)

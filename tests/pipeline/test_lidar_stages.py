@@ -85,3 +85,19 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     monkeypatch.setattr(lidar_stages, "_matched_once_more", matched)
     assert lidar_stages.solve_by_own_errors(estimate, task) is estimate
     assert " ".join(made) == done
+
+
+def test_pairs_of_one_visit_do_not_lead_across_a_step_that_clouds_measure_falsely(monkeypatch):
+    """Those between visits do: their clouds are compared at the poses that everything else gives."""
+    i, j = np.array([0, 2, 3, 3, 4, 0]), np.array([1, 4, 4, 5, 5, 9])
+    monkeypatch.setattr(lidar_stages.joint_refinement, "choose_pairs", lambda *_: (i, j))
+    rejected = np.arange(10) == 3
+    estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=None), rejected=rejected)
+    task = SimpleNamespace(
+        recordings=SimpleNamespace(path=None, of_keyframe=None), allowed=lambda i, j: np.ones(len(i), dtype=bool)
+    )
+    graph, settings = SimpleNamespace(poses=None), MappingConfig().refinement
+    kept = lidar_stages._pairs(estimate, graph, settings, task)
+    assert list(zip(*(part.tolist() for part in kept), strict=True)) == [(0, 1), (4, 5), (0, 9)]
+    estimate.rejected = None
+    assert len(lidar_stages._pairs(estimate, graph, settings, task)[0]) == len(i)

@@ -1,8 +1,11 @@
 """The tools that measure: normalised errors of known covariances, recordings with fewer anchors, pages written in sections."""
 
+import importlib
+import inspect
 from dataclasses import replace
 from pathlib import Path
 
+import ablation
 import accuracy
 import consistency
 import numpy as np
@@ -99,15 +102,13 @@ def test_fewer_anchors_are_as_if_the_others_had_not_been_there(trial):
 
 
 def test_rays_can_be_given_as_of_one_time(trial):
-    flat = accuracy.flat(trial.log).scans
+    flat = ablation.flat(trial.log).scans
     middle = trial.log.scans.stamps + 0.5 * trial.log.scans.time_increment * (trial.log.scans.ranges.shape[1] - 1)
     np.testing.assert_allclose(flat.stamps, middle)
     assert flat.time_increment == 0.0
 
 
 def test_every_setting_that_the_tools_change_exists():
-    for changes in accuracy.INGREDIENTS.values():
-        override(MappingConfig(), [c for c in changes if c != "deskew"])
     for row in accuracy.ROWS.values():
         override(MappingConfig(), row.changes)
     args = type("Args", (), {"quick": False, "seeds": 1})()
@@ -144,9 +145,39 @@ def test_tables_report_what_is_not_known():
     assert trials.table(["a", "b"], [[1, float("nan")], ["x", 0.12345]]) == "| a | b |\n|---|---|\n| 1 | - |\n| x | 0.123 |\n"
 
 
-def test_what_is_left_out_of_recordings_of_others_has_settings():
-    assert set(accuracy.WITHOUT_RADIO) <= set(accuracy.INGREDIENTS)
-    assert accuracy.WITHOUT_RADIO[0] == next(iter(accuracy.INGREDIENTS))
+@pytest.mark.parametrize("name", list(ablation.INGREDIENTS)[1:])
+def test_every_ingredient_that_the_ablation_leaves_out_exists(name):
+    """Its settings are settings, and its functions are functions, which stand again afterwards."""
+    how = ablation.INGREDIENTS[name]
+    override(MappingConfig(), how.settings)
+    assert how.settings or how.patches or how.log is not None
+
+    def present():
+        found = []
+        for where, _ in how.patches:
+            module, _, function = where.rpartition(".")
+            found.append(getattr(importlib.import_module(f"uwblite.{module}"), function))
+        return found
+
+    before = present()
+    with ablation.left_out(name):
+        assert not any(own is other for own, other in zip(present(), before, strict=True))
+        for other, own in zip(present(), before, strict=True):
+            inspect.signature(other).bind(*inspect.signature(own).parameters)
+    assert all(own is other for own, other in zip(present(), before, strict=True))
+
+
+def test_the_ablation_names_the_worst_tenth_and_new_doubts():
+    base, other = list(ablation.INGREDIENTS)[:2]
+    found = {
+        (name, 1, without): ablation.Outcome(error * (1.0 if without == base else factor), nan, nan, doubts * (without != base))
+        for name, error, factor, doubts in (("lab", 0.01, 1.0, ()), ("hall", 0.02, 4.0, ("uncertain",)))
+        for without in (base, other)
+        for nan in [float("nan")]
+    }
+    row = next(line for line in ablation.document(found).splitlines() if line.startswith(f"| {other} "))
+    assert row.split("|")[2:6] == [" 2 ", " 2.00 ", " 4.00 ", " hall 0.020 -> 0.080 "]
+    assert row.split("|")[-2] == " 1 "
 
 
 def test_perturbed_runs_of_a_recording_are_one_row():

@@ -19,6 +19,8 @@ class LaserModel:
     """rad; 1024 steps a turn."""
     time_increment: float = 0.1 / 1024.0
     """s between rays."""
+    stated: bool = True
+    """Whether the log states the time between rays."""
     max_range: float = 5.6
     min_range: float = 0.02
     near_sd: float = 0.010
@@ -49,11 +51,20 @@ class LaserModel:
 SPINNING = LaserModel(
     beams=450, first_step=-225, increment=2.0 * np.pi / 450.0, time_increment=0.0, max_range=8.0, surface_sd=0.008
 )
-"""A turn of 0.8 deg rays, as of an LD06, without stamps of single rays."""
+"""A turn of 0.8 deg rays, as of an LD06, as if all were of one time."""
+UNSTATED = LaserModel(
+    beams=360, first_step=-180, increment=2.0 * np.pi / 360.0, time_increment=0.1 / 360.0, stated=False, max_range=8.0,
+    surface_sd=0.008,
+)
+"""A turn of 360 rays in 0.1 s, in a log that does not say so."""
 NARROW = LaserModel(
     beams=160, first_step=-80, increment=np.deg2rad(0.75), time_increment=0.0, max_range=4.0
 )
 """120 deg and 4 m."""
+RIGHT_ANGLE = LaserModel(
+    beams=180, first_step=-90, increment=np.deg2rad(0.5), time_increment=0.0, max_range=8.0
+)
+"""90 deg and 8 m."""
 
 
 def cast(

@@ -58,6 +58,8 @@ def log_lines(recording: Recording) -> Iterator[bytes]:
         "uwb_tag_offset_x": f"{settings.tag[0]:.3f}",
         "uwb_tag_offset_y": f"{settings.tag[1]:.3f}",
     }
+    if not settings.laser.stated:
+        del params["laser_time_increment"]
     if settings.write_heights:
         params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
     yield b"# CARMEN Logfile\n"

@@ -215,7 +215,7 @@ def check_closures(
         yield add("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
-        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them in uwblite view"
+        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them"
         yield doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
@@ -276,7 +276,7 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
             wrong = factor < 0.0
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
-                "is the laser upside down (--laser-flipped), or has the odometry's heading the wrong sign?"
+                "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
             )
         else:
             wrong = True

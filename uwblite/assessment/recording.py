@@ -143,7 +143,7 @@ def _check_sensors(view: RecordingView) -> Iterator[Finding]:
         cure = "the map rests on wheels and lidar; check the tag if that is not meant"
         if log.notes.unread:
             unread = ", ".join(log.notes.unread)
-            cure = f"there may be some in what was not read: {unread}; --uwb-mapping says where (see above)"
+            cure = f"there may be some in what was not read: {unread}; `mappings` say where (see above)"
         yield Finding("no-ranges", NOTE, "there are no UWB ranges", cure, "radio")
     if "lidar" not in view.figures:
         cure = "there will be a trajectory and anchors, but no map"

@@ -190,7 +190,7 @@ def laser_turned_over(flipped: bool) -> Finding:
     text = (
         "laser and wheels turn in opposite directions: the laser was taken as mounted "
         f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
-        f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
+        f"settle it by {'' if flipped else 'leaving out '}`mounting.laser_flipped`, or by the odometry's sign"
     )
     return doubt("laser-turned-over", text)
 
@@ -199,7 +199,7 @@ def laser_turned_away(degrees: float, pose: Sequence[float]) -> Finding:
     """Warn of a laser that looks elsewhere than its pose says, by the motion that it and the wheels measure."""
     text = (
         f"the laser's direction differs by {degrees:+.0f} degrees from its given pose, by the motion that both "
-        f"measure; corrected: --laser-pose={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}"
+        f"measure; corrected: `mounting.T_base_laser={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}`"
     )
     return warning("laser-turned-away", text)
 

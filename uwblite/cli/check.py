@@ -153,7 +153,8 @@ def _counts(figures: dict[str, Any]) -> str:
     parts = [f"{span}, {odometry['path m']:.1f} m by {readings}"]
     parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
     if "uwb" in figures:
-        parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")
+        many = len(figures["uwb"]["anchors"])
+        parts.append(f"{figures['uwb']['count']} ranges to {many} anchor{'s' if many != 1 else ''}")
     if "lidar" in figures:
         lidar = figures["lidar"]
         parts.append(

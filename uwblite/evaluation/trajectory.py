@@ -65,14 +65,8 @@ class AnchorErrors:
 
 def statistics(errors: Floats) -> ErrorStatistics:
     """Return the figures of the errors (n,), n >= 1."""
-    return ErrorStatistics(
-        rmse=float(np.sqrt(np.mean(errors**2))),
-        mean=float(np.mean(errors)),
-        median=float(np.median(errors)),
-        std=float(np.std(errors)),
-        max=float(np.max(errors)),
-        count=len(errors),
-    )
+    rmse, mean, median = float(np.sqrt(np.mean(errors**2))), float(np.mean(errors)), float(np.median(errors))
+    return ErrorStatistics(rmse, mean, median, float(np.std(errors)), float(np.max(errors)), len(errors))
 
 
 def evaluate_trajectory(

@@ -5,8 +5,8 @@ A message whose definition cannot be read matters only where somebody wants its 
 
 import heapq
 import os
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,6 @@ from .bag_topics import BagTopic
 from .optional_packages import missing_package
 
 _KINDS = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
-_PARTS = (".mcap", ".db3", ".bag")
-"""Endings of the files of a bag's folder."""
 _PACKED = b"\x28\xb5\x2f\xfd"
 
 
@@ -55,8 +53,7 @@ class OpenBag:
                     why = self.unreadable.get(c.msgtype, "the bag does not hold it")
                     raise FormatError(f"the definition of {c.msgtype}, on {c.topic}, cannot be read: {why}")
             # An empty choice would stand for all.
-            if wanted:
-                parts.append(reader.messages(connections=wanted))
+            parts += [reader.messages(connections=wanted)] if wanted else []
         decode = self._store.deserialize_ros1 if self.ros1 else self._store.deserialize_cdr
         for connection, time, raw in heapq.merge(*parts, key=lambda row: row[1]):
             yield connection.topic, time, decode(raw, connection.msgtype)
@@ -79,21 +76,24 @@ class OpenBag:
 
         known = get_typestore(Stores.ROS2_HUMBLE)  # for bags that do not carry the definitions of their messages
         store = get_typestore(Stores.EMPTY)
-        stated = {c.msgtype: c for c in self.connections if c.msgdef.format != MessageDefinitionFormat.NONE}
+        stated = {c.msgtype: c.msgdef for c in self.connections if c.msgdef.format != MessageDefinitionFormat.NONE}
         for kind in sorted({c.msgtype for c in self.connections}):
             try:
-                if (c := stated.get(kind)) is None:
+                if (definition := stated.get(kind)) is None:
                     types = {name: known.fielddefs[name] for name in _with_parts(kind, known.fielddefs)}
-                elif c.msgdef.format == MessageDefinitionFormat.MSG:
-                    types = get_types_from_msg(c.msgdef.data, kind)
+                elif definition.format == MessageDefinitionFormat.MSG:
+                    types = get_types_from_msg(definition.data, kind)
                 else:
-                    types = _types_of_idl(c.msgdef.data, get_types_from_idl)
+                    # Definitions stand one behind the other, each below a line of = and one with its name.
+                    line, text = "=" * 80 + "\n", definition.data
+                    parts = [p.split("\n", 1)[1] for p in text.split(line)[1:]] if text.startswith(f"{line}IDL: ") else [text]
+                    types = {name: how for part in parts for name, how in get_types_from_idl(part).items()}
                 # One name may have stood for two things in the course of a recording: the first counts.
                 store.register({name: how for name, how in types.items() if name not in store.fielddefs})
             except KeyError:
                 self.unreadable[kind] = "the bag does not hold it"
             except Exception as error:  # the parser has errors of many kinds for what is no definition
-                self.unreadable[kind] = " ".join(str(error).split())[:100] or type(error).__name__
+                self.unreadable[kind] = _words(error, 100)
         return store
 
 
@@ -106,22 +106,17 @@ def _with_parts(kind: str, fielddefs: Any) -> list[str]:
     """
     found, left = list[str](), [kind]
     while left:
-        name = left.pop()
-        if name in found:
-            continue
-        found.append(name)
-        for _, (node, detail) in fielddefs[name][1]:
-            inner = detail if node.name == "NAME" else detail[0][1] if node.name not in ("BASE",) else None
-            if isinstance(inner, str):
-                left.append(inner)
+        if (name := left.pop()) not in found:
+            found.append(name)
+            for _, (node, detail) in fielddefs[name][1]:
+                inner = detail if node.name == "NAME" else detail[0][1] if node.name != "BASE" else None
+                left += [inner] if isinstance(inner, str) else []
     return found
 
 
-def _types_of_idl(text: str, parse: Callable[[str], Any]) -> Any:
-    """Return the types of definitions in IDL, one behind the other."""
-    line = "=" * 80 + "\n"
-    parts = [part.split("\n", 1)[1] for part in text.split(line)[1:]] if text.startswith(f"{line}IDL: ") else [text]
-    return {name: how for part in parts for name, how in parse(part).items()}
+def _words(error: Exception, most: int) -> str:
+    """Return the words of another package's error on one line."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
 
 
 @contextmanager
@@ -157,7 +152,7 @@ def open_bag(path: str | os.PathLike[str]) -> Iterator[OpenBag]:
 
 
 def _damaged(error: Exception, name: str) -> str:
-    detail = " ".join(str(error).split())[:200]
+    detail = _words(error, 200)
     text = f"cannot be read as a ROS bag: it is damaged ({type(error).__name__}: {detail})"
     if "database disk image is malformed" in detail:
         text += f"; sqlite3 {os.path.basename(name)} .recover | sqlite3 saved.db3 saves what can be read"
@@ -166,14 +161,10 @@ def _damaged(error: Exception, name: str) -> str:
 
 def _opened(path: Path, stack: ExitStack) -> OpenBag:
     notes = list[str]()
-    if path.is_dir():
-        readers = _of_folder(path, stack, notes)
-        ros1 = any(reader.path.suffix == ".bag" for reader in readers)
-    else:
-        readers, ros1 = [_of_file(path, stack, notes)], _kind(path) == ".bag"
-    bag = OpenBag(readers, ros1, notes)
+    readers = _of_folder(path, stack, notes) if path.is_dir() else [_of_file(path, stack, notes)]
+    bag = OpenBag(readers, any(reader.path.suffix == ".bag" for reader in readers), notes)
     if notes:
-        bag.notes[0] = f"{notes[0]}; what is complete, {bag.seconds():.0f} s, was read"
+        notes[0] = f"{notes[0]}; what is complete, {bag.seconds():.0f} s, was read"
     return bag
 
 
@@ -186,8 +177,8 @@ def _of_folder(folder: Path, stack: ExitStack, notes: list[str]) -> list[Any]:
         try:
             return [stack.enter_context(Reader(folder))]
         except Exception as error:
-            why = f"has a metadata.yaml that does not fit ({' '.join(str(error).split())[:120]})"
-    parts = sorted((p for p in folder.iterdir() if p.suffix in _PARTS), key=_number)
+            why = f"has a metadata.yaml that does not fit ({_words(error, 120)})"
+    parts = sorted((p for p in folder.iterdir() if p.suffix in _KINDS.values()), key=_number)
     packed = [p.name for p in folder.iterdir() if p.name.endswith(".zstd")]
     if not parts:
         cure = f"; unpack its parts first: zstd -d {packed[0]}" if packed else ""
@@ -211,15 +202,14 @@ def _number(path: Path) -> tuple[int, str]:
     return int(digits) if digits.isdigit() else -1, path.name
 
 
-def _kind(path: Path) -> str:
-    """Return the ending of the kind of a bag's file, by its first bytes; '' of what is none."""
-    with path.open("rb") as stream:
-        start = stream.read(16)
-    return next((ending for magic, ending in _KINDS.items() if start.startswith(magic)), "")
+class _NamedPath(type(Path())):  # type: ignore[misc]
+    """A path that ends as files of its kind do, whatever it is called."""
+
+    suffix = ""
 
 
 def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
-    """Return the reader of one file, mended where its recording was not closed.
+    """Return the reader of one file, told by its first bytes, of what is complete where its recording was not closed.
 
     Raises
     ------
@@ -228,59 +218,33 @@ def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-    if not (kind := _kind(path)):
-        raise _no_bag(path)
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    kind = next((ending for magic, ending in _KINDS.items() if start.startswith(magic)), "")
+    if not kind:
+        why = "it begins like none (ROS 1 .bag, .mcap or sqlite3 .db3); is it whole?" if start else "the file is empty"
+        if start.startswith(_PACKED):
+            why = f"it is packed; unpack it first: zstd -d {path.name}"
+        elif start and not start.strip(b"\0"):
+            why = "it holds zeros alone, as after a power failure"
+        raise FormatError(f"cannot be read as a ROS bag: {why}", str(path))
     reader: Any = Reader1 if kind == ".bag" else Reader2
     named = _NamedPath(path)
     named.suffix = kind
     if (log := path.with_name(path.name + "-wal")).exists() and log.stat().st_size:
         notes.append(f"the recording was not closed: {log.name} holds its end (sqlite3 {path.name} 'PRAGMA wal_checkpoint')")
+    # Other programs that mend a file; that of ROS 1 takes a name that ends in .bag alone.
+    whole = path.name.removesuffix(".active")
+    repair = f"{'' if whole == path.name else f'mv {path.name} {whole}, then '}rosbag reindex {whole}"
+    repair = f"mcap recover {path.name} -o whole.mcap" if kind == ".mcap" else repair
     try:
         return stack.enter_context(reader(named))
     except Exception as error:
-        unclosed = None if kind == ".db3" else UnclosedBag(named)
-        if unclosed is None or not unclosed.message_count:
-            raise _not_closed(path, kind, error) from None
-    notes.append(f"{path.name}: the recording was not closed (recorder killed, or power lost; {_repair(path, kind)} mends it)")
+        if kind == ".db3":
+            raise FormatError(_damaged(error, path.name), str(path)) from None
+        unclosed = UnclosedBag(named)
+        if not unclosed.message_count:
+            why = f"it was not closed, or is damaged ({_words(error, 120)}), and no message of it is complete"
+            raise FormatError(f"cannot be read as a ROS bag: {why}; {repair} may save more", str(path)) from None
+    notes.append(f"{path.name}: the recording was not closed (recorder killed, or power lost; {repair} mends it)")
     return unclosed
-
-
-class _NamedPath(type(Path())):  # type: ignore[misc]
-    """A path that ends as files of its kind do, whatever it is called."""
-
-    suffix = ""
-
-
-def _repair(path: Path, kind: str) -> str:
-    """Return the command of others that mends a file."""
-    if kind == ".mcap":
-        return f"mcap recover {path.name} -o whole.mcap"
-    # The command takes a name that ends in .bag alone.
-    whole = path.name.removesuffix(".active")
-    return f"{'' if whole == path.name else f'mv {path.name} {whole}, then '}rosbag reindex {whole}"
-
-
-def _not_closed(path: Path, kind: str, error: Exception) -> FormatError:
-    """Return the error of a file of which nothing can be read."""
-    if kind == ".db3":
-        return FormatError(_damaged(error, path.name), str(path))
-    detail = " ".join(str(error).split())[:120]
-    return FormatError(
-        f"cannot be read as a ROS bag: it was not closed, or is damaged ({detail}), and no message of it is complete;"
-        f" {_repair(path, kind)} may save more",
-        str(path),
-    )
-
-
-def _no_bag(path: Path) -> FormatError:
-    with suppress(OSError), path.open("rb") as stream:
-        start = stream.read(16)
-        if not start:
-            return FormatError("cannot be read as a ROS bag: the file is empty", str(path))
-        if start.startswith(_PACKED):
-            return FormatError(f"cannot be read as a ROS bag: it is packed; unpack it first: zstd -d {path.name}", str(path))
-        if not start.strip(b"\0"):
-            return FormatError("cannot be read as a ROS bag: it holds zeros alone, as after a power failure", str(path))
-    return FormatError(
-        "cannot be read as a ROS bag: it begins like none (ROS 1 .bag, .mcap or sqlite3 .db3); is it whole?", str(path)
-    )

@@ -85,16 +85,17 @@ def plan_topics(
     ------
     ConfigError : a topic that was asked for is not there or of another type, or a mapping of the user's matches nothing.
     """
-    odometry = asked.odometry
-    if not odometry or _topic(topics, odometry).type != TRANSFORMS:
-        wheels = [t for t in topics if not is_truth(t.name)]
-        odometry = _named(topics, odometry, ODOMETRY, "odometry") or _best(
-            wheels, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual")
-        )
-    scan = _named(topics, asked.scan, SCAN, "scans") or _best(topics, SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
-    imu = "" if asked.imu == NONE else _named(topics, asked.imu, IMU, "headings")
-    if not asked.imu:
-        imu = _best(topics, IMU, ("imu",), ("camera", "realsense", "zed", "oak", "head", "arm", "mag"))
+    wheels = [t for t in topics if not is_truth(t.name)]
+    by_tf = bool(asked.odometry) and _topic(topics, asked.odometry).type == TRANSFORMS
+    odometry = asked.odometry or _best(wheels, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual"))
+    scan = asked.scan or _best(topics, SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
+    imu = asked.imu or _best(topics, IMU, ("imu",), ("camera", "realsense", "zed", "oak", "head", "arm", "mag"))
+    imu = "" if imu == NONE else imu
+    for name, kind, what in ((odometry, ODOMETRY, "odometry"), (scan, SCAN, "scans"), (imu, IMU, "headings")):
+        if name and not (by_tf and name == odometry) and (given := _topic(topics, name)).type != kind:
+            fit = [t.name for t in topics if t.type == kind]
+            there = f"; of that type: {', '.join(fit)}" if fit else ", of which the bag has none"
+            raise ConfigError(f"{name} is of type {short_type(given.type)}; {what} are read from {short_type(kind)}{there}")
     for name in asked.uwb:
         _topic(topics, name)
     others = (t for t in topics if t.name not in (odometry, scan) and t.type not in (IMU, TRANSFORMS))
@@ -108,15 +109,17 @@ def plan_topics(
         elif (guess := suggested(t.name, t.type, samples)) is not None:
             unread[t.name] = guess
         if t.name in asked.uwb and t.name not in uwb:
-            raise ConfigError(_no_mapping(t, unread.get(t.name)))
+            text, guess = f"no uwb mapping reads {t.name} of type {short_type(t.type)}", unread.get(t.name)
+            start = "" if guess is None else f", for a start: {as_toml([guess])}"
+            raise ConfigError(f"{text}; describe it in a file for `mappings`{start}")
     # X is left out where X_raw exists: the map has its own correction.
     kept = uwb if asked.uwb else {name: m for name, m in uwb.items() if f"{name}_raw" not in uwb}
     spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN, IMU) and t.name not in (odometry, scan, imu)]
     spare += [name for name in uwb if name not in kept]
     choices = []
     for kind, taken, named, what, option in (
-        (ODOMETRY, odometry, asked.odometry, "odometry is", "--odometry-topic"),
-        (SCAN, scan, asked.scan, "scans are", "--scan-topic"),
+        (ODOMETRY, odometry, asked.odometry, "odometry is", "`topics.odometry`"),
+        (SCAN, scan, asked.scan, "scans are", "`topics.scan`"),
     ):
         alike = [t.name for t in topics if t.type == kind and t.name != taken]
         if taken and alike and not named:
@@ -136,7 +139,7 @@ def unread_warning(plan: TopicPlan) -> str:
     names = ", ".join(plan.unread)
     return (
         f"not read, though there may be ranges in it: {names}. If there are, put this line into a file uwb.toml, correct it"
-        f" (docs/formats.md explains it) and give --uwb-mapping uwb.toml: {as_toml(plan.unread.values())}"
+        f" (docs/formats.md explains it) and give `mappings=uwb.toml`: {as_toml(plan.unread.values())}"
     )
 
 
@@ -167,14 +170,6 @@ def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
     return found
 
 
-def _named(topics: Sequence[BagTopic], name: str, kind: str, what: str) -> str:
-    if name and (given := _topic(topics, name)).type != kind:
-        fitting = [t.name for t in topics if t.type == kind]
-        there = f"; of that type: {', '.join(fitting)}" if fitting else ", of which the bag has none"
-        raise ConfigError(f"{name} is of type {short_type(given.type)}; {what} are read from {short_type(kind)}{there}")
-    return name
-
-
 def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) -> None:
     """Raise ConfigError where a mapping of the user's matches no topic."""
     for number, m in enumerate(mappings, 1):
@@ -188,11 +183,6 @@ def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) 
             f"uwb mapping number {number} matches nothing: topic {m.topic!r} and type {m.type!r};"
             f" the bag has {', '.join(shown) or 'nothing besides odometry, scans and transforms'}"
         )
-
-
-def _no_mapping(topic: BagTopic, guess: UwbMapping | None) -> str:
-    text = f"no uwb mapping reads {topic.name} of type {short_type(topic.type)}; describe it in a file for --uwb-mapping"
-    return text if guess is None else f"{text}, for a start: {as_toml([guess])}"
 
 
 def _best(topics: Sequence[BagTopic], kind: str, liked: tuple[str, ...], disliked: tuple[str, ...]) -> str:

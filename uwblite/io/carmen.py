@@ -1,21 +1,10 @@
-"""CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds.
+"""CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds; docs/formats.md lists the messages.
 
-``NAME contents ipc_timestamp ipc_hostname logger_timestamp``, with the messages
-
-| message | contents |
-|---|---|
-| PARAM | name value |
-| ODOM | x y theta tv rv accel |
-| ROBOTLASER1 | laser_type start_angle fov angular_resolution maximum_range accuracy remission_mode num_readings [readings] num_remissions [remissions] laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety side_safety turn_axis |
-| RAWLASER1 | as ROBOTLASER1 up to the remissions |
-| FLASER | num_readings [readings] x y theta odom_x odom_y odom_theta |
-| GYRO | heading turn_rate |
-| UWB | anchor_id range quality(0..100); UWB2 ... UWB9 = by the robot's second ... ninth tag |
-
-UWB and GYRO are uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
-and some published logs leave out ipc_timestamp: both are accepted, and then the logger's time counts.
-A reading at or above the maximum range saw nothing (+inf); a reading below range_min is an error code (nan).
-"""  # noqa: E501
+``NAME contents ipc_timestamp ipc_hostname logger_timestamp``. UWB and GYRO are uwblite's own; other CARMEN readers skip them.
+ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp: both are
+accepted, and then the logger's time counts. A reading at or above the maximum range saw nothing (+inf); one below range_min is
+an error code (nan).
+"""
 
 import hashlib
 import os
@@ -88,7 +77,7 @@ def read_log(
         with open_source(part, digest) as source:
             for block in source.blocks():
                 reader.feed(block)
-            source.read_rest()
+            source.sha256()
     return reader.finish(digest.hexdigest(), missing)
 
 
@@ -201,13 +190,9 @@ class LogReader:
             self._refuse()
 
     def _refuse(self) -> None:
-        number, why = self.broken_lines[0]
-        raise FormatError(
-            f"{self.broken} of {self.messages} messages are broken (allowed: {self.max_broken_share:.0%}); "
-            f"the first: {why}. Is this a CARMEN log?",
-            self.path,
-            number,
-        )
+        (number, why), share = self.broken_lines[0], f"{self.broken} of {self.messages} messages are broken"
+        text = f"{share} (allowed: {self.max_broken_share:.0%}); the first: {why}. Is this a CARMEN log?"
+        raise FormatError(text, self.path, number)
 
     def finish(self, sha256: str, missing: str = "") -> SensorLog:
         """Return the collected measurements, sorted by time; `missing` is a missing part of the log."""
@@ -225,9 +210,8 @@ class LogReader:
             raise ConfigError(f"the log has no scans of {self.scan_message}{there}")
         if scans is not None and others:
             counts = ", ".join(f"{count} of {name}" for name, count in others.items())
-            used = self.scan_message or "the first"
-            hint = f"--scan-topic {min(others)} would take those of another"
-            warnings.append(f"a map uses one lidar, here {used}; scans of others are left out ({counts}); {hint}")
+            text = f"a map uses one lidar, here {self.scan_message or 'the first'}; scans of others are left out ({counts})"
+            warnings.append(f"{text}; `topics.scan={min(others)}` would take those of another")
         notes = LogNotes(
             source=self.path,
             sha256=sha256,
@@ -248,11 +232,8 @@ class LogReader:
         if len(rows) == 0:
             rows, lines = laser, laser_lines
             if len(rows) == 0:
-                raise FormatError(
-                    f"no odometry in {self.lines} lines: neither ODOM messages nor ROBOTLASER1 with robot poses. "
-                    "Is this a CARMEN log?",
-                    self.path,
-                )
+                what = "neither ODOM messages nor ROBOTLASER1 with robot poses. Is this a CARMEN log?"
+                raise FormatError(f"no odometry in {self.lines} lines: {what}", self.path)
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
             laser, laser_lines = laser[:0], laser_lines[:0]
         rows, clock = judged(rows, lines, laser, laser_lines, warnings)

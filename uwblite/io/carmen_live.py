@@ -11,7 +11,7 @@ from .carmen_stamps import AS_WRITTEN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class _Measurement:
     """One measurement of any kind."""
 
     stamp: float
@@ -21,7 +21,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveOdometry(Measured):
+class LiveOdometry(_Measurement):
     """One pose of the base."""
 
     pose: Floats
@@ -29,7 +29,7 @@ class LiveOdometry(Measured):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveRange(Measured):
+class LiveRange(_Measurement):
     """One range."""
 
     anchor_id: str
@@ -40,7 +40,7 @@ class LiveRange(Measured):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveScan(Measured):
+class LiveScan(_Measurement):
     """One scan."""
 
     scans: LaserScans
@@ -48,12 +48,14 @@ class LiveScan(Measured):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LiveGyro(Measured):
+class LiveGyro(_Measurement):
     """One reading of a gyro."""
 
     heading: float
     """rad; from any zero, its bias in it."""
 
+
+Measured = LiveOdometry | LiveRange | LiveScan | LiveGyro
 
 _MOST_PENDING = 1 << 20
 """Bytes of a line without an end."""

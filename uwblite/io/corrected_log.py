@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats
 from ..errors import FormatError
 from ..map_result import MapResult
 from ..sensor_log import SensorLog
@@ -167,16 +168,8 @@ def _scans(result: StoredResult, recording: int, log: SensorLog) -> Iterator[tup
     if log.scans is None or len(log.scans.stamps) == 0:
         return
     stamps = result.keyframe_stamps[keyframes]
-    chosen = _nearest(log.scans.stamps, stamps)
+    chosen = cKDTree(log.scans.stamps[:, None]).query(stamps[:, None])[1]
     near = np.abs(log.scans.stamps[chosen] - stamps) <= _SAME_TIME
     keyframes, chosen = keyframes[near], chosen[near]
     seen = log.scans.rows(chosen)
     yield from zip(keyframes.tolist(), scan_lines(replace(log, scans=seen)), strict=True)
-
-
-def _nearest(sorted_stamps: Floats, query: Floats) -> Ints:
-    """Return the index of the nearest stamp."""
-    right = np.clip(np.searchsorted(sorted_stamps, query), 1, max(len(sorted_stamps) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(sorted_stamps) - 1)
-    return np.where(query - sorted_stamps[left] <= sorted_stamps[right] - query, left, right).astype(np.intp)

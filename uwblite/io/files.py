@@ -4,7 +4,7 @@ import gzip
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -75,11 +75,15 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def sync_folder(folder: str | os.PathLike[str]) -> None:
     """Force the new name to the disk, where the file system allows it."""
     with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        _with_handle(folder, os.fsync)
+
+
+def _with_handle(path: str | os.PathLike[str], work: Callable[[int], object]) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        work(handle)
+    finally:
+        os.close(handle)
 
 
 def sync_files(folder: str | os.PathLike[str]) -> None:
@@ -93,11 +97,7 @@ def sync_files(folder: str | os.PathLike[str]) -> None:
     for work in (_begin_writing, os.fsync):
         # One at a time: a process may have few files open.
         for file in files:
-            handle = os.open(file, os.O_RDONLY)
-            try:
-                work(handle)
-            finally:
-                os.close(handle)
+            _with_handle(file, work)
     sync_folder(folder)
 
 

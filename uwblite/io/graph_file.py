@@ -217,20 +217,21 @@ def assembled(
     fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior: the first pose is fixed.
     """
     L = {kind: root(m.information) for kind, m in plain.items()}
-    ends, value = {kind: m.ends for kind, m in plain.items()}, {kind: m.value for kind, m in plain.items()}
-    ranges = {kind: (*ends[kind], value[kind][:, 0], 1.0 / L[kind][:, 0, 0]) for kind in ENDS if "range" in kind}
-    (prior,), (known,), (pose, anchor, distance, sigma) = ends["pose_prior"], ends["landmark_prior"], ranges["range"]
-    none, flat = np.full((len(pose), 6), -1, dtype=np.intp), np.zeros((len(pose), 2))
-    at, nowhere = np.zeros(len(pose)), np.zeros((len(value["pose_range"]), 2))
-    one, other, *apart = ranges["pose_range"]
+    ((i, j), T_i_j, _), ((pose, anchor), position, _) = plain["relative"], plain["observation"]
+    ((prior,), value, _), ((known,), place, _) = plain["pose_prior"], plain["landmark_prior"]
+    (seer, seen), (one, other), (first, second) = (plain[kind].ends for kind in _DISTANCES)
+    metres = {kind: plain[kind].value[:, 0] for kind in _DISTANCES}
+    sigma = {kind: 1.0 / L[kind][:, 0, 0] for kind in _DISTANCES}
+    flat, nowhere, at = np.zeros((len(seer), 2)), np.zeros((len(one), 2)), np.zeros(len(seer))
+    uncalibrated = flat, at, flat, np.zeros(2), at, np.full((len(seer), 6), -1, dtype=np.intp)
     edges = (
-        RelativePoseEdges(*ends["relative"], value["relative"], L["relative"]),
-        LandmarkEdges(*ends["observation"], value["observation"], L["observation"]),
-        RangeEdges(pose, anchor, distance, sigma, flat, at, flat, np.zeros(2), at, none),
-        PointDistanceEdges(one, other, nowhere, nowhere, *apart),
-        AnchorDistanceEdges(*ranges["landmark_range"]),
-        PriorEdges("poses", prior, value["pose_prior"], L["pose_prior"] @ se2.rotation(-value["pose_prior"][:, 2])),
-        PriorEdges("anchors", known, value["landmark_prior"], L["landmark_prior"]),
+        RelativePoseEdges(i, j, T_i_j, L["relative"]),
+        LandmarkEdges(pose, anchor, position, L["observation"]),
+        RangeEdges(seer, seen, metres["range"], sigma["range"], *uncalibrated),
+        PointDistanceEdges(one, other, nowhere, nowhere, metres["pose_range"], sigma["pose_range"]),
+        AnchorDistanceEdges(first, second, metres["landmark_range"], sigma["landmark_range"]),
+        PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
+        PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
     given = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
     return Graph(
@@ -240,6 +241,9 @@ def assembled(
         fixed_poses=np.isin(np.arange(len(poses)), fixed if given else [0]),
         fixed_anchors=np.isin(np.arange(len(anchors)), fixed_anchors),
     )
+
+
+_DISTANCES = ("range", "pose_range", "landmark_range")
 
 
 def rows_of(tag: str, form: str, columns: Sequence[Any], *tables: Floats) -> str:

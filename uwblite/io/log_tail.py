@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import FormatError
-from .carmen_words import numbers, stamp_of
+from .carmen_words import RANK, numbers, stamp_of
 from .log_parts import GrowingFile
 from .source import MAX_LINE_BYTES
 
@@ -113,8 +113,7 @@ class LogTail:
                 self._file.close()
                 self._restart()
             self._file, self._first = opened, os.stat(self.path)
-        before = self._file.restarts
-        data = self._file.read()
+        before, data = self._file.restarts, self._file.read()
         if self._file.restarts > before:
             self._restart()
             self._first = os.stat(self.path)
@@ -164,10 +163,6 @@ class LogTail:
 
 def _sensor_of(name: bytes) -> str:
     """Return which sensor a message is of; "" of none."""
-    if name == b"ODOM":
-        return "odometry"
     if name[:3] == b"UWB" and (len(name) == 3 or name[3:].isdigit()):
         return "radio"
-    if name in (b"ROBOTLASER1", b"RAWLASER1", b"FLASER"):
-        return "lidar"
-    return "gyro" if name == b"GYRO" else ""
+    return "lidar" if name in RANK else {b"ODOM": "odometry", b"GYRO": "gyro"}.get(name, "")

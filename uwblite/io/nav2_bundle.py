@@ -1,13 +1,4 @@
-"""A map as nav2 takes it: grid, keep-out mask, parameters, initial pose and anchors in one folder.
-
-| file | what |
-|---|---|
-| map.pgm, map.yaml | the map for map_server |
-| keepout_mask.pgm, keepout_mask.yaml | unknown space as a mask for nav2's keepout filter, in the map's own cells |
-| nav2_params.yaml | map_server, the servers of the mask, the costmaps' filter; no AMCL: map -> odom comes from elsewhere |
-| initial_pose.yaml | where the recording ended, with covariance: a geometry_msgs/PoseWithCovarianceStamped |
-| anchors.yaml | the UWB anchors with covariances |
-"""
+"""A map as nav2 takes it: grid, keep-out mask, parameters, initial pose and anchors in one folder (docs/formats.md)."""
 
 import json
 import math
@@ -118,13 +109,11 @@ def keepout_mask(grid: OccupancyGrid) -> OccupancyGrid:
 def _initial_pose(result: StoredResult) -> str:
     """Return the last pose of the last recording, and the covariance of its last keyframe."""
     x, y, theta = result.trajectories[-1][1][-1].tolist()
-    planar = np.zeros((3, 3))
-    if len(result.keyframe_covariances):
-        planar = result.keyframe_covariances[-1]
     covariance = np.zeros((6, 6))
-    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = planar
+    if len(result.keyframe_covariances):
+        covariance[np.ix_((0, 1, 5), (0, 1, 5))] = result.keyframe_covariances[-1]
     return (
-        "# ros2 topic pub --once /initialpose geometry_msgs/msg/PoseWithCovarianceStamped \"$(cat initial_pose.yaml)\"\n"
+        '# ros2 topic pub --once /initialpose geometry_msgs/msg/PoseWithCovarianceStamped "$(cat initial_pose.yaml)"\n'
         "header:\n  frame_id: map\npose:\n  pose:\n"
         f"    position: {{x: {_number(x)}, y: {_number(y)}, z: 0.0}}\n"
         f"    orientation: {{x: 0.0, y: 0.0, z: {_number(math.sin(theta / 2))}, w: {_number(math.cos(theta / 2))}}}\n"

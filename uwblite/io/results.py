@@ -1,17 +1,4 @@
-"""The folder that `uwblite map` writes: which files, in which formats, and all of them or none.
-
-| file | what |
-|---|---|
-| trajectory.tum | pose at every odometry stamp, map frame; trajectory_2.tum ... for further recordings |
-| trajectory_covariance.csv | stamp, covariance, recording and trust of every keyframe |
-| anchors.csv | anchors with sigmas, biases, shares of ranges used |
-| range_errors.csv | by how much each range was wrong, and where |
-| map.pgm, map.yaml | the map for map_server and nav2 |
-| map.png | picture of the map with path, anchors, closures |
-| graph.g2o, graph.pyfg | the optimised pose graph; graph_stamps.csv has the time and the recording of each pose |
-| config.toml | the settings that were in force |
-| report.html | everything on one page |
-| report.json | the same for programs; hashes of the other files |
+"""The folder that `uwblite map` writes, all of its files or none; docs/formats.md lists them.
 
 A result is replaced as a whole, see folders.py: a full disk or a crash leaves the previous one. report.json holds the
 hash of every other file.
@@ -29,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
-from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import MapResult
 from ..report.html import render
 from ..report.picture import PictureAnchor, draw_map
@@ -84,10 +70,10 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     """
     path = Path(folder)
     if path.exists() and not path.is_dir():
-        raise ConfigError(f"{path} is not a folder; choose another --out")
+        raise ConfigError(f"{path} is not a folder; choose another `folder`")
     present = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
     if present and not force:
-        raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use --force to replace it, or another --out")
+        raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use `force` to replace it, or another `folder`")
     check_free(path, is_of_result)
     if present:
         repair_result(path)
@@ -123,7 +109,9 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     """
     check_target(folder, force=True)
     with replacing_folder(folder, is_of_result) as waiting:
-        _write_trajectories(waiting, result)
+        for number in np.unique(result.recording).tolist():
+            mine, name = result.recording == number, f"trajectory_{number + 1}.tum" if number else "trajectory.tum"
+            write_tum(waiting / name, result.stamps[mine], result.trajectory[mine])
         stamps, recording = result.keyframe_stamps, result.keyframe_recording
         table = covariance_csv(stamps, result.keyframe_covariances, recording, result.trusted(stamps, recording))
         write_text(waiting / "trajectory_covariance.csv", table)
@@ -137,7 +125,10 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
             if record.scale_map:
                 write_map(waiting, result.grid, name="map_scale", mode="scale")
         write_png(waiting / "map.png", picture(result, _caption(logs, result)))
-        _write_graphs(waiting, result)
+        ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
+        write_g2o(waiting / "graph.g2o", result.graph, plain=plain)
+        write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
+        write_text(waiting / "graph_stamps.csv", stamps_csv(result))
         write_text(waiting / "config.toml", record.config)
         page = render(
             result,
@@ -172,51 +163,27 @@ def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
 
 
-def _write_trajectories(folder: Path, result: MapResult) -> None:
-    for recording in np.unique(result.recording).tolist():
-        mine = result.recording == recording
-        name = "trajectory.tum" if recording == 0 else f"trajectory_{recording + 1}.tum"
-        write_tum(folder / name, result.stamps[mine], result.trajectory[mine])
-
-
-def _write_graphs(folder: Path, result: MapResult) -> None:
-    ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
-    write_g2o(folder / "graph.g2o", result.graph, plain=plain)
-    write_pyfg(folder / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
-    write_text(folder / "graph_stamps.csv", stamps_csv(result))
-
-
 def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     """Return the picture of the map with path, anchors and accepted closures."""
     parts = [np.vstack([result.trajectory[result.recording == s, :2], [[np.nan, np.nan]]]) for s in np.unique(result.recording)]
-    poses = result.graph.poses
-    kept = [(*poses[c.i, :2], *poses[c.j, :2]) for c in result.closures if c.accepted]
-    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors]
-    closures = np.array(kept, dtype=np.float64).reshape(-1, 4)
-    doubted = result.doubted_paths()
-    return draw_map(
-        result.grid, np.vstack(parts), anchors=anchors, closures=closures, doubted=doubted, caption=caption
-    )
+    places = result.graph.poses[:, :2]
+    closures = np.array([(*places[c.i], *places[c.j]) for c in result.closures if c.accepted]).reshape(-1, 4)
+    anchors, doubted = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors], result.doubted_paths()
+    return draw_map(result.grid, np.vstack(parts), anchors=anchors, closures=closures, doubted=doubted, caption=caption)
 
 
 def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:
     """Return recording and map in a line."""
     sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
     driven = f"{duration(sums['duration'])}, {sums['travelled']:.1f} m, {sums['ranges']} ranges, {sums['scans']} scans"
-    closures = f"{kept} of {len(result.closures)} loop closures" if result.closures else ""
-    return "; ".join(filter(None, (driven, "" if result.grid is None else _size(result.grid), closures)))
+    closures, size = f"{kept} of {len(result.closures)} loop closures" if result.closures else "", ""
+    if result.grid is not None:
+        g = result.grid.geometry
+        size = f"{g.cols * g.resolution:.1f} x {g.rows * g.resolution:.1f} m at {g.resolution:g} m"
+    return "; ".join(filter(None, (driven, size, closures)))
 
 
 def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
-    facts = [
-        *(("sha256", log.notes.sha256) for log in logs),
-        ("settings", settings_line(record.preset, record.changed)),
-        ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
-    ]
-    return tuple((name, value) for name, value in facts if value)
-
-
-def _size(grid: OccupancyGrid) -> str:
-    g = grid.geometry
-    width, depth = g.cols * g.resolution, g.rows * g.resolution
-    return f"{width:.1f} x {depth:.1f} m at {g.resolution:g} m"
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
+    facts = (("settings", settings_line(record.preset, record.changed)), ("made by", versions))
+    return tuple((name, value) for name, value in (*(("sha256", log.notes.sha256) for log in logs), *facts) if value)

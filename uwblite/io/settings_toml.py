@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from textwrap import wrap
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -75,8 +76,6 @@ def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:
 
 
 def _wrapped(text: str) -> list[str]:
-    from textwrap import wrap
-
     return [f"# {line}" for line in wrap(" ".join(text.split()), 116)]
 
 
@@ -86,10 +85,8 @@ def toml_value(value: Any) -> str:
         return '"none"'
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, float):
+    if isinstance(value, int | float):
         return repr(value)
-    if isinstance(value, int):
-        return str(value)
     if isinstance(value, str):
         return _toml_text(value)
     if isinstance(value, tuple | list):

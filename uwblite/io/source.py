@@ -75,14 +75,10 @@ class TextSource:
         packed = start.startswith(_GZIP)
         self._text: BinaryIO = gzip.GzipFile(fileobj=self._buffered) if packed else self._buffered  # type: ignore[assignment]
 
-    def read_rest(self) -> None:
-        """Read the rest, so that the hash is that of the whole file."""
+    def sha256(self) -> str:
+        """Read the rest and return the hash of all bytes that it took, hexadecimal."""
         while self._buffered.read(BLOCK_BYTES):
             pass
-
-    def sha256(self) -> str:
-        """Read the rest and return the hash of all bytes of the file, hexadecimal."""
-        self.read_rest()
         return self._hashing.hash.hexdigest()
 
     def blocks(self, size: int = BLOCK_BYTES) -> Iterator[bytes]:
@@ -97,8 +93,9 @@ class TextSource:
             if unpacked > _BOMB_BYTES and unpacked > _BOMB_RATIO * self._hashing.count:
                 problem = f"unpacks to more than {_BOMB_RATIO} times its size: nothing that was measured does"
                 raise FormatError(problem, self.path)
-            if first:
-                data, first = _checked_start(data, self.path), False
+            if first and b"\0" in data[:4096]:
+                raise FormatError("this is binary data, not a text file", self.path)
+            data, first = data.removeprefix(b"\xef\xbb\xbf") if first else data, False
             if overlong:
                 cut = data.find(b"\n")
                 if cut < 0:
@@ -179,7 +176,7 @@ def open_input(name: str) -> BinaryIO:
         os.set_blocking(handle, True)
     try:
         return os.fdopen(handle, "rb")
-    except OSError as error:
+    except OSError as error:  # a folder
         os.close(handle)
         raise FormatError(f"cannot be opened: {error.strerror}", name) from None
 
@@ -233,10 +230,3 @@ def read_settings(name: str) -> str:
         return read_bounded(name, _LARGEST_SETTINGS).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError("not a text file (UTF-8)", name) from None
-
-
-def _checked_start(data: bytes, path: str) -> bytes:
-    """Refuse binary data; drop a UTF-8 byte order mark."""
-    if b"\0" in data[:4096]:
-        raise FormatError("this is binary data, not a text file", path)
-    return data.removeprefix(b"\xef\xbb\xbf")

@@ -43,7 +43,10 @@ def suggested(topic: str, message_type: str, samples: Callable[[str], Sequence[A
     kind = short_type(message_type)
     hinted = _HINT.search(topic) is not None or _HINT.search(kind) is not None
     if kind == "sensor_msgs/Range":
-        return None if _OTHER_RANGE.search(topic) else UwbMapping(topic=topic, type=kind, anchor=_word_of_topic(topic))
+        # The anchor's name is the last word of the topic, or the one before a general one.
+        general = topic.rsplit("/", 1)[-1] in ("range", "distance", "dist", "data", "raw") and topic.count("/") > 1
+        anchor = "topic:([^/]+)/[^/]+$" if general else "topic:([^/]+)$"
+        return None if _OTHER_RANGE.search(topic) else UwbMapping(topic=topic, type=kind, anchor=anchor)
     if _OTHERS.match(kind) or (kind.startswith("std_msgs/") and not hinted):
         return None
     for message in list(samples(topic))[:_MOST_SAMPLES]:
@@ -67,25 +70,23 @@ def as_toml(mappings: Iterable[UwbMapping]) -> str:
 
 def _readings(message: Any) -> list[tuple[str, Any]]:
     """Return the message itself and the first entry of each list of messages in it, with its path."""
-    found = [("", message)]
-    for name, value in _fields(message):
-        if isinstance(value, list | tuple) and value and hasattr(value[0], "__dataclass_fields__"):
-            found.append((name, value[0]))
-    return found
+    lists = ((name, value) for name, value in _fields(message) if isinstance(value, list | tuple) and value)
+    return [("", message), *((name, v[0]) for name, v in lists if hasattr(v[0], "__dataclass_fields__"))]
 
 
 def _mapping(reading: Any, kind: str, hinted: bool) -> dict[str, Any] | None:
     """Return anchor, range and unit of a reading, None where no field looks like a range of something."""
     values = dict(_fields(reading))
     ranges = [name for name in values if _RANGE.fullmatch(name.lower()) or kind.startswith("std_msgs/")]
-    lists = [name for name in ranges if _is_list(values[name])]
+    lists = [name for name in ranges if _is_array(values[name], "fiu") and len(values[name])]
     single = [name for name in ranges if isinstance(values[name], Number)]
-    ids = [name for name, v in values.items() if isinstance(v, str | Number) and _is_id(name)]
+    named = [name for name in values if _ID.fullmatch(name.lower()) and not _NOT_ID.match(name.lower())]
+    ids = [name for name in named if isinstance(values[name], str | Number)]
     ids.sort(key=lambda name: (name.lower() == "id", _NOT_ID.search(name.lower()) is not None))
     if single and ids:
         return {"anchor": ids[0], "range": single[0], "unit": _unit(single[0], values[single[0]])}
     if lists:
-        beside = [n for n, v in values.items() if _is_id(n) and n not in lists and _is_ids(v, len(values[lists[0]]))]
+        beside = [n for n in named if n not in lists and _is_ids(values[n], len(values[lists[0]]))]
         anchor = min(beside, key=lambda name: (_NOT_ID.search(name.lower()) is not None, name.lower() == "id"), default="index")
         return {"anchor": anchor, "range": lists[0], "unit": _unit(lists[0], np.max(values[lists[0]]))}
     if hinted and kind in ("std_msgs/Float32", "std_msgs/Float64"):
@@ -98,19 +99,14 @@ def _fields(message: Any) -> list[tuple[str, Any]]:
     return [(name, getattr(message, name)) for name in names]
 
 
-def _is_list(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == 1 and len(value) > 0 and value.dtype.kind in "fiu"
+def _is_array(value: Any, kinds: str) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in kinds
 
 
 def _is_ids(value: Any, count: int) -> bool:
     """Return whether a field holds an id for each of so many ranges."""
     texts = isinstance(value, list | tuple) and all(isinstance(v, str) for v in value)
-    numbers = isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iu"
-    return (texts or numbers) and len(value) == count
-
-
-def _is_id(name: str) -> bool:
-    return _ID.fullmatch(name.lower()) is not None and _NOT_ID.match(name.lower()) is None
+    return (texts or _is_array(value, "iu")) and len(value) == count
 
 
 def _unit(name: str, value: Any) -> float:
@@ -119,9 +115,3 @@ def _unit(name: str, value: Any) -> float:
         return 0.01
     whole = isinstance(value, int | np.integer)
     return 0.001 if name.lower().endswith("mm") or whole or float(value) > LONGEST_RANGE else 1.0
-
-
-def _word_of_topic(topic: str) -> str:
-    """Return where the anchor's name stands in a topic: the last word, or the one before a general one."""
-    general = topic.rsplit("/", 1)[-1] in ("range", "distance", "dist", "data", "raw")
-    return "topic:([^/]+)/[^/]+$" if general and topic.count("/") > 1 else "topic:([^/]+)$"

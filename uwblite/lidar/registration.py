@@ -25,6 +25,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import CloudRasters, rasterize
 from .clouds import Clouds
+from .correlative_matching import search
 from .free_space import free_space
 from .raster_search import Window, best_poses
 from .scan_matching import (
@@ -73,6 +74,8 @@ class RegistrationConfig:
     """Points that such a search looks up."""
     cell: ClassVar[float] = 0.1
     """Step of such a search in x and y, m."""
+    wide: ClassVar[float] = 1.2
+    """Half-width of a search from which on one correlation of all shifts takes less time, m."""
     linear: ClassVar[float] = 0.1
     """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
     iterations: ClassVar[int] = 20
@@ -246,16 +249,25 @@ class Registration:
         return [share * prior.mean for share in (1.0, 0.5, 0.0)]
 
     def _searched(self, i: Ints, j: Ints, prior: Prior) -> list[Floats]:
-        """Return poses (e, 3) from which matching may begin, by exhaustive search of two standard deviations."""
+        """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view.
+
+        Where the wheels counted metres, the window is as large as the clouds: all its shifts are one correlation there.
+        """
         c, within = RegistrationConfig, 2.0 * np.sqrt(np.einsum("eii->ei", prior.slipped))
         starts = np.tile(prior.mean, (c.places, 1, 1))
         for row, (target, source) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
-            pair = self._clouds.chosen(np.array([target, source]))
-            raster = rasterize(pair.chosen(np.array([0])), c.cell, c.first_gate)
-            window = Window(float(within[row, :2].max()), float(within[row, 2]))
-            points = pair_points(pair, np.array([1]), c.scored).of(0)
-            found = best_poses(pair, raster, points, prior.mean[row], window, c.places)
-            starts[: len(found), row] = found
+            own, other = (self._clouds.chosen(np.array([k])) for k in (target, source))
+            view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (own, other))
+            low, high = (np.clip(prior.mean[row, :2] + side * within[row, :2], -view, view) for side in (-1.0, 1.0))
+            middle, half = np.append(0.5 * (low + high), prior.mean[row, 2]), 0.5 * (high - low)
+            turn = min(float(within[row, 2]), np.pi)
+            if half[:2].max() > c.wide:
+                found = search(own, other, middle, (float(half[0]), float(half[1]), turn)).poses
+            else:
+                pair, raster = self._clouds.chosen(np.array([target, source])), rasterize(own, c.cell, c.first_gate)
+                points = pair_points(pair, np.array([1]), c.scored).of(0)
+                found = best_poses(pair, raster, points, middle, Window(float(half.max()), turn), c.places)
+            starts[: len(found), row] = found[: c.places]
         return list(starts)
 
     def _most_odds(self, placed: Placed, prior: Prior) -> Floats:

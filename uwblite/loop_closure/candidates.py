@@ -74,13 +74,26 @@ def propose(
     size = np.maximum(np.diff(seen.indptr), 1)
     expected = common / np.minimum(size[a], size[b])
     doubtful = spread > config.direct
-    worth = np.where(doubtful & ~astray, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
-    possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
+    guess = se2.between(poses[a], poses[b])
+    worth = np.where(doubtful & ~astray, overlap_probability(guess, covariance, config.reach), expected)
+    near = distance < config.reach + np.minimum(spread, config.search_limit)
+    possible = np.where(doubtful, near & (worth > 0.0), expected > 0.25) & (size[a] > 5) & (size[b] > 5)
     possible &= (spread > beyond) & (spread <= config.search_limit)
     fresh = ~_among(np.stack([a, b, doubtful]), tried)
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]
-    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], constrained)
+    return Candidates(a, b, guess[kept], covariance[kept], spread[kept], constrained)
+
+
+def overlap_probability(guess: Floats, covariance: Floats, reach: float) -> Floats:
+    """Return about the probability (p,) that sub-maps at relative poses (p, 3) are within reach, m, of each other.
+
+    The disc within reach is taken as a Gaussian of the same peak and integral, whose variance is reach^2 / 2 along each axis.
+    """
+    own = reach**2 / 2.0 * np.eye(2)
+    summed = covariance[:, :2, :2] + own
+    squared = np.einsum("pi,pi->p", guess[:, :2], np.linalg.solve(summed, guess[:, :2, None])[..., 0])
+    return np.asarray(np.sqrt(np.linalg.det(own) / np.linalg.det(summed)) * np.exp(-0.5 * squared))
 
 
 def _among(columns: Ints, names: Set[tuple[int, ...]]) -> Bools:

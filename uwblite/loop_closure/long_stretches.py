@@ -2,7 +2,7 @@
 
 A search narrower than the uncertainty may miss the true place, and a search over all of it finds many places at which one
 sub-map of a corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
-(net_overlap). The most certain pairs come first: each closed loop reduces the uncertainty of the others.
+(net_overlap). The likeliest pairs come first: each closed loop reduces the uncertainty of the others.
 """
 
 from dataclasses import replace
@@ -14,14 +14,12 @@ from ..graph.graph import Graph
 from ..graph.joint_covariance import JointCovariance
 from ..lidar import submaps
 from ..lidar.submaps import Submaps
-from .candidates import Candidates, propose, uncertain
+from .candidates import Candidates, overlap_probability, propose, uncertain
 from .closures import LoopClosureConfig
 
 _LENGTH = 30.0
 """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays within the
 gate of the final matching. Each begins in the middle of the one before."""
-FARTHEST = 60.0
-"""Largest half-width of a search, m; a bound on time and memory."""
 _AT_ONCE, _PART = 40, 8
 """Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
 
@@ -48,26 +46,24 @@ def any_uncertain(
     ----------
     reference : (s,) keyframes in the middle of stretches or of sub-maps.
     """
-    return uncertain(graph, covariance, reference, recording, _wide(config, FARTHEST), config.search_limit)
+    return uncertain(graph, covariance, reference, recording, _wide(config), config.search_limit)
 
 
-def _wide(config: LoopClosureConfig, farthest: float) -> LoopClosureConfig:
-    return replace(config, reach=_LENGTH / 2.0, search_limit=farthest)
+def _wide(config: LoopClosureConfig) -> LoopClosureConfig:
+    return replace(config, reach=_LENGTH / 2.0, search_limit=np.inf)
 
 
 def uncertain_pairs(
     graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
-    constrained: bool, config: LoopClosureConfig, farthest: float = FARTHEST,
+    constrained: bool, config: LoopClosureConfig,
 ) -> Candidates:
-    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the most certain first.
+    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the likeliest first.
 
-    Parameters
-    ----------
-    farthest : pairs whose 3 sigma are larger, m, are left out. For the others see candidates.propose.
+    For the parameters see candidates.propose.
     """
-    wide = _wide(config, farthest)
+    wide = _wide(config)
     found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, config.search_limit)
-    return found.rows(np.argsort(found.spread, kind="stable"))
+    return found.rows(np.argsort(-overlap_probability(found.guess, found.covariance, wide.reach), kind="stable"))
 
 
 def first_of(candidates: Candidates, pieces: Submaps) -> Candidates:

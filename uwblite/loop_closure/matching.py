@@ -132,10 +132,29 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
             search_config, places = (_coarse(batch.search), _MANY_PLACES) if wide else (batch.search, config.places)
             turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
             target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
-            poses = search(target, source, poses[0], (half_width, half_width, turn), search_config).poses[:places]
+            centre, half_widths = _window(poses[0], half_width, turn, target, source)
+            poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
     return np.concatenate(rows).astype(np.intp), np.concatenate(guesses)
+
+
+def _window(
+    guess: Floats, half_width: float, turn: float, target: Clouds, source: Clouds
+) -> tuple[Floats, tuple[float, float, float]]:
+    """Return centre (3,) and half-widths of the poses within a half-width of a guess, m, at which two clouds overlap."""
+    ends = guess[:2] + half_width * np.array([[-1.0], [1.0]])
+    if len(target.points) and len(source.points):
+        reach = np.quantile(np.hypot(*source.points.T), _MOST)
+        inside = np.quantile(target.points, [1.0 - _MOST, _MOST], axis=0) + reach * np.array([[-1.0], [1.0]])
+        ends = np.clip(inside, *ends)
+    low, high = ends
+    (x, y), (wide, tall) = 0.5 * (low + high), 0.5 * (high - low)
+    return np.array([x, y, guess[2]]), (float(wide), float(tall), turn)
+
+
+_MOST = 0.95
+"""Share of the points of a cloud that its extent contains: those that are far are few."""
 
 
 def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:

@@ -13,39 +13,20 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ..arrays import Bools, Floats, Ints
 from .clearance import ClearanceMap
+from .regions import BLOCK, STRIP, Regions, numbers, regions_of
 from .smoothing import along_lines, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
-_BLOCK = 16
-"""Cells along the edge of a block."""
 _AT_ONCE = 300_000
 """Nodes of a search."""
-_STRIP = 64
-"""Rows that are looked at together; a multiple of _BLOCK."""
 _NEAR_TIGHT = 1.3
 """Cells from a tight place to the nodes that it is joined to: the centre of the next cell but half a cell."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Regions:
-    """Parts of blocks whose cells hang together."""
-
-    label: NDArray[np.int32]
-    """(rows, cols) number of a cell's region, from 1; 0 = the robot may not stand there."""
-    sizes: Ints
-    """(n,) cells of each; regions and then tight places, as in `graph`."""
-    centres: Floats
-    """(n, 2) m."""
-    graph: csr_matrix
-    """(n, n) about what it costs from one centre to the next; symmetric."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,8 +84,8 @@ class StepSearch:
             return
         reached = np.isfinite(dijkstra(self.regions.graph, indices=self._region(np.array([first]))[0]))
         count, grid = len(reached) - len(self.clearance.tight), self.clearance.geometry
-        for start in range(0, grid.rows, _STRIP):
-            label = self.regions.label[start : start + _STRIP].ravel()
+        for start in range(0, grid.rows, STRIP):
+            label = self.regions.label[start : start + STRIP].ravel()
             yield np.flatnonzero(np.append(False, reached[:count])[label]) + start * grid.cols
         yield np.flatnonzero(reached[count:]) + grid.cells
 
@@ -144,7 +125,7 @@ class StepSearch:
         wanted = np.zeros(len(regions.sizes), dtype=np.bool_)
         wanted[chain] = wanted[regions.graph[chain].indices] = True
         count = len(wanted) - len(tight)
-        spread = 2 * _BLOCK * grid.resolution
+        spread = 2 * BLOCK * grid.resolution
         low, high = regions.centres[wanted].min(axis=0) - spread, regions.centres[wanted].max(axis=0) + spread
         (top, left), (bottom, right) = (grid.cell_of(np.clip(v, grid.origin, grid.corner)) for v in (low, high))
         found = np.append(False, wanted[:count])[regions.label[top : bottom + 1, left : right + 1]]
@@ -188,7 +169,7 @@ class StepSearch:
     def _region(self, nodes: Ints) -> Ints:
         """Return the regions (k,) of nodes (k,)."""
         assert self.regions is not None
-        return _regions_of(self.clearance, self.regions.label, len(self.regions.sizes), nodes)
+        return numbers(self.clearance, self.regions.label, len(self.regions.sizes), nodes)
 
     def _pieces(self, chain: Ints) -> list[Ints]:
         """Part a chain of regions so that no piece is too large to be searched at once; each begins where one ends."""
@@ -205,7 +186,7 @@ class StepSearch:
         if region >= count:
             return region - count + grid.cells
         centre = self.regions.centres[region]
-        nodes, places = self.around(centre, 1.5 * _BLOCK * grid.resolution)
+        nodes, places = self.around(centre, 1.5 * BLOCK * grid.resolution)
         mine = self._region(nodes) == region
         return int(nodes[mine][np.argmin(np.hypot(*(places[mine] - centre).T))])
 
@@ -214,7 +195,7 @@ def step_search(clearance: ClearanceMap) -> StepSearch:
     """Prepare searches over a map's cells."""
     joins = _joins(clearance)
     large = int(np.count_nonzero(clearance.passable())) > _AT_ONCE
-    return StepSearch(clearance, joins, _regions(clearance, joins) if large else None)
+    return StepSearch(clearance, joins, regions_of(clearance, joins) if large else None)
 
 
 def _joins(clearance: ClearanceMap) -> csr_matrix:
@@ -246,65 +227,3 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
     lines = along_lines(clearance, tight[start], np.concatenate(ends))
     kept = lines.clear
     return csr_matrix((lines.costs[kept], (start[kept], end[kept])), shape=shape)
-
-
-def _regions(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
-    grid = clearance.geometry
-    label, count = np.zeros((grid.rows, grid.cols), dtype=np.int32), 0
-    sums: list[Floats] = []
-    pairs: list[tuple[Ints, Ints]] = []
-    for start in range(0, grid.rows, _STRIP):
-        rows = slice(start, min(start + _STRIP, grid.rows))
-        part, more = _parted(clearance.passable(rows))
-        part[part > 0] += count
-        label[rows] = part
-        inner = part.ravel() - count
-        keep = inner > 0
-        row, col = np.divmod(np.flatnonzero(keep), grid.cols)
-        values = (None, col, row + start, clearance.cell_cost(rows).ravel()[keep])
-        sums.append(np.stack([np.bincount(inner[keep] - 1, v, more) for v in values]))
-        count += more
-        above = np.arange(max(start, _BLOCK), rows.stop, _BLOCK)
-        pairs += _touching(label[above - 1], label[above]), _touching(part.T[_BLOCK - 1 : -1 : _BLOCK], part.T[_BLOCK::_BLOCK])
-        corner = np.arange(_BLOCK, grid.cols, _BLOCK)
-        four = [[label[above + dr][:, corner + dc] for dc in (-1, 0)] for dr in (-1, 0)]
-        whole = np.all(four, axis=(0, 1))
-        pairs += [_touching(four[0][k] * whole, four[1][1 - k]) for k in (0, 1)]
-    size, col, row, cost = np.concatenate(sums, axis=1)
-    centres = np.concatenate([grid.centre_of(row / size, col / size), clearance.tight])
-    a, b = (end - 1 for end in np.divmod(np.unique(np.concatenate([p * (count + 1) + q for p, q in pairs])), count + 1))
-    costs = 0.5 * np.hypot(*(centres[a] - centres[b]).T) * (cost[a] / size[a] + cost[b] / size[b])
-    joined = joins.tocoo()
-    sizes = np.concatenate([size.astype(np.intp), np.ones(len(clearance.tight), dtype=np.intp)])
-    end = _regions_of(clearance, label, len(sizes), joined.col.astype(np.intp))
-    one, other = np.concatenate([a, joined.row + count]), np.concatenate([b, end])
-    # Of several steps between two of them the cheapest counts.
-    order = np.lexsort((weights := np.concatenate([costs, joined.data]), other, one))
-    first = np.append(True, np.any(np.diff(np.stack([one, other])[:, order]) != 0, axis=0))
-    chosen = order[first]
-    half = csr_matrix((weights[chosen], (one[chosen], other[chosen])), shape=(len(sizes), len(sizes)))
-    return Regions(label, sizes, centres, half.maximum(half.T))
-
-
-def _regions_of(clearance: ClearanceMap, label: NDArray[np.int32], count: int, nodes: Ints) -> Ints:
-    cells, tight = clearance.geometry.cells, len(clearance.tight)
-    return np.where(nodes < cells, label.ravel()[np.minimum(nodes, cells - 1)] - 1, nodes - cells + count - tight)
-
-
-def _parted(passable: Bools) -> tuple[NDArray[np.int32], int]:
-    """Return numbers from 1 of what hangs together in each block of some rows (rows, cols), and how many there are."""
-    rows, cols = passable.shape
-    down, across = -(-rows // _BLOCK), -(-cols // _BLOCK)
-    apart = np.zeros((down, _BLOCK + 1, across, _BLOCK + 1), dtype=np.bool_)
-    whole = np.pad(passable, ((0, down * _BLOCK - rows), (0, across * _BLOCK - cols)))
-    apart[:, :-1, :, :-1] = whole.reshape(down, _BLOCK, across, _BLOCK)
-    label, count = ndimage.label(apart.reshape(down * (_BLOCK + 1), -1))
-    label = label.reshape(apart.shape)[:, :-1, :, :-1].reshape(whole.shape)[:rows, :cols]
-    return np.ascontiguousarray(label, dtype=np.int32), int(count)
-
-
-def _touching(one: NDArray[np.int32], other: NDArray[np.int32]) -> tuple[Ints, Ints]:
-    """Return the regions (k,), (k,) on both sides of borders (borders, n), each pair about once."""
-    both = np.stack([one, other])[:, (one > 0) & (other > 0)].astype(np.intp)
-    first, second = both[:, np.append(True, np.any(np.diff(both, axis=1) != 0, axis=0))] if both.size else both
-    return first, second

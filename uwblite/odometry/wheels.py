@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, spread
+from ..arrays import Floats, Ints, spread
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph
@@ -86,7 +86,7 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
         return wheels
     own = np.searchsorted(wheels.i, steps.i)
     off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
-    off = np.abs(np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off))
+    off = np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off)
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
     seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
@@ -94,11 +94,31 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(3)
     for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH_STEPS):
-        by_all, by_best = (spread(off[some[:, k], k]) for some in (seen, well))
-        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, 0.3, 10.0)
+        by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
+        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, 0.1, 10.0)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
 
+def _growing(off: Floats, step: Ints) -> float:
+    """Return the robust standard deviation of differences (m,) of steps (m,) by how it grows with the way.
+
+    Errors of wheels add up. An error of one cloud's pose, or of the stamp at which it was taken, is in the steps before and
+    after it with opposite signs. So the sum over n following steps has n times the variance of the wheels or more, and the
+    least quotient of all n is the nearest to it (the slope of a variogram, without its nugget).
+    """
+    begins = np.flatnonzero(np.diff(step, prepend=-2) != 1)
+    place = np.arange(len(step)) - np.repeat(begins, np.diff(np.append(begins, len(step))))
+    least = spread(off)
+    for n in _SUMS:
+        number = np.cumsum(place % n == 0) - 1
+        sums = np.bincount(number, off)[np.bincount(number) == n]
+        if len(sums) >= _ENOUGH_STEPS:
+            least = min(least, spread(sums) / np.sqrt(n))
+    return float(least)
+
+
+_SUMS = (2, 4, 8)
+"""Numbers of following steps whose differences are summed: up to two metres."""
 _ENOUGH_STEPS = 20
 """Least number of measured steps from which the noise of the wheels is learnt."""
 _MUCH_WORSE, _ALIKE = 6.0, 2.0

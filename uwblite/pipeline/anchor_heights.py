@@ -10,13 +10,12 @@ from typing import ClassVar
 import numpy as np
 
 from ..errors import SolverError
-from ..graph.calibration import HEIGHT, RADIO, with_free
+from ..graph.calibration import HEIGHT, RADIO, CalibrationConfig, with_free
 from ..graph.graph import Graph
 from ..graph.optimizer import Optimizer
 from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, explanations
-from ..problem.evidence import laplace_marginal_likelihood
+from ..problem.evidence import laplace_marginal_likelihood, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve
-from ..radio import prior_selection
 from .estimate import Estimate, OtherHeights, Task
 from .mapping_config import MappingConfig
 
@@ -29,6 +28,8 @@ class HeightPolicy:
     """Logarithm of the odds; wrong assumptions about the noise of ranges can cause 10 of it."""
     noticeable: ClassVar[float] = 1.0
     """m above the tag from which on anchors can look like another unit; lower ones lengthen short ranges only."""
+    high: ClassVar[float] = 6.0
+    """m above the tag; anchors in a large hall."""
     elsewhere: ClassVar[float] = 0.4
     """m rms between two trajectories from which on it matters which of them is true."""
 
@@ -56,9 +57,6 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
 def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimizer) -> Explanation | None:
     """Return the explanation by high anchors, None where the measurements do not determine it or the present one."""
 
-    def as_high(graph: Graph) -> list[Alternative]:
-        return [Alternative(with_free(prior_selection.with_high_anchors(graph, config.calibration), *RADIO))]
-
     def solved(graph: Graph) -> Graph:
         return solve(graph, comparable(config.solver), optimizer)[0]
 
@@ -67,11 +65,26 @@ def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimize
         return laplace_marginal_likelihood(with_free(graph, HEIGHT))
 
     present = estimate.problem
+    high = Alternative(with_high_anchors(present, config.calibration))
     try:
-        found = explanations(present, lambda graph: as_high(graph) if graph is present else [], solved, evidence)
+        found = explanations(present, lambda graph: [high] if graph is present else [], solved, evidence)
     except SolverError:
         return None
     return next((each for each in found if each.graph is not present), None)
+
+
+def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
+    """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
+
+    As the start, lengths scaled by a wrong unit are scaled back; heights that were fixed at 0 are free again.
+    """
+    scales, heights = graph.calibration.of_kinds("odometry_scale"), graph.calibration.of_kinds(HEIGHT)
+    stretched = 1.0 + float(np.mean(graph.calibration.values[scales])) if scales.any() else 1.0
+    poses = np.column_stack([graph.poses[:, :2] / stretched, graph.poses[:, 2]])
+    graph = graph.updated(poses, graph.anchors / stretched, np.where(scales, 0.0, graph.calibration.values))
+    sigma = prior_sigma(graph)
+    sigma[scales], sigma[heights] = config.odometry_scale, HeightPolicy.high**2
+    return with_prior_sigma(with_free(graph, *RADIO), sigma)
 
 
 def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:

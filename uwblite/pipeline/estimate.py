@@ -86,6 +86,8 @@ class Estimate:
     """None without lidar, and again after the final optimisation."""
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
+    rejected: Bools | None = None
+    """(k,) keyframes whose step to the next the clouds measure falsely, see ScanOdometry; None = none."""
     closures: Closures = field(default_factory=no_closures)
     other_heights: OtherHeights | None = None
     other_side: Graph | None = None

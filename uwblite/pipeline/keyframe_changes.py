@@ -42,7 +42,8 @@ def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) ->
     ranges = None if estimate.ranges is None else _attached(estimate.ranges, before, after)
     fixed = np.isin(np.arange(len(poses)), number[estimate.graph.fixed_poses])
     graph = replace(estimate.graph, poses=poses, edges=edges, fixed_poses=fixed)
-    return replace(estimate, graph=graph, odometry=odometry, ranges=ranges, recordings=after)
+    rejected = None if estimate.rejected is None or len(poses) != len(estimate.rejected) else estimate.rejected
+    return replace(estimate, graph=graph, odometry=odometry, ranges=ranges, rejected=rejected, recordings=after)
 
 
 def _cut(odometry: OdometryEdges, number: Ints, after: Recordings) -> OdometryEdges:

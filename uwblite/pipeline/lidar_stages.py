@@ -184,14 +184,16 @@ _RETIMINGS = 4
 def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
     """Match each cloud with those just before and after it, so that sub-maps are stiff; objects that move are left out."""
     config, rules, graph = task.config, task.config.refinement, estimate.graph
-    estimate = replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, config))
+    rejected = np.zeros(len(graph.poses), dtype=bool)
+    rejected[estimate.odometry.i[track.rejected]] = True
+    estimate = replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, config), rejected=rejected)
     weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
     return _refined_neighbours(
-        estimate, graph, gate, task, searched=track.searched, slipped=int(np.sum(track.slips > _LIKELY)),
-        moving=round(float(track.moving.mean()), 4),
+        estimate, graph, gate, task, searched=track.searched, rejected=int(track.rejected.sum()),
+        slipped=int(np.sum(track.slips > _LIKELY)), moving=round(float(track.moving.mean()), 4),
     )  # fmt: skip
 
 
@@ -199,7 +201,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
     """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
     scans, rules = estimate.lidar, task.config.refinement
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
-    i, j = _pairs(graph, scans, settings, task)
+    i, j = _pairs(estimate, graph, settings, task)
     edges = _with_inflated_ranges(estimate).odometry_and_ranges
     refined = _refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
     ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
@@ -230,11 +232,15 @@ _INFLATION = 10.0
 """Factor on the ranges' standard deviations."""
 
 
-def _pairs(graph: Graph, scans: ScanClouds, settings: RefinementConfig, task: Task) -> tuple[Ints, Ints]:
-    """Return pairs of overlapping clouds (e,), (e,), without those that the user has forbidden."""
-    recordings = task.recordings
-    i, j = joint_refinement.choose_pairs(scans.clouds, graph.poses, recordings.path, recordings.of_keyframe, settings)
+def _pairs(estimate: Estimate, graph: Graph, settings: RefinementConfig, task: Task) -> tuple[Ints, Ints]:
+    """Return pairs of clouds (e,), (e,) that overlap at a graph's poses, without those that the user has forbidden and those
+    of one visit that lead across a step which clouds measure falsely."""
+    recordings, clouds = task.recordings, estimate.lidar.clouds
+    i, j = joint_refinement.choose_pairs(clouds, graph.poses, recordings.path, recordings.of_keyframe, settings)
     kept = task.allowed(i, j)
+    if estimate.rejected is not None:
+        until: Ints = np.cumsum(estimate.rejected) - estimate.rejected
+        kept &= (j - i > max(settings.neighbours)) | (until[i] == until[j])
     return i[kept], j[kept]
 
 
@@ -257,7 +263,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is not None:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
     before, edges = estimate.graph.poses, estimate.odometry_and_ranges
-    i, j = _pairs(estimate.graph, scans, config.refinement, task)
+    i, j = _pairs(estimate, estimate.graph, config.refinement, task)
     refined = _refine(estimate.graph, edges, scans, i, j, config.refinement, task, "joint refinement")
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
@@ -311,7 +317,7 @@ _STILL = 0.001
 def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate:
     """Match all clouds again after the poses moved by a shift, m, and solve with these matches."""
     scans, settings = estimate.lidar, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
-    i, j = _pairs(estimate.graph, scans, settings, task)
+    i, j = _pairs(estimate, estimate.graph, settings, task)
     refined = _refine(estimate.graph, estimate.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
     task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))

@@ -12,8 +12,7 @@ without contradiction this is that all units are right. The scale of the radios 
 several widths, from calibrated to uncalibrated radios, are tried, and their mean (of the logarithms), weighted by
 marginal likelihood, is taken. A scale that is clearly off gets the widest prior. So a scale stays at its nominal value as long
 as the recording does not show it, is corrected in part where it is uncertain, and is free where the posterior odds are clear.
-Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. The marginal likelihood (Laplace) at the
-optimum is compared with that of another hypothesis: the wheels' unit is right, and the anchors are high.
+Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -21,48 +20,36 @@ With the posterior N(a, P) found under the prior N(0, D), the marginal likelihoo
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
+from ..graph.calibration import BIAS, RANGE_SCALE, CalibrationConfig
 from ..graph.graph import Edges, Graph
 from ..graph.joint_covariance import calibration_covariance
+from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
 
-_STEPS = 4
-"""Number of widths tried, from calibrated to uncalibrated radios, evenly spaced in their logarithm."""
-_WRONG_UNIT = 0.1
-"""Prior odds that the wheels' unit of length is wrong, against all units being right."""
-_OFF = 1.0
-"""Prior odds that the radio's scale is off, by any order of magnitude, against being right; and the same of biases."""
-_CLEARLY = 3.0
-"""Posterior odds from which on the scale counts as off and is free; positive evidence (Kass and Raftery, Bayes factors,
-1995)."""
-_FARTHEST = 0.08
-"""Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
-_SHORT, _TOO_SHORT = -0.01, 0.01
-"""Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a radio:
-ranges too long may come from late first paths, ranges too short only from a wrong constant."""
-_HIGH = 6.0
-"""Height above the tag of anchors in a large hall, m."""
 
+@dataclass(frozen=True, slots=True)
+class UnitPolicy:
+    """What is known beforehand of units of length and of the calibration of radios."""
 
-def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
-    """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
-
-    As the start, lengths scaled by a wrong unit are scaled back; heights that were fixed at 0 are free again.
-    """
-    scales, heights = graph.calibration.of_kinds("odometry_scale"), graph.calibration.of_kinds(HEIGHT)
-    stretched = 1.0 + float(np.mean(graph.calibration.values[scales])) if scales.any() else 1.0
-    poses = np.column_stack([graph.poses[:, :2] / stretched, graph.poses[:, 2]])
-    graph = graph.updated(poses, graph.anchors / stretched, np.where(scales, 0.0, graph.calibration.values))
-    graph = replace(graph, fixed_calibration=graph.fixed_calibration & ~heights)
-    sigma = prior_sigma(graph)
-    sigma[scales], sigma[heights] = config.odometry_scale, _HIGH**2
-    return with_prior_sigma(graph, sigma)
+    widths: ClassVar[int] = 4
+    """Number of widths tried, from calibrated to uncalibrated radios, evenly spaced in their logarithm."""
+    wrong_unit: ClassVar[float] = 0.1
+    """Prior odds that the wheels' unit of length is wrong, against all units being right."""
+    off: ClassVar[float] = 1.0
+    """Prior odds that the radio's scale is off, by any order of magnitude, against being right; and the same of biases."""
+    farthest: ClassVar[float] = 0.08
+    """Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
+    short: ClassVar[float] = -0.01
+    """Relative error from which on ranges are shorter than the speed of light allows."""
+    too_short: ClassVar[float] = 0.01
+    """Factor on the odds of such a radio: ranges too long may come from late first paths, too short ones do not."""
 
 
 def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:
@@ -118,7 +105,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     if radios:
         floats = int(np.flatnonzero(hypothesis == 0)[-1])
         off = float(_mean_under(mean, covariance, before, tried[floats][0])[0])
-        against = -np.inf if abs(off) > _FARTHEST else np.log(_TOO_SHORT) if off < _SHORT else 0.0
+        against = -np.inf if abs(off) > UnitPolicy.farthest else np.log(UnitPolicy.too_short) if off < UnitPolicy.short else 0.0
         odds = odds + np.where((hypothesis == 0) & (np.arange(len(odds)) > 0), against, 0.0)
     worth = worth + odds[:, None] + np.log(_odds(len(biases)))
     likely = np.exp(worth - worth.max())
@@ -136,7 +123,7 @@ def _unit_widths(units: Floats, likely: Floats) -> Floats:
     ----------
     likely : (h,) how likely each is.
     """
-    if likely[1:].sum() > _CLEARLY * likely[0]:
+    if likely[1:].sum() > np.exp(EvidencePolicy.positive) * likely[0]:
         return np.asarray(units[likely > 0.0][-1])
     return np.asarray(np.exp(likely @ np.log(units) / likely.sum()))
 
@@ -160,14 +147,14 @@ def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats,
         wrong = [np.arange(wheels) == k for k in range(wheels)]
         for number, these in enumerate(wrong if wheels == 1 else [*wrong, np.ones(wheels, dtype=bool)]):
             units.append(np.append(units[0][:radios], np.where(these, config.odometry_unit, right)))
-            odds.append(_WRONG_UNIT)
+            odds.append(UnitPolicy.wrong_unit)
             hypothesis.append(number + 1)
     return np.array(units), np.log(odds), np.array(hypothesis)
 
 
 def _odds(widths: int) -> Floats:
     """Return the prior odds (widths,) of the widths from calibrated to uncalibrated radios."""
-    return np.append(1.0, np.full(widths - 1, _OFF / max(widths - 1, 1)))
+    return np.append(1.0, np.full(widths - 1, UnitPolicy.off / max(widths - 1, 1)))
 
 
 def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> Floats:
@@ -177,7 +164,7 @@ def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats)
 
 
 def _between(low: float, high: float) -> list[float]:
-    return [high] if not 0.0 < low < high else np.geomspace(low, high, _STEPS).tolist()
+    return [high] if not 0.0 < low < high else np.geomspace(low, high, UnitPolicy.widths).tolist()
 
 
 def _free(graph: Graph, name: str) -> Ints:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
@@ -131,15 +131,11 @@ def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAncho
         low, high = central_box(boxes[0])
         reach = max(float((high - low).max()), _ANCHOR_REACH)
         boxes = [np.clip(boxes[0], low, high), np.clip(boxes[1], low - reach, high + reach)]
-    if grid is not None:
-        observed = grid.log_odds != 0.0
+    if grid is not None and (observed := grid.log_odds != 0.0).any():
         rows, cols = np.flatnonzero(observed.any(axis=1)), np.flatnonzero(observed.any(axis=0))
-        if len(rows):
-            corners = grid.geometry.centre_of(rows[[0, -1]], cols[[0, -1]])
-            boxes.append(corners)
+        boxes.append(grid.geometry.centre_of(rows[[0, -1]], cols[[0, -1]]))
     points = np.concatenate(boxes)
-    if len(points) == 0:
-        points = np.zeros((1, 2))
+    points = points if len(points) else np.zeros((1, 2))
     return points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
 
 
@@ -159,22 +155,20 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 
 def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the more certain a cell, the closer to white or black."""
-    return _colours(grid.log_odds)
+    return _painted(grid.log_odds)
 
 
 def _painted(cells: NDArray[Any]) -> Image:
     """Return the colours (rows, cols, 3) of log-odds (rows, cols); colours stay as they are."""
-    return _colours(cells) if cells.ndim == 2 else cells
-
-
-def _colours(log_odds: NDArray[np.float32]) -> Image:
-    image = np.full((*log_odds.shape, 3), PAPER, dtype=np.uint8)
+    if cells.ndim == 3:
+        return cells
+    image = np.full((*cells.shape, 3), PAPER, dtype=np.uint8)
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
-    for part, colours in zip(np.split(log_odds, step := range(256, len(log_odds), 256)), np.split(image, step), strict=True):
+    for start in range(0, len(cells), 256):
+        part, colours = cells[start : start + 256], image[start : start + 256]
         known = part != 0.0
         p = (1.0 / (1.0 + np.exp(-part[known]))).astype(np.float32)
-        free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, None]
-        wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, None]
+        free, wall = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, None], np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, None]
         colours[known] = np.rint(paper + free * (floor - paper) + wall * (ink - paper))
     return image
 
@@ -188,9 +182,10 @@ def _paste(image: Image, cells: NDArray[Any], geometry: GridGeometry, low: Float
         each = round(pixels)
         row = (height - 1 - np.arange(height)) // each - first_row
         col = np.arange(width) // each - first_col
-        rows, cols = (row >= 0) & (row < geometry.rows), (col >= 0) & (col < geometry.cols)
-        colours = _painted(cells)
-        image[_span_of(rows), _span_of(cols)] = colours.take(col[cols], axis=1).take(row[rows], axis=0)
+        rows, cols = np.flatnonzero((row >= 0) & (row < geometry.rows)), np.flatnonzero((col >= 0) & (col < geometry.cols))
+        if len(rows) and len(cols):
+            shown = _painted(cells).take(col[cols], axis=1).take(row[rows], axis=0)
+            image[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] = shown
         return
     together = round(1.0 / pixels)
     row, col = (first_row + np.arange(geometry.rows)) // together, (first_col + np.arange(geometry.cols)) // together
@@ -207,19 +202,16 @@ def _paste(image: Image, cells: NDArray[Any], geometry: GridGeometry, low: Float
     image[np.ix_(height - 1 - rows[seen_rows], cols[seen_cols])] = shown[np.ix_(seen_rows, seen_cols)]
 
 
-def _span_of(inside: Bools) -> slice:
-    """Return the slice of the elements that are true; they lie side by side."""
-    places = np.flatnonzero(inside)
-    return slice(places[0], places[-1] + 1) if len(places) else slice(0, 0)
-
-
 def _draw_track(canvas: Canvas, track: Floats, colour: Colour) -> None:
     """Draw a path (n, 2), pixels, with a disc at its start and a ring at its end."""
     canvas.polyline(track, 2.2, colour, 0.85)
-    canvas.discs(track[:1], 7.0, FLOOR)
-    canvas.discs(track[:1], 5.5, START)
-    canvas.discs(track[-1:], 7.0, colour)
-    canvas.discs(track[-1:], 4.0, FLOOR)
+    for end, radius, ink in (
+        (track[:1], 7.0, FLOOR),
+        (track[:1], 5.5, START),
+        (track[-1:], 7.0, colour),
+        (track[-1:], 4.0, FLOOR),
+    ):
+        canvas.discs(end, radius, ink)
 
 
 def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:

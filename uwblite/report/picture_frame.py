@@ -49,17 +49,17 @@ def draw_axes(image: NDArray[np.uint8], low: Floats, scale: float) -> None:
     canvas = Canvas(image)
     height, width = image.shape[:2]
     step = round_length(_TICK_EVERY / scale)
-    for value in np.arange(math.ceil(low[0] / step), math.floor((low[0] + width / scale) / step) + 1) * step:
-        x = (value - low[0]) * scale
-        canvas.lines(np.array([[x, height - 7.0, x, height]]), 1.5, INK)
-        label = f"{value + 0.0:g}"
-        if 20 < x < width - 30:
-            canvas.text(x - 3 * len(label), height - 18, label, INK, 1, PAPER)
-    for value in np.arange(math.ceil(low[1] / step), math.floor((low[1] + height / scale) / step) + 1) * step:
-        y = height - (value - low[1]) * scale
-        canvas.lines(np.array([[0.0, y, 7.0, y]]), 1.5, INK)
-        if 10 < y < height - 30:
-            canvas.text(11, y - 4, f"{value + 0.0:g}", INK, 1, PAPER)
+    for axis, length in enumerate((width, height)):
+        for value in np.arange(math.ceil(low[axis] / step), math.floor((low[axis] + length / scale) / step) + 1) * step:
+            at, label = (value - low[axis]) * scale, f"{value + 0.0:g}"
+            if axis == 0:
+                canvas.lines(np.array([[at, height - 7.0, at, height]]), 1.5, INK)
+                place, shown = (at - 3 * len(label), height - 18.0), 20 < at < width - 30
+            else:
+                canvas.lines(np.array([[0.0, height - at, 7.0, height - at]]), 1.5, INK)
+                place, shown = (11.0, height - at - 4), 10 < height - at < height - 30
+            if shown:
+                canvas.text(*place, label, INK, 1, PAPER)
     _draw_origin(canvas, np.array([-low[0] * scale, height + low[1] * scale]))
 
 

@@ -38,24 +38,18 @@ def _coordinates(points: Floats) -> str:
 
 def _extent(result: MapResult) -> tuple[float, float, float, float]:
     """Return the box of everything drawn: x, y (downwards) of the corner, width, height, m."""
-    parts = [result.trajectory[:, :2], result.graph.poses[:, :2]]
-    parts += [np.asarray(a.position)[None] for a in result.anchors]
+    places = np.array([a.position for a in result.anchors]).reshape(-1, 2)
+    parts = [result.trajectory[:, :2], result.graph.poses[:, :2], places]
     if result.grid is not None:
-        geometry = result.grid.geometry
-        parts.append(np.stack([geometry.origin, geometry.corner]))
+        parts.append(np.stack([result.grid.geometry.origin, result.grid.geometry.corner]))
     points = np.concatenate(parts)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     size = float(np.max(high - low))
-    names = [float(a.position[0]) + _NAME * size for a in result.anchors if np.isfinite(a.position).all()]
-    high = np.array([max([high[0], *names]), high[1]])
+    high[0] = max([high[0], *(places[np.isfinite(places).all(axis=1), 0] + _NAME * size)])
     margin = 0.03 * size + 0.5
-    return (
-        float(low[0]) - margin,
-        -float(high[1]) - margin,
-        float(high[0] - low[0]) + 2 * margin,
-        float(high[1] - low[1]) + 2 * margin,
-    )
+    (x, y), (width, height) = (low - margin).tolist(), (high - low + 2 * margin).tolist()
+    return x, -(y + height), width, height
 
 
 def draw(result: MapResult, grid_png: bytes | None) -> str:
@@ -72,15 +66,11 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
             f' href="data:image/png;base64,{data}"/>'
         )
     parts.append(_closure_lines(result))
-    parts.append('<g class="trajectory">')
-    for recording in np.unique(result.recording):
-        path = result.trajectory[result.recording == recording, :2]
-        parts.append(f'<polyline class="s{int(recording) % 4}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
-    for path in result.doubted_paths():
-        parts.append(f'<polyline class="doubted" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
     recordings = np.unique(result.recording).tolist()
-    parts += [_end_marks(result, recording, size) for recording in recordings]
-    parts.append("</g>")
+    paths = [(f"s{k % 4}", result.trajectory[result.recording == k, :2]) for k in recordings]
+    paths += [("doubted", path) for path in result.doubted_paths()]
+    lines = [f'<polyline class="{kind}" points="{_coordinates(p[thin(len(p), MOST_POINTS)])}"/>' for kind, p in paths]
+    parts += ['<g class="trajectory">', *lines, *(_end_marks(result, recording, size) for recording in recordings), "</g>"]
     parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
     bar = round_length(size / 5.0)
     svg = (
@@ -96,8 +86,8 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     unclear = "orange triangle: an anchor that is not certain; " if any(a.status != "ok" for a in result.anchors) else ""
     unclear += "yellow: a stretch that is not to be trusted; " if result.doubted_stretches else ""
     words = f"Green: start; ring: end; {unclear}wheel or pinch zooms, dragging moves; point at things for details."
-    paths = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
-    hint = f'<p class=hint><output id="place"></output>{paths}{words}</p>'
+    keys = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
+    hint = f'<p class=hint><output id="place"></output>{keys}{words}</p>'
     return f"<div class=mapbox>{svg}</div><div class=controls>{boxes}<span class=buttons>{buttons}</span></div>{hint}"
 
 
