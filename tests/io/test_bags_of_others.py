@@ -76,10 +76,10 @@ def test_the_truth_is_no_odometry(tmp_path):
     path = bag(tmp_path, [*rows, pose(1.0, 1.0, topic="/wheels"), pose(2.0, 1.0, topic="/wheels"), pose(2.0, topic="/other")])
     log = read_bag(path)
     assert len(log.odometry.stamps) == 2
-    assert warned(log, "the odometry is read from /wheels; --odometry-topic takes another (/other, /robot/ground_truth/odom)")
+    assert warned(log, "the odometry is read from /wheels; `topics.odometry` takes another (/other, /robot/ground_truth/odom)")
     assert len(read_bag(path, BagTopics(odometry="/robot/ground_truth/odom")).odometry.stamps) == 200
     (tmp_path / "alone").mkdir()
-    with pytest.raises(FormatError, match=r"no odometry.*; /gt/pose is the truth by its name, and --odometry-topic /gt/pose"):
+    with pytest.raises(FormatError, match=r"no odometry.*; /gt/pose is the truth by its name, and `topics.odometry=/gt/pose`"):
         read_bag(bag(tmp_path / "alone", [pose(1.0, topic="/gt/pose")]))
 
 
@@ -260,7 +260,7 @@ def test_an_orientation_that_is_none_is_no_heading(tmp_path):
     assert warned(log, "orientations of 1 odometry messages are no unit quaternions")
     assert warned(log, "transforms without a rotation (a quaternion of zeros, or no number) were left out: laser")
     (tmp_path / "none").mkdir()
-    with pytest.raises(FormatError, match=r"no message on /odom can be used: 2 of 2 .*no heading.*--odometry-topic /tf"):
+    with pytest.raises(FormatError, match=r"no message on /odom can be used: 2 of 2 .*no heading.*`topics.odometry=/tf`"):
         read_bag(bag(tmp_path / "none", [pose(1.0, 0.0, {"x": 0.0}), pose(1.1, 0.0, {"x": 0.0})]))
 
 

@@ -82,7 +82,7 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
     path = Path(folder)
     present = [path / name for name in _FILES if (path / name).is_file()]
     if present and not force:
-        raise ConfigError(f"{path} already holds a recording ({present[0].name}); use --force to replace it, or another folder")
+        raise ConfigError(f"{path} already holds a recording ({present[0].name}); use `force` to replace it, or another folder")
     refuse_foreign(unmarked(path, _FILES, "sensors.toml", _MARK))
     with replacing_folder(path, _FILES.__contains__) as waiting:
         _write_tables(waiting, log)
