@@ -128,6 +128,27 @@ def test_packed_blocks_that_are_complete_are_read(tmp_path, compression):
     assert len(log.odometry.stamps) > 300
 
 
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_of_packed_blocks_of_ros1_the_beginning_is_read(tmp_path, compression):
+    """A block that is cut off keeps what its packer had finished."""
+    from rosbags.rosbag1 import Writer
+
+    store, kind = store_with({}, 1), ODOMETRY
+    writer = Writer(tmp_path / "run.bag")
+    writer.set_compression(getattr(Writer.CompressionFormat, compression))
+    with writer as out:
+        connection = out.add_connection("/odom", kind, typestore=store)
+        for k in range(6000):
+            _, _, _, fields = odometry(1.0 + 0.02 * k, 0.01 * k + 1e-4 * ((k * 7919) % 101))
+            out.write(connection, round((1.0 + 0.02 * k) * 1e9), store.serialize_ros1(made(store, kind, fields), kind))
+    data = (tmp_path / "run.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: int(0.8 * len(data))])
+    log = read_bag(tmp_path / "cut.bag")
+    count = len(log.odometry.stamps)
+    assert 2000 < count < 6000
+    np.testing.assert_allclose(log.odometry.stamps, 1.0 + 0.02 * np.arange(count), atol=1e-6)
+
+
 def test_ros1_blocks_without_an_index_at_the_end(tmp_path):
     """The header of an active bag names no index, and its last block states no length."""
     path = bag(tmp_path, [odometry(1.0 + 0.02 * k, 0.01 * k) for k in range(500)], ros=1)

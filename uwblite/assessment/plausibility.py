@@ -19,7 +19,6 @@ from ..sensor_log.anchor_names import name_and_number
 from .causes import explained
 from .certainty import check_certainty
 from .decisions import RULES
-from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
 from .other_side import check_other_side
@@ -67,7 +66,6 @@ def judge(
         lambda: check_closures(estimate, anchors, grid, task),
         lambda: check_calibration(calibrated, usual, task),
         lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
-        lambda: check_displaced_stretches(table, anchors, task) if table else (),
         lambda: check_residuals(estimate, residuals, grid, task),
         lambda: check_unit(anchors, task),
         lambda: check_short_ranges(anchors, estimate, sigma, task),

@@ -125,11 +125,11 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
         for finding in check_recording(view.repaired):
             if finding.kind == WHEELS_AGAINST_LIDAR:
                 cure = "a map is doubted for it, unless its ranges agree with the lidar there"
-                yield replace(finding, severity=WARNING, cure=cure, sensor="log")
+                yield replace(finding, severity=WARNING, cure=cure)
             elif finding.severity == DOUBT:
-                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there", sensor="log")
+                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there")
             else:
-                yield replace(finding, cure="a map repairs it so; the files stay as they are", sensor="log")
+                yield replace(finding, cure="a map repairs it so; the files stay as they are")
 
 
 def _check_sensors(view: RecordingView) -> Iterator[Finding]:

@@ -66,7 +66,8 @@ def stamps_of_receipt(sensors: Sequence[str]) -> Finding:
 
 def clock_set_back(sensor: str, by: float) -> Finding:
     """Doubt a recording in which a sensor's clock was set back: its readings are in another order than they were made."""
-    return doubt("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there")
+    text = f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there"
+    return replace(doubt("clock-set-back", text), sensor=sensor)
 
 
 def clock_jump(clock: str, sensor: str, by: float, at: float, moved: float) -> Finding:
