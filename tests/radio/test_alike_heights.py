@@ -11,6 +11,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.radio.alike_heights import _common, with_alike_heights
 from uwblite.radio.range_measurements import range_edges
+from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 
@@ -41,7 +42,7 @@ def solved(seed, heights, anchors=slice(None)):
     frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
     listed = unknowns(CalibrationConfig(), ids, np.zeros(len(ids), dtype=bool))
     attached = attach_ranges(radio, wheels, frames, level)
-    edges = range_edges(attached, ids, level, block(listed), 0.15, TrilaterationConfig())
+    edges = range_edges(attached, ids, level, block(listed), RangeNoiseConfig(0.15), TrilaterationConfig())
     constant = np.array([u.key.kind not in (HEIGHT, "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, places.copy(), (prior_edges(listed),), block(listed), fixed, fixed_calibration=constant)

@@ -17,6 +17,7 @@ from uwblite.radio import bootstrap
 from uwblite.radio.bootstrap import bootstrap_graph
 from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult
 from uwblite.radio.range_measurements import range_edges
+from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 
@@ -37,7 +38,7 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=fixed)
     mounting = SensorMounting()
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, ids, mounting, calibration, 0.1, TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), TrilaterationConfig())
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
     config = BootstrapConfig(range_sigma=1.5 * SIGMA)
     bootstrapped = bootstrap_graph(

@@ -27,7 +27,7 @@ def world(seed, metres=40.0, anchors=3, **settings):
     wheels = Odometry(stamps, truth)
     frames = select(wheels, KeyframeConfig())
     attached = attach_ranges(radio, wheels, frames, MOUNTING)
-    edges = range_edges(attached, radio.anchor_ids, MOUNTING, Calibration(), 0.3, TrilaterationConfig())
+    edges = range_edges(attached, radio.anchor_ids, MOUNTING, Calibration(), RangeNoiseConfig(0.3), TrilaterationConfig())
     return stamps, truth, frames, places, radio, edges
 
 
@@ -48,7 +48,7 @@ def test_readings_that_cannot_be_distances_weigh_nothing():
     radio, wheels = ranges(rng, stamps, truth, np.zeros((1, 2))), Odometry(stamps, truth)
     radio.ranges[:4] = [0.0, -1.0, 1e6, 0.001]
     attached = attach_ranges(radio, wheels, select(wheels, KeyframeConfig()), MOUNTING)
-    edges = range_edges(attached, radio.anchor_ids, MOUNTING, Calibration(), 0.1, TrilaterationConfig())
+    edges = range_edges(attached, radio.anchor_ids, MOUNTING, Calibration(), RangeNoiseConfig(0.1), TrilaterationConfig())
     assert edges.weights.tolist() == [0.0] * 4 + [1.0] * (len(radio.ranges) - 4)
 
 
@@ -87,7 +87,8 @@ def test_a_range_is_an_outlier_by_what_one_range_scatters():
     radio = ranges(rng, stamps, truth, places, sigma=0.05, rate=8.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
     attached = attach_ranges(radio, Odometry(stamps, truth), frames, SensorMounting())
-    edges = range_edges(attached, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, TrilaterationConfig())
+    noise = RangeNoiseConfig(0.3)
+    edges = range_edges(attached, radio.anchor_ids, SensorMounting(), Calibration(), noise, TrilaterationConfig())
     slow = 0.15 * np.sin(edges.tag_positions(truth[frames.index]).sum(axis=1))
     edges = replace(edges, ranges=edges.ranges + slow + np.where(np.arange(len(edges)) == 40, 2.0, 0.0))
     graph = Graph(truth[frames.index], places)

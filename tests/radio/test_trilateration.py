@@ -211,11 +211,11 @@ def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
     path, state = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]), np.array([3.0, 4.0, 0.3])
     ranges = np.array([5.0, 4.0, 3.0]) + 0.3 + [0.1, -0.2, 4.0]
     covariance = np.array([[0.04, 0.0, 9.0], [0.0, 0.01, 9.0], [9.0, 9.0, 99.0]])
-    scored = _scored(path, ranges, state[None], covariance[None], np.array([0.5]), 0.1, CONFIG)[0]
+    scored = _scored(path, ranges, (state[None], covariance[None], np.array([0.5])), 0.1, CONFIG)[0]
     assert scored.cost == pytest.approx((5.0 + CONFIG.outlier**2) / 3.0 + (0.3 / CONFIG.bias_sigma) ** 2 / 3.0)
     assert (scored.sigma, scored.bias) == (0.5, 0.3)
     assert scored.position_sigma == pytest.approx(0.5 * 0.2)
-    assert _scored(path, ranges, state[None], -covariance[None], np.array([0.5]), 0.1, CONFIG)[0].position_sigma == 0.0
+    assert _scored(path, ranges, (state[None], -covariance[None], np.array([0.5])), 0.1, CONFIG)[0].position_sigma == 0.0
 
 
 def test_stretches_searched_together_have_the_places_of_each_alone():

@@ -36,10 +36,10 @@ def chordal_start(graph: Graph) -> Graph | None:
     z = np.exp(1j * graph.poses[:, 2])
     places = graph.poses[:, 0] + 1j * graph.poses[:, 1]
     try:
-        z = _solved(i, j, np.exp(1j * T[:, 2]), np.zeros(len(i)), information[:, 2], z, free)
+        z = _solved((i, j), np.exp(1j * T[:, 2]), np.zeros(len(i)), information[:, 2], z, free)
         z /= np.maximum(np.abs(z), _LEAST)
         step = z[i] * (T[:, 0] + 1j * T[:, 1])
-        places = _solved(i, j, np.ones(len(i)), step, information[:, :2].mean(axis=1), places, free)
+        places = _solved((i, j), np.ones(len(i)), step, information[:, :2].mean(axis=1), places, free)
     except SolverError:
         return None
     poses = np.column_stack([places.real, places.imag, np.angle(z)])
@@ -51,9 +51,9 @@ def chordal_start(graph: Graph) -> Graph | None:
 _LEAST = 1e-300
 
 
-def _solved(i: Ints, j: Ints, factor: Floats, step: Floats, weight: Floats, values: Floats, free: Bools) -> Floats:
+def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Floats, values: Floats, free: Bools) -> Floats:
     """Return the complex numbers (n,) with x_j = factor x_i + step (e,) in least squares, those that are not free as given."""
-    e, root = np.arange(len(i)), np.sqrt(weight)
+    (i, j), e, root = ends, np.arange(len(weight)), np.sqrt(weight)
     entries = np.concatenate([root + 0j, -root * factor]), (np.concatenate([e, e]), np.concatenate([j, i]))
     A = sparse.csc_matrix(entries, shape=(len(i), len(values)))
     right = root * step - A[:, ~free] @ values[~free]

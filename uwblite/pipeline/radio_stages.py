@@ -60,7 +60,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    ranges = range_edges(attached, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
+    ranges = range_edges(attached, ids, log.mounting, block, config.ranges, config.trilateration)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 

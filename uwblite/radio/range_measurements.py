@@ -8,27 +8,23 @@ from ..arrays import Bools, Floats, spread
 from ..graph.calibration import range_indices
 from ..graph.graph import Calibration, Graph
 from ..graph.range_edges import RangeEdges
-from ..graph.robust import Kernel
 from ..odometry.attached import AttachedRanges
 from ..sensor_log import SensorMounting
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
 from .trilateration import TrilaterationConfig, agreement, trilaterate_each, usable
 
-_RANGES = Kernel("cauchy", 2.5)
-
 
 def range_edges(
     attached: AttachedRanges, anchor_ids: tuple[str, ...], mounting: SensorMounting,
-    calibration: Calibration, sigma: float, search: TrilaterationConfig, kernel: Kernel = _RANGES,
+    calibration: Calibration, noise: RangeNoiseConfig, search: TrilaterationConfig,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 
     Parameters
     ----------
     anchor_ids : names of the graph's anchors; attached.anchor indexes them.
-    sigma : m, for all ranges until noise is learnt.
-    search : decides which readings can be distances. kernel : robust kernel of all ranges.
+    noise : of all ranges until it is learnt. search : decides which readings can be distances.
     """
     above = [mounting.height_difference(a) for a in anchor_ids]
     given = np.array([height or 0.0 for height in above])
@@ -37,14 +33,14 @@ def range_edges(
         attached.keyframe,
         attached.anchor,
         attached.ranges,
-        np.full(len(attached.ranges), sigma),
+        np.full(len(attached.ranges), noise.sigma),
         attached.lever_arm,
         attached.turn,
         attached.velocity,
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
         given[attached.anchor] - np.where(is_given[attached.anchor], attached.rise, 0.0),
         range_indices(calibration, attached.anchor, anchor_ids, attached.tag),
-        kernel,
+        noise.kernel,
         (usable(attached.ranges, search) & attached.inside).astype(np.float64),
         attached.stamps,
     )

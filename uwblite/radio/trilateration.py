@@ -107,10 +107,10 @@ def _of_one_size(
     paths, ranges = (np.stack(columns) for columns in zip(*picked, strict=True))
     refined = _refine(paths[each], ranges[each], np.concatenate(starts), steps, drift, config)
     for k, (path, own) in enumerate(picked):
-        states, covariances, sigmas = (values[each == k] for values in refined)
-        floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
+        own_refined = tuple(values[each == k] for values in refined)
+        floor = max(float(own_refined[2].min()), 0.5 * drift, 0.02)
         distinct: list[AnchorHypothesis] = []
-        for hypothesis in _scored(path, own, states, covariances, sigmas, floor, config):
+        for hypothesis in _scored(path, own, own_refined, floor, config):
             apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
             if all(a > max(3.0 * floor, 0.5 * searched[k][2]) for a in apart):
                 distinct.append(hypothesis)
@@ -222,9 +222,15 @@ def _refine(
 
 
 def _scored(
-    path: Floats, ranges: Floats, states: Floats, covariances: Floats, own: Floats, sigma: float, config: TrilaterationConfig
+    path: Floats, ranges: Floats, refined: tuple[Floats, ...], sigma: float, config: TrilaterationConfig
 ) -> list[AnchorHypothesis]:
-    """Return the hypotheses of refined states, best first; for the parameters see _refine, whose robust sigmas are `own`."""
+    """Return the hypotheses of refined states, best first.
+
+    Parameters
+    ----------
+    refined : states (s, 3), covariances (s, 3, 3) and robust sigmas (s,), see _refine. sigma : of the best, m.
+    """
+    states, covariances, own = refined
     offset, bias = states[:, :2, None] - path.T, states[:, 2]
     error = ranges - np.hypot(offset[:, 0], offset[:, 1]) - bias[:, None]
     cost = np.minimum((error / sigma) ** 2, config.outlier**2).mean(axis=1) + (bias / config.bias_sigma) ** 2 / len(ranges)
