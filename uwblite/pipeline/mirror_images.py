@@ -45,14 +45,19 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     free &= ~estimate.graph.fixed_anchors
     if not free.any():
         return estimate
-    config, (images, straight) = task.config.solver, _images(estimate, ranges)
+    config, (mirrored, straight), second = task.config.solver, _images(estimate, ranges), _second_places(estimate)
     here = _minimum(estimate.graph, ranges, free, estimate.graph.anchors, config)
     pace = MirrorPolicy.pace * EvidencePolicy.very_strong / (EvidencePolicy.very_strong - log_density(here))
     slow = replace(config, relative_decrease=max(config.relative_decrease, pace))
-    there = _minimum(estimate.graph, ranges, free, images, slow)
-    log_odds, others = 0.5 * (_costs(here, ranges) - _costs(there, ranges)), there.anchors
-    as_well = (np.hypot(*(others - here.anchors).T) > MirrorPolicy.apart) & (log_odds > -EvidencePolicy.very_strong)
-    best = estimate.graph
+    log_odds, others = np.full(len(free), -np.inf), here.anchors.copy()
+    for start in (mirrored, second):
+        there = _minimum(estimate.graph, ranges, free, start, slow)
+        odds = 0.5 * (_costs(here, ranges) - _costs(there, ranges))
+        likelier = (np.hypot(*(there.anchors - here.anchors).T) > MirrorPolicy.apart) & (odds > log_odds)
+        log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], there.anchors, others)
+    as_well, best = log_odds > -EvidencePolicy.very_strong, estimate.graph
+    other = found.ambiguous & np.any(second != best.anchors, axis=1)
+    images = np.where(other[:, None], second, mirrored)
     bent = np.flatnonzero(free & ~as_well & straight & (np.hypot(*(images - best.anchors).T) > MirrorPolicy.apart))
     if len(bent) and task.recordings.have_scans:
         # Anchors were estimated last and alone, and all together may be better.
@@ -123,22 +128,32 @@ def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, 
 
 
 def _images(estimate: Estimate, ranges: RangeEdges) -> tuple[Floats, Bools]:
-    """Return the other place (a, 2) of each anchor to be tried, m, mirrored at the line that fits the tag's places best; and
-    which anchors (a,) were measured from nearly a straight line alone."""
-    assert estimate.bootstrap is not None
+    """Return the anchors (a, 2), m, each mirrored at the line that fits the tag's places best; and which anchors (a,) were
+    measured from nearly a straight line alone."""
     anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
     straight = np.zeros(len(anchors), dtype=bool)
     for k in np.flatnonzero(estimate.placed).tolist():
         own = tags[ranges.alive & (ranges.anchor == k)]
         variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 2 else (np.full(2, np.inf), np.zeros((2, 2)))
         straight[k] = variances[0] <= MirrorPolicy.straight**2
-        found = estimate.bootstrap.hypotheses[k]
-        if estimate.bootstrap.ambiguous[k] and len(found) > 1:
-            # Later measurements may have moved the anchor from the first of the two places to the second.
-            anchors[k] = max((each.position for each in found[:2]), key=lambda place: float(np.hypot(*(place - anchors[k]))))
-        elif len(own) > 2:
+        if len(own) > 2:
             anchors[k] -= 2.0 * axes[:, 0] * float(axes[:, 0] @ (anchors[k] - own.mean(axis=0)))
     return anchors, straight
+
+
+def _second_places(estimate: Estimate) -> Floats:
+    """Return the anchors (a, 2), m, each at the other of the two places that the bootstrap found likeliest; where it found one,
+    at its own.
+
+    A few ranges from beside a straight way tilt the line that fits the tag's places, but not these.
+    """
+    assert estimate.bootstrap is not None
+    anchors = estimate.graph.anchors.copy()
+    for place, found in zip(anchors, estimate.bootstrap.hypotheses, strict=True):
+        if len(found) > 1:
+            # Later measurements may have moved the anchor from the first of the two places to the second.
+            place[:] = max((each.position for each in found[:2]), key=lambda other: float(np.hypot(*(other - place))))
+    return anchors
 
 
 def _minimum(graph: Graph, ranges: RangeEdges, free: Bools, anchors: Floats, config: SolverConfig) -> Graph:
