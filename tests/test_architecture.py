@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -202,9 +203,21 @@ def mutable_state(module):
         yield f"{module} rebinds a global"
 
 
+def options_in_messages(module):
+    """Options of the command line, in what is said to someone who passed arrays; the pages' own texts and styles are theirs."""
+    if module.startswith(("cli/", "server/", "report/")) or module == "__main__":
+        return
+    documents = {id(node.value) for node in nodes_of(module) if isinstance(node, ast.Expr)}
+    for node in nodes_of(module):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
+            text = re.sub(r"var\(--\w+|<!--|ros2 topic .*|-m venv --\S+", "", node.value)
+            if re.search(r"(?<![\w-])--[a-z]", text):
+                yield f"{module}:{node.lineno} {text!r}"
+
+
 RULES = (
     algorithms_in_files_and_devices, imports_from_above, imports_by_the_name_of_the_package, noise_and_impurity,
-    numbers_of_a_fixed_width, mutable_state,
+    numbers_of_a_fixed_width, mutable_state, options_in_messages,
 )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from faulting.case import Case, Fault, Floats, Ints
+from faulting.causes import causes_of
 from faulting.every import FAULTS
 from faulting.logs import two_buildings, two_robots
 from faulting.outcome import ANCHOR_BAR, CRASHED, VERDICTS, Outcome, by_kind, counted, summary
@@ -38,6 +39,7 @@ from trials import ROOT, SHARED, made, table, write_section
 from uwblite import se2
 from uwblite.assessment.recording import diagnose
 from uwblite.errors import UwbliteError
+from uwblite.findings import DOUBT, folded
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_words import time_order
 from uwblite.map_result import AnchorEstimate, MapResult
@@ -140,7 +142,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
         result = build_map(log)
         figures = judged(result, log.odometry.stamps, truth, case, sensors == "no-lidar")
         stated, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
-        kinds = tuple(doubt.kind for doubt in result.doubts)
+        kinds = tuple(cause.kind for cause, rest in folded(result.findings) if any(f.severity == DOUBT for f in (cause, *rest)))
         code, seconds = 3 if result.doubts else 0, time.process_time() - began
         signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
         check = checked(log, result=result)
@@ -155,7 +157,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
     seconds = seconds or time.process_time() - began
-    return Outcome(world, name, sensors, *figures, code, stated, kinds, check, seconds, warnings)
+    return Outcome(world, name, sensors, *figures, code, stated, kinds, check, seconds, warnings, causes_of(name))
 
 
 WITH_ANOTHER = {"two robots in one log": two_robots, "two buildings in one log": two_buildings}
@@ -214,7 +216,8 @@ def line(outcome: Outcome) -> str:
     """Return what became of a case in one line of text."""
     anchor = f"anchor {outcome.anchor:.3f}, exit code {outcome.exit_code}, check {outcome.check}, {outcome.seconds:.0f} s"
     case = f"{outcome.world} | {outcome.name} | {outcome.sensors}"
-    return f"{case} | {outcome.verdict} | ATE {outcome.ate:.3f}, {anchor} | {'; '.join(outcome.stated)}"
+    kinds = "" if outcome.named is not False else f"[told first: {outcome.kinds[0] if outcome.kinds else outcome.stated[0]}] "
+    return f"{case} | {outcome.verdict} | ATE {outcome.ate:.3f}, {anchor} | {kinds}{'; '.join(outcome.stated)}"
 
 
 def write_page(page: Path, done: Sequence[Outcome], minutes: float) -> None:

@@ -24,7 +24,8 @@ Written by `tools/make_docs.py` from the rules themselves; do not edit.
 A finding says what is wrong in a recording, in a map or in a live pose. Its kind is a fixed name, for searching here and for
 scripts (`kind` in `report.json` and in `--json`). A **doubt** is a reason not to trust the result: the files are written and
 the exit code is 3. A **warning** was repaired or costs accuracy. No rule takes back what another one found. Where a doubt is
-about stretches of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states.
+about stretches of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states. Settings and
+arguments stand in backticks; the command line puts its options there.
 
 *Planted faults* are those of `tools/faults.py` in a simulated laboratory and in a real recording: the faults after which this
 kind was the only doubt. A kind without such a fault is named by other rules at the same time, or needs a recording of another

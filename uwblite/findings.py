@@ -84,3 +84,20 @@ def kinds(findings: Iterable[Finding]) -> set[str]:
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return the findings, worst first, otherwise in their order."""
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def folded(findings: Iterable[Finding]) -> list[tuple[Finding, tuple[Finding, ...]]]:
+    """Return the findings that no other one of them explains, each with those that it explains, directly or by another one."""
+    given = tuple(findings)
+    first = {finding.kind: finding for finding in reversed(given)}
+
+    def cause(finding: Finding) -> Finding:
+        known = next((first[kind] for kind in finding.explained_by if kind in first), None)
+        return finding if known is None else cause(known)
+
+    roots = [cause(finding) for finding in given]
+    return [
+        (one, tuple(f for f, root in zip(given, roots, strict=True) if root is one and f is not one))
+        for one, own in zip(given, roots, strict=True)
+        if own is one
+    ]

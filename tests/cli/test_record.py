@@ -142,7 +142,7 @@ def test_a_recorder_with_its_page_ends_both(tmp_path):
     words = ["record", "--lidar", str(tmp_path / "no"), "--wait", "--out", str(out), "--watch", str(port)]
     process = subprocess.Popen([sys.executable, "-m", "uwblite", *words], cwd=ROOT, stderr=subprocess.PIPE)
     try:
-        for _ in range(100):
+        for _ in range(600):
             try:
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as answer:
                     page = answer.read()

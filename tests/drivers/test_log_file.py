@@ -53,7 +53,7 @@ def test_lines_are_read_back_by_the_reader(tmp_path):
 def test_an_existing_log_is_not_overwritten(tmp_path):
     path = tmp_path / "run.log"
     path.write_text("ODOM\n")
-    with pytest.raises(DataError, match="--append"):
+    with pytest.raises(DataError, match="`append`"):
         LogFile(path)
     assert path.read_text() == "ODOM\n"
 

@@ -16,7 +16,7 @@ from simulation.recording import Settings, simulate
 from uwblite.cli import main
 from uwblite.drivers.devices import open_device
 
-MINUTES, LEAD = 0.6, 3.0
+MINUTES, LEAD = 0.5, 2.0
 """min of driving, s of standing before."""
 BASES = {"kobuki": KobukiDevice, "create2": Create2Device, "line": TickLineDevice}
 OPTIONS = {

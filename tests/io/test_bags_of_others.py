@@ -76,10 +76,10 @@ def test_the_truth_is_no_odometry(tmp_path):
     path = bag(tmp_path, [*rows, pose(1.0, 1.0, topic="/wheels"), pose(2.0, 1.0, topic="/wheels"), pose(2.0, topic="/other")])
     log = read_bag(path)
     assert len(log.odometry.stamps) == 2
-    assert warned(log, "the odometry is read from /wheels; --odometry-topic takes another (/other, /robot/ground_truth/odom)")
+    assert warned(log, "the odometry is read from /wheels; `topics.odometry` takes another (/other, /robot/ground_truth/odom)")
     assert len(read_bag(path, BagTopics(odometry="/robot/ground_truth/odom")).odometry.stamps) == 200
     (tmp_path / "alone").mkdir()
-    with pytest.raises(FormatError, match=r"no odometry.*; /gt/pose is the truth by its name, and --odometry-topic /gt/pose"):
+    with pytest.raises(FormatError, match=r"no odometry.*; /gt/pose is the truth by its name, and `topics.odometry=/gt/pose`"):
         read_bag(bag(tmp_path / "alone", [pose(1.0, topic="/gt/pose")]))
 
 
@@ -126,6 +126,27 @@ def test_packed_blocks_that_are_complete_are_read(tmp_path, compression):
     cut.write_bytes(whole.read_bytes()[: int(0.8 * whole.stat().st_size)])
     log = read_bag(cut)
     assert len(log.odometry.stamps) > 300
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_of_packed_blocks_of_ros1_the_beginning_is_read(tmp_path, compression):
+    """A block that is cut off keeps what its packer had finished."""
+    from rosbags.rosbag1 import Writer
+
+    store, kind = store_with({}, 1), ODOMETRY
+    writer = Writer(tmp_path / "run.bag")
+    writer.set_compression(getattr(Writer.CompressionFormat, compression))
+    with writer as out:
+        connection = out.add_connection("/odom", kind, typestore=store)
+        for k in range(6000):
+            _, _, _, fields = odometry(1.0 + 0.02 * k, 0.01 * k + 1e-4 * ((k * 7919) % 101))
+            out.write(connection, round((1.0 + 0.02 * k) * 1e9), store.serialize_ros1(made(store, kind, fields), kind))
+    data = (tmp_path / "run.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: int(0.8 * len(data))])
+    log = read_bag(tmp_path / "cut.bag")
+    count = len(log.odometry.stamps)
+    assert 2000 < count < 6000
+    np.testing.assert_allclose(log.odometry.stamps, 1.0 + 0.02 * np.arange(count), atol=1e-6)
 
 
 def test_ros1_blocks_without_an_index_at_the_end(tmp_path):
@@ -239,7 +260,7 @@ def test_an_orientation_that_is_none_is_no_heading(tmp_path):
     assert warned(log, "orientations of 1 odometry messages are no unit quaternions")
     assert warned(log, "transforms without a rotation (a quaternion of zeros, or no number) were left out: laser")
     (tmp_path / "none").mkdir()
-    with pytest.raises(FormatError, match=r"no message on /odom can be used: 2 of 2 .*no heading.*--odometry-topic /tf"):
+    with pytest.raises(FormatError, match=r"no message on /odom can be used: 2 of 2 .*no heading.*`topics.odometry=/tf`"):
         read_bag(bag(tmp_path / "none", [pose(1.0, 0.0, {"x": 0.0}), pose(1.1, 0.0, {"x": 0.0})]))
 
 

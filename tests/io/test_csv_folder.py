@@ -46,7 +46,7 @@ def test_a_recording_survives_a_folder(tmp_path):
     np.testing.assert_array_equal(read.mounting.T_base_laser, log.mounting.T_base_laser)
     np.testing.assert_allclose(read.gyro.heading, log.gyro.heading, atol=1e-6)
     np.testing.assert_allclose(read.gyro.stamps, log.gyro.stamps, atol=1e-6)
-    with pytest.raises(ConfigError, match="--force"):
+    with pytest.raises(ConfigError, match="`force`"):
         write_csv_folder(tmp_path / "t", log)
     write_csv_folder(tmp_path / "t", log, force=True)
     (tmp_path / "t" / "sensors.toml").write_text("[scans]\n# of my own\n")

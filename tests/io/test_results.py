@@ -145,7 +145,7 @@ def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     folder = tmp_path / "map"
     check_target(folder, force=False)
     write_result(folder, [small_log()], small_result(), RECORD)
-    with pytest.raises(ConfigError, match="--force"):
+    with pytest.raises(ConfigError, match="`force`"):
         check_target(folder, force=False)
     check_target(folder, force=True)
     with pytest.raises(ConfigError, match="not a folder"):

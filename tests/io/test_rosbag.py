@@ -169,7 +169,7 @@ def test_the_real_bag_gives_the_measurements_of_its_log(shared_data):
     np.testing.assert_allclose(bag.scans.ranges, log.scans.ranges, atol=6e-4)
     np.testing.assert_allclose(bag.mounting.T_base_laser, log.mounting.T_base_laser, atol=1e-6)
     np.testing.assert_allclose(bag.mounting.tag_position, log.mounting.tag_position, atol=1e-6)
-    assert bag.notes.warnings[0] == "the scans are read from /scan; --scan-topic takes another (/sonar_scan)"
+    assert bag.notes.warnings[0] == "the scans are read from /scan; `topics.scan` takes another (/sonar_scan)"
     assert "not used: /beacon" in bag.notes.warnings[1]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.round_columns import find_columns, fitted_circles, refined_columns, surroundings
+from uwblite.lidar.round_columns import fitted_circles, join_circles, refined_columns, surroundings
 from uwblite.odometry.attached import ScanPoints
 
 POSES = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a), a + 2.0] for a in np.arange(0.0, 6.2, 0.5)])
@@ -48,7 +48,7 @@ def rays_in_map(rays):
 
 def test_a_column_is_found_where_it_stands():
     rays = seen(POSES, circle)
-    columns = find_columns(fitted_circles(rays), POSES)
+    columns = join_circles(fitted_circles(rays), POSES)
     assert len(columns) == 1
     np.testing.assert_allclose(columns[0], [0.0, 0.0, RADIUS], atol=0.05)
     np.testing.assert_allclose(refined_columns(columns, *rays_in_map(rays))[0], [0.0, 0.0, RADIUS], atol=0.003)
@@ -57,13 +57,13 @@ def test_a_column_is_found_where_it_stands():
 def test_a_column_seen_from_too_few_keyframes_is_none():
     rays = seen(POSES[:2], circle)
     assert len(fitted_circles(rays).radius) == 2
-    assert len(find_columns(fitted_circles(rays), POSES)) == 0
+    assert len(join_circles(fitted_circles(rays), POSES)) == 0
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_box_is_no_column(seed):
     rays = seen(POSES, square, seed=seed)
-    columns = find_columns(fitted_circles(rays), POSES)
+    columns = join_circles(fitted_circles(rays), POSES)
     assert len(refined_columns(columns, *rays_in_map(rays))) == 0
 
 

@@ -31,7 +31,7 @@ def said(log):
 
 
 def factor(text):
-    return text.rsplit(" ", 1)[-1].rstrip(")")
+    return text.rsplit("=", 1)[-1].rstrip("`)")
 
 
 @pytest.mark.parametrize(("speed", "unit"), [(8.99, ""), (9.01, "0.01"), (89.9, "0.01"), (90.1, "0.001"), (-90.1, "0.001")])

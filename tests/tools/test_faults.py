@@ -5,6 +5,7 @@ from dataclasses import replace
 import faults
 import numpy as np
 import pytest
+from faulting.causes import causes_of
 from faulting.every import FAULTS
 from faulting.outcome import SENSORS, VERDICTS, Outcome, by_kind, cell, counted, summary
 
@@ -32,6 +33,26 @@ DOUBTED = replace(RIGHT, exit_code=3, stated=("the map may be mirrored",), kinds
 def test_a_cell_has_the_verdict_and_the_error(outcome, expected):
     assert outcome.verdict in VERDICTS
     assert cell(outcome) == expected
+
+
+@pytest.mark.parametrize(("code", "kinds", "stated", "named"), [
+    (3, ("mirrored", "uncertain"), ("", ""), True), (3, ("uncertain", "mirrored"), ("", ""), False), (0, (), (), None),
+    (1, (), ("the odometry's positions look like millimetres",), True), (1, (), ("two robots in one log",), False),
+])  # fmt: skip
+def test_the_true_cause_is_named_first(code, kinds, stated, named):
+    outcome = replace(RIGHT, exit_code=code, kinds=kinds, stated=stated, causes=("mirrored", "millimetres"))
+    assert outcome.named is named
+    assert ("by another name" in cell(outcome)) is (named is False)
+    assert replace(outcome, causes=()).named is None
+
+
+def test_every_fault_knows_its_cause():
+    """Kinds that exist, or words; a recording without a fault has none."""
+    page = (faults.ROOT / "docs" / "formats.md").read_text()
+    for fault in FAULTS:
+        causes = causes_of(fault)
+        assert bool(causes) is (fault != "none"), fault
+        assert all(f"`{cause}`" in page for cause in causes if "-" in cause), causes
 
 
 DONE = [

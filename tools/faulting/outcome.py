@@ -48,6 +48,15 @@ class Outcome:
     """Exit code of `uwblite check`."""
     seconds: float
     warnings: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    """Kinds of findings, or words of a refusal, that name the fault."""
+
+    @property
+    def named(self) -> bool | None:
+        """Whether what is told first names the true cause; None where nothing is doubted, or there is no fault."""
+        if self.exit_code not in (1, 3) or not self.causes:
+            return None
+        return self.kinds[0] in self.causes if self.kinds else any(word in self.stated[0] for word in self.causes)
 
     @property
     def verdict(self) -> str:
@@ -65,6 +74,7 @@ class Outcome:
 def cell(outcome: Outcome) -> str:
     """Return the verdict in a word, and the error of the trajectory; of an anchor too, where that is what is wrong."""
     word = f"**{outcome.verdict}**" if outcome.verdict.isupper() else outcome.verdict
+    word += " by another name" if outcome.named is False else ""
     error = "" if np.isnan(outcome.ate) else f" {outcome.ate:.2f}"
     return word + error + (f", anchor {outcome.anchor:.1f}" if outcome.beyond > 0.0 else "")
 
@@ -101,4 +111,6 @@ def summary(done: Sequence[Outcome]) -> str:
     """Return the counts of all verdicts in one line."""
     verdicts = Counter(o.verdict for o in done)
     counts = ", ".join(f"{v} {verdicts[v]}" for v in VERDICTS)
-    return f"{len({o.name for o in done})} kinds of fault in {len(done)} recordings: {counts}"
+    named = [o.named for o in done if o.named is not None]
+    first = f"; true cause named first in {sum(named)} of {len(named)} that were doubted or refused" if named else ""
+    return f"{len({o.name for o in done})} kinds of fault in {len(done)} recordings: {counts}{first}"

@@ -24,8 +24,8 @@ _BY_RANGES = _PLACES | {
 }
 """What a map by ranges and wheels alone shows of a fault of either."""
 _BY_SCANS = frozenset({
-    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-jumps",
-    "odometry-steps", "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
+    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-steps",
+    "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
     "unusual-calibration", "mirrored",
 })  # fmt: skip
 """What a map shows of a fault of lidar or wheels."""
@@ -68,6 +68,13 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
     "few-ranges": frozenset({"anchor-unplaced"}),
 })  # fmt: skip
 """By the kind of a cause, the kinds that it explains; a cause stands before those causes that it explains."""
+_SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType({
+    "radio": _TIMES | _BY_RANGES | {
+        "carried", "spikes", "few-in-reach", "few-ranges", "no-ranges", "untied-parts", "odometry-alone",
+    },
+    "lidar": _TIMES | _BY_SCANS | {"wheels-against-lidar", "carried", "no-lidar", "range-scatter", "anchors-moved-together"},
+})  # fmt: skip
+"""What a fault of one sensor alone can explain; one of the odometry may explain all."""
 _RANK = {kind: number for number, kind in enumerate(EXPLAINS)}
 
 
@@ -91,6 +98,8 @@ def _causes(finding: Finding, findings: Iterable[Finding]) -> tuple[str, ...]:
 def _explains(cause: Finding, finding: Finding) -> bool:
     """Return whether a finding is a consequence of another one, of the same recording, anchor and time where they have such."""
     if finding.kind not in EXPLAINS.get(cause.kind, ()) or _RANK[cause.kind] >= _RANK.get(finding.kind, len(_RANK)):
+        return False
+    if finding.kind not in _SHOWN_BY.get(cause.sensor, (finding.kind,)):
         return False
     if cause.recording and finding.recording and cause.recording != finding.recording:
         return False

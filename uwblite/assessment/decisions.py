@@ -41,7 +41,7 @@ def anchor_heights(height: float, taken: bool, apart: float) -> Finding:
     words, instead = ("high", "low") if taken else ("low", "high")
     text = (
         f"the ranges fit anchors {height:.1f} m above the tag about as well as low ones: taken as {words}; if they are "
-        f"{instead}, the trajectory differs by {apart:.1f} m (rms); give the anchors' heights (--anchor-height)"
+        f"{instead}, the trajectory differs by {apart:.1f} m (rms); give the anchors' heights (`mounting.anchor_height`)"
     )
     return doubt("anchor-heights", text)
 
@@ -87,8 +87,8 @@ def worse_than_parts(recording: int, stretch: tuple[float, float], start: float,
         "together are more probable; the map follows that"
     )
     cure = (
-        f"`uwblite convert run.log before.log --end {begin:.0f}` gives the part that is supported best; map that, or "
-        "`uwblite map run.log --without lidar` for what wheels and ranges alone say"
+        f"`end={begin:.0f}` gives the part that is supported best; map that, or "
+        "`use_lidar=false` for what wheels and ranges alone say"
     )
     figures = {"off": off, "turned": turned}
     return Finding("worse-than-parts", DOUBT, text, cure, "lidar", (stretch,), recording, figures=figures)
@@ -144,7 +144,7 @@ def open_loops(pairs: int, first: float, second: float, sigma: float) -> Finding
     text = (
         f"the scans at t = {first:.0f} s and at t = {second:.0f} s may show the same place, but their relative position is "
         f"known to {sigma:.1f} m only and no scan match confirms it ({pairs} such pairs): drive there once more in the same "
-        "direction, or force the closure (uwblite view)"
+        "direction, or force the closure"
     )
     return doubt("open-loops", text)
 
@@ -173,7 +173,7 @@ def coarse_grid(resolution: float, asked: float, cells: float) -> Finding:
     """Warn where the map is drawn with larger cells than requested; a map larger than any building is a doubt."""
     text = (
         f"the map is drawn with cells of {resolution:g} m instead of {asked:g} m: there would be more than {cells:g} million; "
-        "raise grid.max_cells where there is memory (12 bytes each), or set --crop or a smaller grid.max_range"
+        "raise grid.max_cells where there is memory (12 bytes each), or set `crop` or a smaller grid.max_range"
     )
     return Finding("coarse-grid", WARNING if resolution <= _COARSEST * asked else DOUBT, text)
 

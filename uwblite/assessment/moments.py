@@ -26,8 +26,8 @@ def between_keyframes(finding: Finding, recordings: Recordings, *spans: tuple[in
 
 
 def parts_beside(begin: float, end: float) -> str:
-    """Return the commands that cut a recording before and after a stretch, s since its start."""
+    """Return what cuts a recording before and after a stretch, s since its start."""
     return (
-        f"`uwblite convert run.log before.log --end {begin:.0f}` and `--start {end:.0f}` give the parts before and after it; "
+        f"`end={begin:.0f}` and `start={end:.0f}` give the parts before and after it; "
         "map each, or both together where they have anchors in common"
     )

@@ -19,7 +19,6 @@ from ..sensor_log.anchor_names import name_and_number
 from .causes import explained
 from .certainty import check_certainty
 from .decisions import RULES
-from .displaced_stretches import check_displaced_stretches
 from .drift_tests import check_drifts
 from .half_tests import check_halves
 from .other_side import check_other_side
@@ -67,7 +66,6 @@ def judge(
         lambda: check_closures(estimate, anchors, grid, task),
         lambda: check_calibration(calibrated, usual, task),
         lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
-        lambda: check_displaced_stretches(table, anchors, task) if table else (),
         lambda: check_residuals(estimate, residuals, grid, task),
         lambda: check_unit(anchors, task),
         lambda: check_short_ranges(anchors, estimate, sigma, task),
@@ -217,7 +215,7 @@ def check_closures(
         yield add("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
-        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them in uwblite view"
+        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them"
         yield doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
@@ -278,7 +276,7 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
             wrong = factor < 0.0
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
-                "is the laser upside down (--laser-flipped), or has the odometry's heading the wrong sign?"
+                "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
             )
         else:
             wrong = True

@@ -125,11 +125,11 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
         for finding in check_recording(view.repaired):
             if finding.kind == WHEELS_AGAINST_LIDAR:
                 cure = "a map is doubted for it, unless its ranges agree with the lidar there"
-                yield replace(finding, severity=WARNING, cure=cure, sensor="log")
+                yield replace(finding, severity=WARNING, cure=cure)
             elif finding.severity == DOUBT:
-                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there", sensor="log")
+                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there")
             else:
-                yield replace(finding, cure="a map repairs it so; the files stay as they are", sensor="log")
+                yield replace(finding, cure="a map repairs it so; the files stay as they are")
 
 
 def _check_sensors(view: RecordingView) -> Iterator[Finding]:
@@ -143,7 +143,7 @@ def _check_sensors(view: RecordingView) -> Iterator[Finding]:
         cure = "the map rests on wheels and lidar; check the tag if that is not meant"
         if log.notes.unread:
             unread = ", ".join(log.notes.unread)
-            cure = f"there may be some in what was not read: {unread}; --uwb-mapping says where (see above)"
+            cure = f"there may be some in what was not read: {unread}; `mappings` say where (see above)"
         yield Finding("no-ranges", NOTE, "there are no UWB ranges", cure, "radio")
     if "lidar" not in view.figures:
         cure = "there will be a trajectory and anchors, but no map"

@@ -66,7 +66,8 @@ def stamps_of_receipt(sensors: Sequence[str]) -> Finding:
 
 def clock_set_back(sensor: str, by: float) -> Finding:
     """Doubt a recording in which a sensor's clock was set back: its readings are in another order than they were made."""
-    return doubt("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there")
+    text = f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there"
+    return replace(doubt("clock-set-back", text), sensor=sensor)
 
 
 def clock_jump(clock: str, sensor: str, by: float, at: float, moved: float) -> Finding:
@@ -189,7 +190,7 @@ def laser_turned_over(flipped: bool) -> Finding:
     text = (
         "laser and wheels turn in opposite directions: the laser was taken as mounted "
         f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
-        f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
+        f"settle it by {'' if flipped else 'leaving out '}`mounting.laser_flipped`, or by the odometry's sign"
     )
     return doubt("laser-turned-over", text)
 
@@ -198,7 +199,7 @@ def laser_turned_away(degrees: float, pose: Sequence[float]) -> Finding:
     """Warn of a laser that looks elsewhere than its pose says, by the motion that it and the wheels measure."""
     text = (
         f"the laser's direction differs by {degrees:+.0f} degrees from its given pose, by the motion that both "
-        f"measure; corrected: --laser-pose={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}"
+        f"measure; corrected: `mounting.T_base_laser={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}`"
     )
     return warning("laser-turned-away", text)
 

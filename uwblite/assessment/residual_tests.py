@@ -8,16 +8,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
-from ..findings import DOUBT, Finding, doubt, kinds, of_severity, warning
+from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..loop_closure.loose_links import ANOTHER_VISIT, untied_breaks
-from ..loop_closure.slid_stretches import jumps, scans_fixing
+from ..loop_closure.loose_links import untied_breaks
+from ..loop_closure.slid_stretches import scans_fixing
 from ..pipeline.estimate import Estimate, Task
 from ..radio.line_of_sight import LEAST_POINTS, blocked
 from ..radio.range_noise import short_term_sigma
@@ -38,12 +37,6 @@ _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
-_REDUNDANT = 2
-"""Least number of scan edges that fix a step: a single one is not checked by others."""
-_MOVING = 0.05
-"""m or rad; over a smaller step even a lidar that sees the robot itself would agree."""
-_CONTRADICTED = ("free-space-violation", "contradicting-closures", "no-closure")
-"""Doubts about a map whose scan edges may be wrong together."""
 _WAYS = 0.15
 """Relative difference of distances between scans by lidar and by wheels; single scans measure it to a few per cent."""
 _SCALE = 0.12
@@ -54,7 +47,6 @@ def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid |
     """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, contradict."""
     yield from check_range_scatter(estimate, residuals, grid, task)
     yield from check_odometry_steps(estimate, task)
-    yield from check_odometry_jumps(estimate, task)
     yield from check_untied_breaks(estimate, task)
     yield from check_slips(estimate, task)
     yield from check_scales(estimate, task)
@@ -103,22 +95,18 @@ def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Boo
 def check_odometry_steps(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be.
 
-    They are a doubt of the map, unless the lidar fixes the poses there by itself: from other visits, or from clear and
-    redundant matches of the neighbouring clouds in a map without other contradictions. Then only the odometry is wrong.
+    Where scans fix these steps, the wheels slipped and the map followed: good to know. Elsewhere they are a doubt.
     """
     wheels, graph = estimate.odometry, estimate.graph
     if len(wheels) < _WINDOW:
         return
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
     off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
-    confirmed = _confirmed(graph, task.recordings.path)
-    fixed = confirmed[wheels.i] & confirmed[wheels.j]
-    if kinds(of_severity(task.stages.findings, DOUBT)).isdisjoint(_CONTRADICTED):
-        fixed |= _fixed_by_neighbours(graph)[wheels.i]
-    say, text = doubt, "most steps of the odometry contradict the map far beyond their noise"
+    fixed = scans_fixing(graph)[wheels.i] > 0
+    say, text = doubt, "most steps of the odometry contradict the map far beyond their noise, and no scan measures them"
     stretch = _stretch(off & ~fixed)
     if stretch is None and (stretch := _stretch(off)) is not None:
-        say, text = warning, text + "; the map follows the lidar, which determines every pose there: check them"
+        say, text = warning, "the wheels slipped: the map follows the lidar, which measures the steps there"
     if stretch is not None:
         span = int(wheels.i[stretch[0]]), int(wheels.j[stretch[1]])
         a, b = (seconds(task.recordings, k) for k in span)
@@ -166,46 +154,6 @@ def _stretch(off: Bools) -> tuple[int, int] | None:
     return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
 
 
-def _confirmed(graph: Graph, path: Floats) -> Bools:
-    """Return which keyframes (k,) lidar ties to another visit of the place; path : (k,) travelled distance, m."""
-    confirmed = np.zeros(len(path), dtype=bool)
-    for edges in graph.edges:
-        if isinstance(edges, ScanEdges):
-            again = np.abs(path[edges.i] - path[edges.j]) > ANOTHER_VISIT
-            confirmed[edges.i[again]] = confirmed[edges.j[again]] = True
-    return confirmed
-
-
-def check_odometry_jumps(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map in which the robot jumps from one keyframe to the next and neither odometry nor scans measured it.
-
-    Then only closures support the jump, and in repetitive corridors they may all have the same error. With anchors, steps
-    without scan edges are left to check_slips. At the others, scan edges that fix no place let one step absorb the errors
-    of many, and displaced anchors agree with that.
-    """
-    wheels, graph = estimate.odometry, estimate.graph
-    rows, by = jumps(wheels, graph)
-    tested = 1.0 / wheels.sqrt_information[rows, 0, 0] < _MEASURED_BREAK
-    if estimate.placed.any():
-        tested &= np.isin(wheels.i[rows], _measured_by_lidar(graph))
-    rows, far = rows[tested], np.hypot(by[tested, 0], by[tested, 1])
-    if far.max(initial=0.0) < _FAR:
-        return
-    worst = int(np.argmax(far))
-    when = seconds(task.recordings, int(wheels.i[rows[worst]]))
-    found = doubt(
-        "odometry-jumps",
-        f"at t = {when:.0f} s map and odometry differ by {far[worst]:.1f} m over one step, and no scan "
-        f"measures it ({len(rows)} such steps): loop closures there may join different places that look the same",
-        steps=len(rows), metres=float(far[worst]), at=when,
-    )  # fmt: skip
-    yield between_keyframes(found, task.recordings, *((int(wheels.i[k]), int(wheels.j[k])) for k in rows.tolist()))
-
-
-_FAR = 1.0
-"""m; no wheel slips by that within one step between keyframes."""
-
-
 def check_untied_breaks(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall.
 
@@ -251,13 +199,6 @@ def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> I
 _FEW_RANGES, _CONTRADICTS, _CONTRADICTING = 3, 1.0, 2
 """Least number of ranges to an anchor in a part, m by which they contradict it, and the least number of such anchors: behind
 furniture ranges are too long by half a metre, and one anchor may have been moved."""
-
-
-def _fixed_by_neighbours(graph: Graph) -> Bools:
-    """Return at which keyframes (k,) a step begins that several scan edges of the same visit fix and agree on."""
-    steps = se2.between(graph.poses[:-1], graph.poses[1:])
-    moves = np.append((np.hypot(steps[:, 0], steps[:, 1]) > _MOVING) | (np.abs(steps[:, 2]) > _MOVING), False)
-    return (scans_fixing(graph) >= _REDUNDANT) & moves
 
 
 def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -81,8 +81,8 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
                     at=float(frames.stamps[at]), way=float(lengths.sum()), error=off,
                 )  # fmt: skip
                 ends_at = sorted((float(frames.stamps[at]), float(frames.stamps[0 if word == "until" else -1])))
-                option = "--start" if word == "until" else "--end"
-                cure = f"`uwblite convert run.log part.log {option} {seconds:.0f}` leaves that part out"
+                edge = "start" if word == "until" else "end"
+                cure = f"`{edge}={seconds:.0f}` leaves that part out"
                 yield replace(loose, recording=recording.number + 1, stretches=((ends_at[0], ends_at[1]),), cure=cure)
 
 

@@ -115,12 +115,15 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> d
 
 
 def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, mapped: bool = True) -> list[str]:
-    """Return the findings and figures as lines of text."""
+    """Return the findings and figures as lines of text; what a finding explains stands below it."""
+    from ..findings import folded
+
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
-    for finding in diagnosis.findings:
+    for finding, explains in folded(diagnosis.findings):
         sensor = f"{finding.sensor}: " if finding.sensor else ""
         lines.append(f"{finding.severity.upper():<8} {sensor}{finding.text}")
         lines += [f"         -> {finding.cure}"] if finding.cure else []
+        lines += [f"         explains {other.severity}: {other.text}" for other in explains]
     if not diagnosis.findings:
         lines.append("nothing to complain about")
     lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
@@ -150,7 +153,8 @@ def _counts(figures: dict[str, Any]) -> str:
     parts = [f"{span}, {odometry['path m']:.1f} m by {readings}"]
     parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
     if "uwb" in figures:
-        parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")
+        many = len(figures["uwb"]["anchors"])
+        parts.append(f"{figures['uwb']['count']} ranges to {many} anchor{'s' if many != 1 else ''}")
     if "lidar" in figures:
         lidar = figures["lidar"]
         parts.append(

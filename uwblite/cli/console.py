@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from typing import Any, TextIO
 
 from ..report.printable import duration, encodable, printable
+from .wording import with_options
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -42,7 +43,7 @@ def set_up(*, quiet: bool = False, verbose: int = 0) -> None:
 
 def say(text: str = "") -> None:
     """Write one line of the result to stdout."""
-    say_lines(printable(text))
+    say_lines(printable(with_options(text)))
 
 
 def say_lines(text: str) -> None:
@@ -64,7 +65,7 @@ def note(text: str) -> None:
     """Write one line beside the result to stderr; --quiet drops it."""
     if not _CONSOLE.quiet:
         _clear_bar()
-        write(sys.stderr, printable(text) + "\n")
+        write(sys.stderr, printable(with_options(text)) + "\n")
 
 
 def fail(text: str, code: int, *, trace: bool = False) -> int:
@@ -73,7 +74,7 @@ def fail(text: str, code: int, *, trace: bool = False) -> int:
     if trace:
         write(sys.stderr, traceback.format_exc())
     head = "uwblite: " if code == 130 else "uwblite: error: "
-    write(sys.stderr, head + printable(" ".join(text.split())) + "\n")
+    write(sys.stderr, head + printable(with_options(" ".join(text.split()))) + "\n")
     return code
 
 
@@ -241,7 +242,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, str):
-        return encodable(value)
+        return encodable(with_options(value))
     if isinstance(value, float):
         return value if abs(value) < float("inf") else None
     return value

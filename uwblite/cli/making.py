@@ -5,9 +5,11 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
+from .wording import findings_with_options, with_options
 from .workers import versions
 
 if TYPE_CHECKING:
@@ -36,7 +38,9 @@ def read_logs(args: argparse.Namespace, executor: "Executor | None" = None) -> "
     from .options import apply_mounting, bag_choices
 
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
-    return [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
+    logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
+    told = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
+    return [replace(log, notes=notes) for log, notes in zip(logs, told, strict=True)]
 
 
 def make(
@@ -78,6 +82,7 @@ def make(
     _check_memory(kept, config, args.ignore_memory, note, maps)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
+    result = replace(result, findings=findings_with_options(result.findings))
     record = RunRecord(
         command=repeat_command(args, config),
         config=config_text(config),

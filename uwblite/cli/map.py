@@ -237,10 +237,14 @@ def summary_json(args: argparse.Namespace, made: "Made") -> dict[str, Any]:
     }
 
 
+_LABELS = {"doubt": "DOUBT", "warning": "warning", "note": "note"}
+
+
 def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     """Return the summary for people."""
     import os
 
+    from ..findings import DOUBT, folded
     from ..report.printable import duration
     from .wording import anchor_line, calibration_line
 
@@ -255,9 +259,11 @@ def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     lines += [anchor_line(a) for a in result.anchors]
     shown = (c for c in result.calibration if c.state == "estimated" and c.key.anchor is None and abs(c.value) > 2.0 * c.sigma)
     lines += [calibration_line(c) for c in shown]
-    lines += [f"warning: {text}" for text in result.warnings]
-    for found in result.doubts:
-        lines += [f"DOUBT: {found}", *([f"  {found.cure}"] if found.cure else [])]
+    told = sorted(folded(result.findings), key=lambda group: any(f.severity == DOUBT for f in (group[0], *group[1])))
+    for cause, explains in told:
+        lines.append(f"{_LABELS[cause.severity]}: {cause}")
+        lines += [f"  {cause.cure}"] if cause.severity == DOUBT and cause.cure else []
+        lines += [f"  explains {_LABELS[other.severity]}: {other}" for other in explains]
     if result.doubted_stretches:
         lines.append("the rest of the map is as good as it states; map.png marks the stretches that are not")
     lines.append("files: " + " ".join(os.path.join(args.out, name) for name in made.names))

@@ -1,11 +1,45 @@
-"""Numbers in words, always with unit and sigma."""
+"""Words of the command line: numbers with unit and sigma, and options where the library names settings and arguments."""
 
+import re
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..report.printable import sigma_text
 
 if TYPE_CHECKING:
+    from ..findings import Finding
     from ..map_result import AnchorEstimate, CalibrationEstimate
+
+
+OPTIONS = {
+    "mounting.laser_flipped": "--laser-flipped", "mounting.T_base_laser": "--laser-pose", "mounting.tag_position": "--tag",
+    "mounting.anchor_height": "--anchor-height", "crop": "--crop", "use_lidar=false": "--without lidar",
+    "range_unit": "uwblite convert --range-unit", "odometry_unit": "uwblite convert --odometry-unit",
+    "laser_unit": "uwblite convert --laser-unit", "time_unit": "uwblite convert --time-unit",
+    "angle_unit": "uwblite convert --angle-unit",
+    "end": "uwblite convert run.log before.log --end", "start": "uwblite convert run.log after.log --start",
+    "topics.odometry": "--odometry-topic", "topics.scan": "--scan-topic", "topics.imu": "--imu-topic",
+    "topics.base_frame": "--base-frame", "mappings": "--uwb-mapping", "folder": "--out", "force": "--force",
+    "append": "--append", "steps": "--lidar-steps", "shell": "--uwb shell:PORT",
+}  # fmt: skip
+"""What sets on the command line what a text of the library has in backticks, alone or with its value."""
+
+
+def with_options(text: str) -> str:
+    """Return a text of the library with options in place of the settings and arguments that it names."""
+    return re.sub(r"`([\w.]+)(=[^`]*)?`", _option, text) if "`" in text else text
+
+
+def _option(found: "re.Match[str]") -> str:
+    name, value = found[1], found[2] or ""
+    option = OPTIONS.get(name + value) or (OPTIONS[name] + value if name in OPTIONS else "")
+    return f"`{option}`" if " " in option else option or found[0]
+
+
+def findings_with_options(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":
+    """Return findings whose texts and cures name options."""
+    return tuple(replace(f, text=with_options(f.text), cure=with_options(f.cure)) for f in findings)
 
 
 def anchor_line(anchor: "AnchorEstimate") -> str:

@@ -47,7 +47,7 @@ UNJOINED = 3.0
 def _slow(width: float) -> Note:
     """Return the note on answers that take so long that fixes are known to so many seconds only."""
     text = f"uwb: answers are slow: the time of a range is known to {width:.1f} s only, and beyond {WIDEST} s it is not logged"
-    return Note("warning", "uwb-slow", f"{text}; read the module's stream instead (--uwb shell:PORT), or connect it directly")
+    return Note("warning", "uwb-slow", f"{text}; read the module's stream instead (`shell`), or connect it directly")
 
 
 Readings = tuple[RangeReading, ...]

@@ -110,7 +110,7 @@ class LogFile:
                 self.part += 1
             self.path = self._name(self.part)
         elif path.exists():
-            raise DataError(f"{path} exists; choose another name, or --append to go on with it after a crash")
+            raise DataError(f"{path} exists; choose another name, or `append` to go on with it after a crash")
         try:
             self._fd = self._open(self.path)
         except OSError as error:

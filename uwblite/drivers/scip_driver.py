@@ -157,7 +157,7 @@ class ScipDriver(ScipUnit):
         self._skip = min(MAX_SKIP, math.ceil(periods) - 1)
         text = (
             f"lidar: this line carries {carried:.1f} of {1 / self.geometry.period:.0f} scans a second; asking for one in"
-            f" {self._skip + 1}{'' if self._wide else ', up to 4.1 m'}. On RS-232 use USB or a faster port, or --lidar-steps"
+            f" {self._skip + 1}{'' if self._wide else ', up to 4.1 m'}. On RS-232 use USB or a faster port, or fewer `steps`"
         )
         yield from self.say_once(Note("warning", "lidar-slow-line", text))
         return True
@@ -228,7 +228,7 @@ class ScipDriver(ScipUnit):
         details.append(("range", f"{unit.distance_min / 1000:.2f} to {unit.distance_max / 1000:.2f} m"))
         details.append(("steps", f"{unit.first} to {unit.last}, {unit.speed} rev/min"))
         if facts.get("LASR") == "OFF":
-            text = "the laser is off, as it should be now; `uwblite record` switches it on"
+            text = "the laser is off, as it should be now; a recording switches it on"
             findings.append(Note("info", "laser-off", text))
         state = facts.get("STAT")
         if state is None:

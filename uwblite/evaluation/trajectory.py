@@ -65,8 +65,8 @@ class AnchorErrors:
 
 def statistics(errors: Floats) -> ErrorStatistics:
     """Return the figures of the errors (n,), n >= 1."""
-    figures = np.sqrt(np.mean(errors**2)), np.mean(errors), np.median(errors), np.std(errors), np.max(errors)
-    return ErrorStatistics(*map(float, figures), count=len(errors))
+    rmse, mean, median = float(np.sqrt(np.mean(errors**2))), float(np.mean(errors)), float(np.median(errors))
+    return ErrorStatistics(rmse, mean, median, float(np.std(errors)), float(np.max(errors)), len(errors))
 
 
 def evaluate_trajectory(

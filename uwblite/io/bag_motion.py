@@ -193,7 +193,7 @@ def no_odometry(topics: Sequence[tuple[str, str]], truths: Sequence[str], frames
     """
     text = "the bag has no odometry: neither nav_msgs/Odometry nor, in tf, a transform from odom to the base"
     if truths:
-        text += f"; {', '.join(truths)} is the truth by its name, and --odometry-topic {truths[0]} takes it nevertheless"
+        text += f"; {', '.join(truths)} is the truth by its name, and `topics.odometry={truths[0]}` takes it nevertheless"
     if frames:
         text += f"; tf moves {', '.join(frames[:4])}"
     held = [f"{name} ({kind})" for name, kind in topics]

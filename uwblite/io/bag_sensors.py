@@ -187,7 +187,7 @@ class ImuReadings:
         if pose is None and not heavy:
             warnings.append(
                 f"no transform from {base} to {self.frame or 'the IMU'}, and its accelerations show no gravity: its z axis is"
-                " taken to point up; --imu-topic none maps without it"
+                " taken to point up; `topics.imu=none` maps without it"
             )
         stated = np.array([0.0, 0.0, 1.0]) if pose is None else pose[2, :3]
         if not heavy:
@@ -262,7 +262,8 @@ class RangeReadings:
             )
         elif unknown:
             warnings.append(
-                "no transform to the UWB tag: it is taken to sit in the middle of the robot, on the floor; give --tag X,Y,Z"
+                "no transform to the UWB tag: it is taken to sit in the middle of the robot, on the floor;"
+                " give `mounting.tag_position`"
             )
         return found
 

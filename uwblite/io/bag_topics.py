@@ -111,15 +111,15 @@ def plan_topics(
         if t.name in asked.uwb and t.name not in uwb:
             text, guess = f"no uwb mapping reads {t.name} of type {short_type(t.type)}", unread.get(t.name)
             start = "" if guess is None else f", for a start: {as_toml([guess])}"
-            raise ConfigError(f"{text}; describe it in a file for --uwb-mapping{start}")
+            raise ConfigError(f"{text}; describe it in a file for `mappings`{start}")
     # X is left out where X_raw exists: the map has its own correction.
     kept = uwb if asked.uwb else {name: m for name, m in uwb.items() if f"{name}_raw" not in uwb}
     spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN, IMU) and t.name not in (odometry, scan, imu)]
     spare += [name for name in uwb if name not in kept]
     choices = []
     for kind, taken, named, what, option in (
-        (ODOMETRY, odometry, asked.odometry, "odometry is", "--odometry-topic"),
-        (SCAN, scan, asked.scan, "scans are", "--scan-topic"),
+        (ODOMETRY, odometry, asked.odometry, "odometry is", "`topics.odometry`"),
+        (SCAN, scan, asked.scan, "scans are", "`topics.scan`"),
     ):
         alike = [t.name for t in topics if t.type == kind and t.name != taken]
         if taken and alike and not named:
@@ -139,7 +139,7 @@ def unread_warning(plan: TopicPlan) -> str:
     names = ", ".join(plan.unread)
     return (
         f"not read, though there may be ranges in it: {names}. If there are, put this line into a file uwb.toml, correct it"
-        f" (docs/formats.md explains it) and give --uwb-mapping uwb.toml: {as_toml(plan.unread.values())}"
+        f" (docs/formats.md explains it) and give `mappings=uwb.toml`: {as_toml(plan.unread.values())}"
     )
 
 

@@ -211,7 +211,7 @@ class LogReader:
         if scans is not None and others:
             counts = ", ".join(f"{count} of {name}" for name, count in others.items())
             text = f"a map uses one lidar, here {self.scan_message or 'the first'}; scans of others are left out ({counts})"
-            warnings.append(f"{text}; --scan-topic {min(others)} would take those of another")
+            warnings.append(f"{text}; `topics.scan={min(others)}` would take those of another")
         notes = LogNotes(
             source=self.path,
             sha256=sha256,

@@ -105,11 +105,9 @@ class LaserMessages:
         scans.seen += 1
 
     def _layout(self, name: bytes, head: bytes) -> Layout:
-        layout = self._layouts.get(head)
-        if layout is None:
-            layout = parse_head(name, head.split())
-            if len(self._layouts) < _LAYOUTS_KEPT:
-                self._layouts[head] = layout
+        layout = self._layouts.get(head) or parse_head(name, head.split())
+        if len(self._layouts) < _LAYOUTS_KEPT:
+            self._layouts[head] = layout
         return layout
 
     def _tail(self, name: bytes, number: int, tail: list[bytes]) -> float:

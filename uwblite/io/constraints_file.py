@@ -6,17 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from .. import constraints as known
 from ..config import from_dict, parse_toml
-from ..constraints import (
-    Constraints,
-    ForbiddenClosure,
-    GivenAnchor,
-    GivenClosure,
-    GivenDistance,
-    GivenLandmark,
-    GivenLandmarkDistance,
-    GivenPose,
-)
+from ..constraints import Constraints, GivenAnchor
 from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
 from ..sensor_log.anchor_names import last_places
@@ -24,12 +16,12 @@ from .csv_table import read_csv
 
 _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
     "anchor": (GivenAnchor, "anchors", ("id", "position")),
-    "pose": (GivenPose, "poses", ("stamp", "pose")),
-    "anchor_distance": (GivenDistance, "distances", ("anchors", "distance")),
-    "landmark": (GivenLandmark, "landmarks", ("name", "position")),
-    "landmark_distance": (GivenLandmarkDistance, "landmark_distances", ("landmarks", "distance")),
-    "closure": (GivenClosure, "closures", ("stamps",)),
-    "forbidden_closure": (ForbiddenClosure, "forbidden", ("stamps",)),
+    "pose": (known.GivenPose, "poses", ("stamp", "pose")),
+    "anchor_distance": (known.GivenDistance, "distances", ("anchors", "distance")),
+    "landmark": (known.GivenLandmark, "landmarks", ("name", "position")),
+    "landmark_distance": (known.GivenLandmarkDistance, "landmark_distances", ("landmarks", "distance")),
+    "closure": (known.GivenClosure, "closures", ("stamps",)),
+    "forbidden_closure": (known.ForbiddenClosure, "forbidden", ("stamps",)),
 }
 """Class, field of Constraints and needed fields of each table."""
 
@@ -48,8 +40,8 @@ def parse_constraints(text: str, path: str = "") -> Constraints:
     found: dict[str, tuple[Any, ...]] = {}
     for name, tables in data.items():
         if name not in _TABLES or not isinstance(tables, list):
-            known = ", ".join(f"[[{k}]]" for k in _TABLES)
-            raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {known}")
+            tables_known = ", ".join(f"[[{k}]]" for k in _TABLES)
+            raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {tables_known}")
         kind, field, needed = _TABLES[name]
         where = f"{path or 'constraints'}: [[{name}]] number"
         found[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))

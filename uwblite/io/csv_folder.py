@@ -10,7 +10,8 @@ import hashlib
 import io
 import os
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .carmen_stamps import false_stamps, placed
 from .csv_table import csv_rows
-from .files import replacing
+from .files import replacing, write_text
 from .folders import refuse_foreign, replacing_folder, unmarked
 from .readings import largest_reading, ranges_of, without_reach
 from .settings_toml import to_toml
@@ -81,7 +82,7 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
     path = Path(folder)
     present = [path / name for name in _FILES if (path / name).is_file()]
     if present and not force:
-        raise ConfigError(f"{path} already holds a recording ({present[0].name}); use --force to replace it, or another folder")
+        raise ConfigError(f"{path} already holds a recording ({present[0].name}); use `force` to replace it, or another folder")
     refuse_foreign(unmarked(path, _FILES, "sensors.toml", _MARK))
     with replacing_folder(path, _FILES.__contains__) as waiting:
         _write_tables(waiting, log)
@@ -93,38 +94,24 @@ _MARK = f"# {Scans.__doc__}"
 
 
 def _write_tables(path: Path, log: SensorLog) -> None:
-    odometry = np.column_stack([log.odometry.stamps, log.odometry.poses])
-    _write(path / "odometry.csv", "stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in odometry.tolist()))
+    rows = np.column_stack([log.odometry.stamps, log.odometry.poses]).tolist()
+    tables = {"odometry": ("stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in rows))}
     if log.gyro is not None:
         headings = zip(log.gyro.stamps.tolist(), log.gyro.heading.tolist(), strict=True)
-        _write(path / "gyro.csv", "stamp,heading", (f"{stamp:.6f},{heading:.6f}" for stamp, heading in headings))
-    if log.ranges is not None:
-        log.ranges.require_one_tag("a CSV folder")
-        _write(path / "ranges.csv", "stamp,anchor,range,quality", _range_rows(log.ranges))
-    if log.scans is not None:
-        beams = ",".join(f"r{k}" for k in range(log.scans.ranges.shape[1]))
-        _write(path / "scans.csv", f"stamp,{beams}", _scan_rows(log.scans))
-    with replacing(path / "sensors.toml") as stream:
-        stream.write(to_toml(_sensors(log), comments=True).encode())
-
-
-def _write(path: Path, header: str, rows: Iterable[str]) -> None:
-    with replacing(path) as stream:
-        stream.write(f"{header}\n".encode())
-        for row in rows:
-            stream.write(f"{row}\n".encode())
-
-
-def _range_rows(ranges: UwbRanges) -> Iterator[str]:
-    names = [csv_field(name) for name in ranges.anchor_ids]
-    columns = (column.tolist() for column in (ranges.stamps, ranges.anchor, ranges.ranges, ranges.quality))
-    for stamp, anchor, distance, quality in zip(*columns, strict=True):
-        yield f"{stamp:.6f},{names[anchor]},{distance:.4f},{quality:g}"
-
-
-def _scan_rows(scans: LaserScans) -> Iterator[str]:
-    for stamp, readings in zip(scans.stamps.tolist(), scans.ranges, strict=True):
-        yield f"{stamp:.6f}," + ",".join("" if v == np.inf else f"{v:.4f}" for v in readings.tolist())
+        tables["gyro"] = "stamp,heading", (f"{stamp:.6f},{heading:.6f}" for stamp, heading in headings)
+    if (r := log.ranges) is not None:
+        r.require_one_tag("a CSV folder")
+        names = [csv_field(name) for name in r.anchor_ids]
+        ranges = zip(*(column.tolist() for column in (r.stamps, r.anchor, r.ranges, r.quality)), strict=True)
+        tables["ranges"] = "stamp,anchor,range,quality", (f"{t:.6f},{names[k]},{d:.4f},{q:g}" for t, k, d, q in ranges)
+    if (s := log.scans) is not None:
+        beams = ",".join(f"r{k}" for k in range(s.ranges.shape[1]))
+        cells = (",".join("" if v == np.inf else f"{v:.4f}" for v in readings.tolist()) for readings in s.ranges)
+        tables["scans"] = f"stamp,{beams}", (f"{t:.6f},{row}" for t, row in zip(s.stamps.tolist(), cells, strict=True))
+    for name, (header, lines) in tables.items():
+        with replacing(path / f"{name}.csv") as stream:
+            stream.writelines(f"{line}\n".encode() for line in chain((header,), lines))
+    write_text(path / "sensors.toml", to_toml(_sensors(log), comments=True))
 
 
 def _sensors(log: SensorLog) -> Sensors:

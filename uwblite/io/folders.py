@@ -189,7 +189,7 @@ def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
     """
     with _held(path, "run", wait=False) as held:
         if not held:
-            raise ConfigError(f"another run is writing {os.fspath(path)}; wait for it, or choose another --out")
+            raise ConfigError(f"another run is writing {os.fspath(path)}; wait for it, or choose another `folder`")
         yield
 
 

@@ -23,6 +23,7 @@ _ANCHOR_FIELDS = (
     "id", "position", "covariance", "ranges", "used_share", "bias", "bias_sigma", "residual_rms", "status", "reason",
     "alternative",
 )  # fmt: skip
+_GRID_FIELDS = ("resolution", "origin", "rows", "cols")
 _CALIBRATION_FIELDS = ("name", "value", "sigma", "unit", "meaning", "state", "reason")
 
 
@@ -61,9 +62,7 @@ def _decimal(value: float, digits: int = 6) -> str:
     return f"{value + 0.0:.{digits}f}" if np.isfinite(value) else ""
 
 
-def covariance_csv(
-    stamps: Floats, covariances: Floats, recordings: Ints | None = None, trusted: Bools | None = None
-) -> str:
+def covariance_csv(stamps: Floats, covariances: Floats, recordings: Ints | None = None, trusted: Bools | None = None) -> str:
     """Return stamp, covariance (upper triangle; m^2, m rad, rad^2; map frame), recording and trust of every pose as CSV.
 
     Parameters
@@ -94,19 +93,11 @@ def anchors_csv(result: MapResult) -> str:
     ]
     for a in result.anchors:
         other = np.full(2, np.nan) if a.alternative is None else a.alternative
-        sigmas = np.sqrt(np.maximum(np.diag(a.covariance), 0.0))
-        values = (
-            a.id,
-            *(_decimal(v) for v in (*a.position, *sigmas)),
-            str(a.ranges),
-            *(_decimal(v, 4) for v in (a.used_share, a.bias, a.bias_sigma, a.residual_rms)),
-            a.status,
-            _decimal(a.covariance[0, 1], 9),
-            *(_decimal(v) for v in other),
-            a.reason,
-            _decimal(a.since),
-        )
-        lines.append(",".join(map(csv_field, values)))
+        places = [_decimal(v) for v in (*a.position, *np.sqrt(np.maximum(np.diag(a.covariance), 0.0)))]
+        figures = [_decimal(v, 4) for v in (a.used_share, a.bias, a.bias_sigma, a.residual_rms)]
+        alternative = [_decimal(v) for v in other]
+        values = (a.id, *places, str(a.ranges), *figures, a.status, _decimal(a.covariance[0, 1], 9), *alternative)
+        lines.append(",".join(map(csv_field, (*values, a.reason, _decimal(a.since)))))
     return "\n".join(lines) + "\n"
 
 
@@ -132,6 +123,7 @@ _RANGE_COLUMNS = ("stamp", "anchor", "range", "residual", "weight", "x", "y", "t
 def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:
     """Return the result as report.json has it (JSON-ready); see docs/formats.md."""
     grid = result.grid
+    seen = {} if grid is None else {"scans_used": grid.scans_used, "missing_share": grid.missing_share}
     content = {
         "schema": SCHEMA,
         "versions": record.versions,
@@ -153,16 +145,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "shape": {"poses": result.shape_poses, "covariances": result.shape_covariances},
         "closures": [_closure_entry(c, result.keyframe_stamps) for c in result.closures],
         "stages": [{"name": s.name, **s.figures} for s in result.stages],
-        "map": None
-        if grid is None
-        else {
-            "resolution": grid.geometry.resolution,
-            "origin": grid.geometry.origin,
-            "rows": grid.geometry.rows,
-            "cols": grid.geometry.cols,
-            "scans_used": grid.scans_used,
-            "missing_share": grid.missing_share,
-        },
+        "map": None if grid is None else {name: getattr(grid.geometry, name) for name in _GRID_FIELDS} | seen,
         "files": hashes,
     }
     if record.seconds:
@@ -178,18 +161,11 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
 
 def notices(found: Sequence[Finding]) -> list[dict[str, Any]]:
     """Return warnings or doubts as JSON-ready records."""
-    return [
-        {
-            "kind": n.kind,
-            "text": n.text,
-            "cure": n.cure,
-            "recording": n.recording,
-            "stretches": [list(span) for span in n.stretches],
-            "explained_by": list(n.explained_by),
-            "figures": n.figures,
-        }
-        for n in found
-    ]
+    values = ({name: getattr(n, name) for name in _FINDING_FIELDS} for n in found)
+    return [{name: list(v) if isinstance(v, tuple) else v for name, v in fields.items()} for fields in values]
+
+
+_FINDING_FIELDS = ("kind", "text", "cure", "recording", "stretches", "explained_by", "figures")
 
 
 def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:

@@ -70,10 +70,10 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     """
     path = Path(folder)
     if path.exists() and not path.is_dir():
-        raise ConfigError(f"{path} is not a folder; choose another --out")
+        raise ConfigError(f"{path} is not a folder; choose another `folder`")
     present = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
     if present and not force:
-        raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use --force to replace it, or another --out")
+        raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use `force` to replace it, or another `folder`")
     check_free(path, is_of_result)
     if present:
         repair_result(path)

@@ -120,7 +120,7 @@ class Collector:
         if scans is not None and (laser := self.frames.pose(self.base_frame, self.scans.frame)) is None:
             warnings.append(
                 f"no transform from {self.base_frame} to {self.scans.frame}: the laser is taken to sit in the middle of"
-                " the robot, looking ahead; give --laser-pose X,Y,THETA where it does not"
+                " the robot, looking ahead; give `mounting.T_base_laser` where it does not"
             )
         if ranges is not None:
             places = self.ranges.places(tags, self.frames, self.base_frame, warnings)
@@ -141,7 +141,7 @@ class Collector:
         ------
         FormatError : there is none, or it has no headings.
         """
-        where, cure = self.plan.odometry, "; where tf has a transform from odom to the base: --odometry-topic /tf"
+        where, cure = self.plan.odometry, "; where tf has a transform from odom to the base: `topics.odometry=/tf`"
         if self._by_transforms:
             best = self.moving.best(self.base_frame)
             if best is None:
@@ -152,7 +152,7 @@ class Collector:
             self.base_frame, where, cure = self.base_frame or child, f"tf, {parent} -> {child}", ""
             reason = "no topic of nav_msgs/Odometry is there" if not self.plan.odometry else "as asked"
             others = [" -> ".join(pair) for pair in self.moving.pairs if pair != (parent, child)]
-            more = f"; --base-frame takes another ({', '.join(others[:4])})" if others else ""
+            more = f"; `topics.base_frame` takes another ({', '.join(others[:4])})" if others else ""
             warnings.append(f"the odometry is read from {where}: {reason}{more}")
         odometry = self.odometry.odometry(warnings)
         if odometry is None:

@@ -10,22 +10,46 @@ from ..arrays import Bools, Floats, Ints, Table, connected, dots
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
 
-_JUMP, _JUMP_SHARE = 0.2, 0.02
-"""Difference of neighbouring ranges that ends a run of rays, m, and share of the range on top."""
-_MISSING = 3
-"""Rays that may be missing within a run."""
-_FEWEST = 10
-"""Least number of rays that show a curvature."""
-_RADII = 0.04, 0.8
-"""Radii of columns, m."""
-_CURVED = 40.0
-"""Least chi2 by which a circle fits a run better than a line."""
-_SCATTER = 1.4
-"""Largest rms distance from the circle, relative to the noise."""
-_APART, _UNLIKE = 0.12, 0.3
-"""Distance of the centres, m, and relative difference of the radii up to which two circles are one column."""
-_VIEWS = 3
-"""Least number of keyframes that see a column."""
+
+@dataclass(frozen=True, slots=True)
+class ColumnConfig:
+    """What a round column is."""
+
+    radii: tuple[float, float] = (0.04, 0.8)
+    """m, smallest and largest."""
+    jump: float = 0.2
+    """m, difference of neighbouring ranges that ends a run of rays, beside two standard deviations of them."""
+    missing: int = 3
+    """Rays that may be missing within a run."""
+    fewest: int = 10
+    """Least number of rays of a run that shows a curvature."""
+    bend: float = 20.0
+    """Least chi2 by which a circle fits a run better than a line."""
+    scatter: float = 1.4
+    """Largest rms distance of a run from its circle, relative to the noise."""
+    apart: float = 0.12
+    """m between centres up to which two circles may be one column."""
+    unlike: float = 0.3
+    """Relative difference of the radii up to which they are, beside half the smallest radius."""
+    views: int = 3
+    """Least number of keyframes that see a column."""
+    gates: tuple[float, ...] = (0.15, 0.15, 0.15)
+    """m, of the first steps towards a circle."""
+    steps: int = 8
+    """Steps towards a circle."""
+    gate: float = 4.0
+    """Gate of the other steps, standard deviations of the rays, beside the slack."""
+    slack: float = 0.02
+    """m."""
+    incidence: float = 0.4
+    """Least cosine between a ray and the normal; others hit the edge of a column, where readings are unreliable."""
+    around: float = 0.3
+    """m from the circle up to which rays are a column's surroundings."""
+    share: float = 0.6
+    """Share of the rays around it that must end on it."""
+
+
+_CONFIG = ColumnConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +66,12 @@ class Circles(Table):
     """(c,) number of rays that show it."""
 
 
-def fitted_circles(rays: ScanPoints) -> Circles:
+def fitted_circles(rays: ScanPoints, config: ColumnConfig = _CONFIG) -> Circles:
     """Fit a circle to each run of neighbouring rays, and keep those that are curved towards the laser, as a column is.
 
     Least squares of the algebraic distance (I. Kasa 1976): a little too small where little of the circle is seen.
     """
-    rays, number, reach = _short_runs(rays)
+    rays, number, reach = _short_runs(rays, config)
     many = int(number.max(initial=-1)) + 1
     count = np.maximum(np.bincount(number, minlength=many), 1)
 
@@ -64,23 +88,23 @@ def fitted_circles(rays: ScanPoints) -> Circles:
     flat = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy))
     sigma = mean(range_sigma(reach))
     origin = np.stack([mean(rays.origins[:, 0]), mean(rays.origins[:, 1])], axis=1) - middle
-    good = (count >= _FEWEST) & (radius > _RADII[0]) & (radius < _RADII[1]) & (off < _SCATTER * sigma)
-    good &= (count * (flat - off**2) > _CURVED * sigma**2) & (dots(centre, origin) < 0.0)
+    good = (radius > config.radii[0]) & (radius < config.radii[1]) & (off < config.scatter * sigma)
+    good &= (count * (flat - off**2) > config.bend * sigma**2) & (dots(centre, origin) < 0.0)
     chosen = np.flatnonzero(good)
     keyframe = rays.keyframe[np.searchsorted(number, chosen)]
     return Circles(keyframe, (middle + centre)[chosen], radius[chosen], count[chosen].astype(np.float64))
 
 
-def _short_runs(rays: ScanPoints) -> tuple[ScanPoints, Ints, Floats]:
+def _short_runs(rays: ScanPoints, config: ColumnConfig) -> tuple[ScanPoints, Ints, Floats]:
     """Return the rays (m,) of runs no longer than a column is wide, the number of each ray's run, and the rays' lengths, m."""
     reach = np.hypot(*(rays.points - rays.origins).T)
     begins = np.ones(len(reach), dtype=bool)
-    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > _MISSING)
-    begins[1:] |= np.abs(np.diff(reach)) > _JUMP + _JUMP_SHARE * reach[1:]
+    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > config.missing)
+    begins[1:] |= np.abs(np.diff(reach)) > config.jump + 2.0 * range_sigma(reach[1:])
     first = np.flatnonzero(begins)
     count = np.diff(np.append(first, len(reach)))
     wide = np.hypot(*(rays.points[first + count - 1] - rays.points[first]).T)
-    good = (count >= _FEWEST) & (wide < _WIDEST * _RADII[1])
+    good = (count >= config.fewest) & (wide < _WIDEST * config.radii[1])
     rows, kept = np.flatnonzero(np.repeat(good, count)), count[good]
     return rays.rows(rows), np.repeat(np.arange(len(kept)), kept), reach[rows]
 
@@ -100,18 +124,18 @@ _SINGULAR = 1e-14
 """m^4."""
 
 
-def find_columns(found: Circles, poses: Floats) -> Floats:
+def join_circles(found: Circles, poses: Floats, config: ColumnConfig = _CONFIG) -> Floats:
     """Return the columns (n, 3), x, y, radius in the map, that circles of several keyframes at poses (k, 3) show."""
     at = se2.transform(poses[found.keyframe], found.centre)
-    one, other = cKDTree(at).query_pairs(_APART, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
+    one, other = cKDTree(at).query_pairs(config.apart, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
     smaller = np.minimum(found.radius[one], found.radius[other])
-    alike = np.abs(found.radius[one] - found.radius[other]) < _UNLIKE * smaller + _RADII[0] / 2.0
+    alike = np.abs(found.radius[one] - found.radius[other]) < config.unlike * smaller + 0.5 * config.radii[0]
     number = connected(one[alike], other[alike], len(at))
     views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.intp))
     weight = np.bincount(number, found.rays).astype(np.float64)
     values = np.column_stack([at, found.radius])
     columns = np.stack([np.bincount(number, found.rays * v) / weight for v in values.T], axis=1)
-    return _apart(columns[views >= _VIEWS], weight[views >= _VIEWS])
+    return _apart(columns[views >= config.views], weight[views >= config.views])
 
 
 def _apart(columns: Floats, weight: Floats) -> Floats:
@@ -187,21 +211,13 @@ def surroundings(columns: Floats, margin: float) -> Surroundings:
     return Surroundings(columns, corner, size, near)
 
 
-_WIDE, _WIDE_ROUNDS, _ROUNDS = 0.15, 3, 8
-"""Gate of the first steps towards a circle, m; their number, and that of all."""
-_GATE, _SLACK = 4.0, 0.02
-"""Gate of the other steps, standard deviations of the rays and m."""
-_FACING = -0.4
-"""Cosine between a ray and the outward normal; closer to 0 it hits the edge of a column, where readings are unreliable."""
-_AROUND, _OWN = 0.3, 0.6
-"""Distance from the circle up to which rays are a column's surroundings, m; share of these that must lie on it."""
 _PROBABLE = 1.22
 """Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
-_FEW = 20
-"""Least number of rays of a column."""
 
 
-def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Floats) -> Floats:
+def refined_columns(
+    columns: Floats, at: Floats, direction: Floats, sigma: Floats, config: ColumnConfig = _CONFIG
+) -> Floats:
     """Fit columns (c, 3) to the rays that end at (p, 2) in the map, and keep those that are round.
 
     Parameters
@@ -212,22 +228,22 @@ def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Float
         return columns
     own = cKDTree(columns[:, :2]).query(at)[1]
     weight = 1.0 / sigma**2
-    for turn in range(_ROUNDS):
+    for turn in range(config.steps):
         centre, radius = columns[:, :2].take(own, axis=0), columns[:, 2].take(own)
         shift, normal, incidence = to_circle(at - centre, direction, radius)
-        gate = _WIDE if turn < _WIDE_ROUNDS else _GATE * sigma + _SLACK
-        near = (incidence < _FACING) & (np.abs(shift) < gate)
+        gate = config.gates[turn] if turn < len(config.gates) else config.gate * sigma + config.slack
+        near = (incidence < -config.incidence) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
         rows = np.flatnonzero(robust)
         residual = (-shift * incidence).take(rows)
         whole, right = _summed(own.take(rows), robust.take(rows), normal.take(rows, axis=0), residual, len(columns))
         columns = columns + np.linalg.solve(whole + np.eye(3), right[:, :, None])[:, :, 0]
-        columns[:, 2] = np.clip(columns[:, 2], *_RADII)
-    ended = (incidence < _FACING) & (np.abs(shift) < _AROUND)
+        columns[:, 2] = np.clip(columns[:, 2], *config.radii)
+    ended = (incidence < -config.incidence) & (np.abs(shift) < config.around)
     count, around, probable = (
         np.bincount(own, flags, len(columns)) for flags in (near, ended, near & (np.abs(shift) < _PROBABLE * sigma))
     )
-    return np.asarray(columns[(count >= _FEW) & (count > _OWN * around) & (probable > 0.5 * count)])
+    return np.asarray(columns[(count >= 2 * config.fewest) & (count > config.share * around) & (probable > 0.5 * count)])
 
 
 def _summed(own: Ints, weight: Floats, normal: Floats, residual: Floats, many: int) -> tuple[Floats, Floats]:

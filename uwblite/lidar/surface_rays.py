@@ -20,16 +20,11 @@ from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
 from .ray_noise import RayNoise, range_sigma
-from .round_columns import Surroundings, refined_columns, surroundings, to_circle
+from .round_columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
 
-_GATE = 4.0
-"""Standard deviations within which a ray ends on the surface."""
 ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
-INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
-"""Least cosine of incidence on walls, and on columns, whose edges give unreliable readings."""
-_SLACK = 0.03
-"""Initial error of a column's place and radius, m."""
+_COLUMNS = ColumnConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,14 +160,16 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
-def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
+def on_columns(
+    rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS
+) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
     if not len(columns):
         return rays.rows(np.zeros(0, dtype=np.intp))
     at, direction = in_map(rays, poses)
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
-    good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE * rays.sigma + _SLACK)
+    good = (incidence < -config.incidence) & (np.abs(shift) < config.gate * rays.sigma + config.slack)
     return replace(rays, surface=nearest + first).rows(good)
 
 

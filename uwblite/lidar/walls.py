@@ -23,8 +23,11 @@ class WallConfig:
     """m, largest distance of a place from the other's line."""
     lean: float = np.deg2rad(6.0)
     """rad, largest difference of directions, beside two standard deviations of it."""
-    scatter: float = 0.03
+    scatter: float = 0.05
     """m, rms scatter of places about a straight wall."""
+    turned: float = 2.0
+    """Largest rms difference of directions from the wall's, in their standard deviations: what looks flat from every side, as a
+    stem or a corner does, turns with the view."""
     keyframes: int = 4
     """Least number that see it."""
     halvings: int = 6
@@ -35,7 +38,7 @@ _CONFIG = WallConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Walls:
+class StraightWalls:
     """Straight walls (w) of a map."""
 
     of_piece: Ints
@@ -46,7 +49,7 @@ class Walls:
     """(w, 2) unit, towards the robot."""
 
 
-def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _CONFIG) -> Walls:
+def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _CONFIG) -> StraightWalls:
     """Join those of some pieces (s,) that lie on each other, at poses (k, 3) of the keyframes, to walls."""
     piece, at, normal = _places(pieces, poses, config.every)
     kept = np.flatnonzero(some[piece])
@@ -57,9 +60,10 @@ def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = 
     centre, facing = _lines(number, at, normal, deviation)
     seen = np.bincount(unique_rows(np.stack([number, keyframe], axis=1))[0][:, 0], minlength=len(centre))
     good = (seen >= config.keyframes) & (_scatter(number, at, centre, facing) < config.scatter)
+    good &= _rms(number, _across(normal, facing[number]) / np.hypot(deviation, _TURNED), len(centre)) < config.turned
     of_piece = np.full(len(some), -1)
     of_piece[piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
-    return Walls(of_piece, centre[good], facing[good])
+    return StraightWalls(of_piece, centre[good], facing[good])
 
 
 def _places(pieces: Pieces, poses: Floats, every: float) -> tuple[Ints, Floats, Floats]:
@@ -141,17 +145,17 @@ def _halved(number: Ints, at: Floats, normal: Floats, deviation: Floats, keyfram
     """Return the number (m,) of the set of each place, with bent sets halved along their length.
 
     Heading errors of some mrad over a long distance bend a long wall in the map, which looks straight from each pose. Its parts
-    are straight, and are joined once poses have been adjusted to them (joined_walls.py). Walls bent in one scan stay whole.
+    are straight. Sets bent in one scan stay whole, and short ones: what bends within a metre is no bend of the poses.
     """
     number = np.unique(number, return_inverse=True)[1]
     centre, facing = _lines(number, at, normal, deviation)
     bent = _scatter(number, at, centre, facing) > config.scatter
     bent &= ~_curved(number, at, keyframe, facing, config)
+    bent &= _rms(number, _across(at - centre[number], facing[number]), len(centre)) > config.reach
     for _ in range(config.halvings):
         if not bent.any():
             break
-        off = at - centre[number]
-        beyond = bent[number] & (off[:, 0] * facing[number, 1] > off[:, 1] * facing[number, 0])
+        beyond = bent[number] & (_across(at - centre[number], facing[number]) < 0.0)
         halves, number = np.unique(2 * number + beyond, return_inverse=True)
         centre, facing = _lines(number, at, normal, deviation)
         bent = bent[halves // 2] & (_scatter(number, at, centre, facing) > config.scatter)
@@ -166,10 +170,9 @@ def _lines(number: Ints, at: Floats, normal: Floats, deviation: Floats) -> tuple
     centre, facing = _mean(number, at, np.ones(len(at)), many), _mean(number, normal, weight, many)
     facing /= np.maximum(np.hypot(*facing.T), 1e-9)[:, None]
     off, own = at - centre[number], facing[number]
-    across, along = dots(off, own), off[:, 1] * own[:, 0] - off[:, 0] * own[:, 1]
-    turn = normal[:, 1] * own[:, 0] - normal[:, 0] * own[:, 1]
+    across, along = dots(off, own), _across(off, own)
     known = np.bincount(number, (along / _OFF) ** 2 + weight, many)
-    turn = np.bincount(number, turn * weight - along * across / _OFF**2, many) / known
+    turn = np.bincount(number, _across(normal, own) * weight - along * across / _OFF**2, many) / known
     return centre, se2.rotate(turn, facing)
 
 
@@ -180,8 +183,17 @@ and m."""
 
 def _scatter(number: Ints, at: Floats, centre: Floats, facing: Floats) -> Floats:
     """Return the rms distance (w,) of places (m, 2) from the lines of their sets, m."""
-    off = dots(at - centre[number], facing[number])
-    return np.asarray(np.sqrt(np.bincount(number, off**2, len(centre)) / np.bincount(number, minlength=len(centre))))
+    return _rms(number, dots(at - centre[number], facing[number]), len(centre))
+
+
+def _rms(number: Ints, values: Floats, many: int) -> Floats:
+    """Return the rms (m,) of the values (s,) of each of many sets."""
+    return np.asarray(np.sqrt(np.bincount(number, values**2, many) / np.bincount(number, minlength=many)))
+
+
+def _across(vectors: Floats, unit: Floats) -> Floats:
+    """Return by how much (m,) vectors (m, 2) point to the left of unit vectors (m, 2)."""
+    return np.asarray(unit[:, 0] * vectors[:, 1] - unit[:, 1] * vectors[:, 0])
 
 
 def _curved(number: Ints, at: Floats, keyframe: Ints, facing: Floats, config: WallConfig) -> Bools:

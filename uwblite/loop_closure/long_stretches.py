@@ -20,8 +20,6 @@ from .closures import LoopClosureConfig
 _LENGTH = 30.0
 """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays within the
 gate of the final matching. Each begins in the middle of the one before."""
-FARTHEST = 120.0
-"""Largest 3 sigma of a pair, m; beyond it, every stretch may be any other."""
 _AT_ONCE, _PART = 40, 8
 """Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
 
@@ -48,24 +46,22 @@ def any_uncertain(
     ----------
     reference : (s,) keyframes in the middle of stretches or of sub-maps.
     """
-    return uncertain(graph, covariance, reference, recording, _wide(config, FARTHEST), config.search_limit)
+    return uncertain(graph, covariance, reference, recording, _wide(config), config.search_limit)
 
 
-def _wide(config: LoopClosureConfig, farthest: float) -> LoopClosureConfig:
-    return replace(config, reach=_LENGTH / 2.0, search_limit=farthest)
+def _wide(config: LoopClosureConfig) -> LoopClosureConfig:
+    return replace(config, reach=_LENGTH / 2.0, search_limit=np.inf)
 
 
 def uncertain_pairs(
     graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
-    constrained: bool, config: LoopClosureConfig, farthest: float = FARTHEST,
+    constrained: bool, config: LoopClosureConfig,
 ) -> Candidates:
     """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the likeliest first.
 
-    Parameters
-    ----------
-    farthest : pairs whose 3 sigma are larger, m, are left out. For the others see candidates.propose.
+    For the parameters see candidates.propose.
     """
-    wide = _wide(config, farthest)
+    wide = _wide(config)
     found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, config.search_limit)
     return found.rows(np.argsort(-overlap_probability(found.guess, found.covariance, wide.reach), kind="stable"))
 

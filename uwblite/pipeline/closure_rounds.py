@@ -129,7 +129,7 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
     recordings, rules = task.recordings, task.config.loop_closure
     covariance = JointCovariance(base.with_edges(found.edges), stretches.reference)
     left = long_stretches.likely(long_stretches.uncertain_pairs(
-        base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules, np.inf
+        base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules
     ))  # fmt: skip
     if not len(left.target):
         return

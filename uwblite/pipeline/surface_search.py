@@ -8,7 +8,7 @@ from ..arrays import Floats, concatenated
 from ..lidar.pieces import straight_pieces
 from ..lidar.ray_equations import misfit
 from ..lidar.ray_noise import UNLEARNT
-from ..lidar.round_columns import find_columns, fitted_circles, surroundings
+from ..lidar.round_columns import fitted_circles, join_circles, surroundings
 from ..lidar.surface_rays import (
     NEAR,
     MeasuredSurfaces,
@@ -43,7 +43,7 @@ _ON_RIM = 0.06
 
 def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfaces:
     """Return the surfaces of the map with clouds at poses (k, 3)."""
-    columns = find_columns(concatenated([fitted_circles(rays) for rays in _rays(scans, task)]), poses)
+    columns = join_circles(concatenated([fitted_circles(rays) for rays in _rays(scans, task)]), poses)
     near_columns, many = surroundings(columns, NEAR), 0
     near, pieces, on = [], [], []
     for rays in _rays(scans, task):

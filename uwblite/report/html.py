@@ -12,7 +12,7 @@ from html import escape as escape_markup
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..findings import Finding
+from ..findings import DOUBT, Finding, folded
 from ..graph.calibration import HEIGHT
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .page import PAGE, SCRIPT, STYLE
@@ -72,20 +72,26 @@ def _section(title: str, content: str) -> str:
 
 
 def _banner(result: MapResult, lead: str) -> str:
+    groups = [(cause, rest, any(f.severity == DOUBT for f in (cause, *rest))) for cause, rest in folded(result.findings)]
     boxes = (
-        ('"box bad" role=alert', "Do not trust this map before these are resolved:", result.doubts),
-        ('"box warn"', "Worth knowing:", result.warnings),
+        ('"box bad" role=alert', "Do not trust this map before these are resolved:", True),
+        ('"box warn"', "Worth knowing:", False),
     )
-    items = ((kind, head, "".join(_item(finding) for finding in found)) for kind, head, found in boxes)
+    items = (
+        (kind, head, "".join(_item(cause, rest) for cause, rest, doubted in groups if doubted is bad))
+        for kind, head, bad in boxes
+    )
     text = "".join(f"<div class={kind}><b>{head}</b><ul>{listed}</ul></div>" for kind, head, listed in items if listed)
     text = text or '<div class="box good">No warnings.</div>'
     return f'<section id="warnings">{text}<p class=lead>{escape(lead)}</p></section>'
 
 
-def _item(finding: Finding) -> str:
-    """Return a finding as an item of a list: its text, and what to do, commands as code."""
+def _item(finding: Finding, explains: Sequence[Finding] = ()) -> str:
+    """Return a finding as an item of a list: its text, what to do, commands as code, and what it explains."""
     cure = re.sub("`([^`]*)`", r"<code>\1</code>", escape(finding.cure))
-    return f"<li class={escape(finding.kind)}>{escape(finding.text)}{f'<br>{cure}' if cure else ''}</li>"
+    more = "".join(_item(other) for other in explains)
+    more = f"<details><summary>explains {len(explains)} more</summary><ul>{more}</ul></details>" if more else ""
+    return f"<li class={escape(finding.kind)}>{escape(finding.text)}{f'<br>{cure}' if cure else ''}{more}</li>"
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:

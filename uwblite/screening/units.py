@@ -87,9 +87,9 @@ def likely_unit(times: float) -> str:
     if times <= 0.0:
         return ""
     if abs(np.log(times * _YARD)) < _SAME_UNIT:
-        return f"; ranges in yards would look like this (uwblite convert --range-unit {_YARD})"
+        return f"; ranges in yards would look like this (`range_unit={_YARD}`)"
     if abs(np.log(times / _LENGTHS["feet"])) < _SAME_UNIT:
-        return f"; odometry in feet would look like this (uwblite convert --odometry-unit {_LENGTHS['feet']})"
+        return f"; odometry in feet would look like this (`odometry_unit={_LENGTHS['feet']}`)"
     return ""
 
 
@@ -152,7 +152,7 @@ def _other_time(name: str, unit: float, period: float, speed: float) -> str:
     """Return the words on stamps in another unit, s."""
     return (
         f"the stamps look like {name}: the odometry would come every {period:.3g} s, at {speed:.1g} m/s; "
-        f"write seconds into the log (uwblite convert --time-unit {unit:g})"
+        f"write seconds into the log (`time_unit={unit:g}`)"
     )
 
 
@@ -213,7 +213,7 @@ def _positions(odometry: Odometry) -> str:
 def _other_unit(what: str, usual: str, unit: str, option: str) -> str:
     """Return the words on lengths in another unit."""
     factor = f"{_LENGTHS[unit]:g}"
-    return f"{what} look like {unit}: the {usual}; write metres into the log (uwblite convert --{option}-unit {factor})"
+    return f"{what} look like {unit}: the {usual}; write metres into the log (`{option}_unit={factor}`)"
 
 
 def _heading(odometry: Odometry) -> str:
@@ -227,7 +227,7 @@ def _heading(odometry: Odometry) -> str:
     if varied and large and plain < _AGREEMENT and degrees > max(plain, mirrored) + _CLEARLY:
         return (
             f"the odometry's heading looks like degrees (as such it agrees with the path to {degrees:.2f} of 1, as radians to "
-            f"{plain:.2f}); write radians into the log (uwblite convert --angle-unit 0.0174533)"
+            f"{plain:.2f}); write radians into the log (`angle_unit=0.0174533`)"
         )
     return ""
 

@@ -1,0 +1,126 @@
+"""Causes before consequences: each consequence names its cause, keeps its severity, and is told below it."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from helpers.room_recording import recording, two_rounds
+
+from uwblite import se2
+from uwblite.assessment import decisions, repairs
+from uwblite.assessment.causes import EXPLAINS, explained
+from uwblite.assessment.recording import diagnose
+from uwblite.findings import Finding, doubt, folded, warning
+from uwblite.mapping import build_map
+from uwblite.sensor_log import LogNotes, Odometry
+
+
+def causes(findings):
+    return {finding.kind: finding.explained_by for finding in findings}
+
+
+def test_a_consequence_names_its_cause_and_comes_after_it():
+    found = explained([doubt("uncertain", "c"), doubt("clock-set-back", "a"), doubt("range-scatter", "b"), doubt("gap", "d")])
+    assert [f.kind for f in found] == ["clock-set-back", "gap", "range-scatter", "uncertain"]
+    assert causes(found) == {
+        "clock-set-back": (), "gap": (), "range-scatter": ("clock-set-back",), "uncertain": ("clock-set-back", "range-scatter"),
+    }  # fmt: skip
+    assert all(f.severity == "doubt" for f in found)
+
+
+@pytest.mark.parametrize(("recordings", "anchors", "named"), [
+    ((1, 1), ("", ""), True), ((0, 2), ("", ""), True), ((1, 2), ("", ""), False), ((1, 1), ("A", "A"), True),
+    ((1, 1), ("A", "B"), False), ((1, 1), ("", "B"), True),
+])  # fmt: skip
+def test_a_cause_concerns_the_same_recording_and_anchor(recordings, anchors, named):
+    kinds = ("shared-name", "anchor-distrusted")
+    pair = [Finding(k, "warning", "", recording=r, anchor=a) for k, r, a in zip(kinds, recordings, anchors, strict=True)]
+    assert causes(explained(pair))["anchor-distrusted"] == (("shared-name",) if named else ())
+
+
+def test_no_cause_explains_itself_in_a_circle():
+    """Along the order of the table every cause explains later causes only."""
+    rank = {kind: k for k, kind in enumerate(EXPLAINS)}
+    every = [doubt(kind, "") for kind in {*EXPLAINS, *(kind for kinds in EXPLAINS.values() for kind in kinds)}]
+    for finding in explained(every):
+        assert all(rank[cause] < rank.get(finding.kind, len(rank)) for cause in finding.explained_by)
+
+
+@pytest.mark.parametrize(("sensor", "named"), [("radio", False), ("odometry", True)])
+def test_a_fault_of_one_sensor_explains_what_that_sensor_shows(sensor, named):
+    pair = [replace(doubt("clock-set-back", ""), sensor=sensor), doubt("wheels-stand-still", "")]
+    assert causes(explained(pair))["wheels-stand-still"] == (("clock-set-back",) if named else ())
+
+
+def test_every_kind_of_fact_has_a_rule_of_its_name():
+    assert not set(repairs.RULES) & set(decisions.RULES)
+
+
+def test_what_is_explained_is_folded_under_the_first_cause_of_all():
+    doubts = [doubt(kind, "") for kind in ("uncertain", "range-scatter", "clock-set-back")]
+    found = explained([*doubts, warning("gyro", "")])
+    (first, below), (second, none) = folded(found)
+    assert (first.kind, [f.kind for f in below]) == ("clock-set-back", ["range-scatter", "uncertain"])
+    assert (second.kind, none) == ("gyro", ())
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return recording(two_rounds())
+
+
+def with_steps(log, change):
+    poses = log.odometry.poses
+    steps = se2.between(poses[:-1], poses[1:])
+    change(steps)
+    return replace(log, odometry=Odometry(log.odometry.stamps, se2.chain(poses[0], steps)))
+
+
+def turned_over(log):
+    return replace(log, mounting=replace(log.mounting, laser_flipped=True))
+
+
+def two_names(log):
+    """Give one anchor's name to two of them."""
+    return replace(log, ranges=replace(log.ranges, anchor=np.where(log.ranges.anchor == 1, 0, log.ranges.anchor)))
+
+
+def stuck_wheels(log):
+    def stop(steps):
+        steps[1000:1300] = 0.0
+
+    return with_steps(log, stop)
+
+
+def twice(log):
+    """Write every scan twice."""
+    scans = log.scans
+    again = np.sort(np.concatenate([scans.stamps, scans.stamps + 0.01]))
+    return replace(log, scans=replace(scans, stamps=again, ranges=np.repeat(scans.ranges, 2, axis=0)))
+
+
+def set_back(log):
+    return replace(log, notes=LogNotes(set_back={"radio": 30.0}))
+
+
+FAULTS = {
+    "laser-turned-over": turned_over, "shared-name": two_names, "wheels-stand-still": stuck_wheels, "repeated-scans": twice,
+    "clock-set-back": set_back,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("one", "other"), [*combinations(FAULTS, 2)])
+def test_of_two_faults_at_once_both_are_named(sound, one, other):
+    """Neither hides the other, nor is it told as a consequence of the other."""
+    found = diagnose(FAULTS[one](FAULTS[other](sound))).findings
+    assert {one, other} <= {cause.kind for cause, _ in folded(found)}, [f.text for f in found]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("one", "other"), [
+    ("wheels-stand-still", "shared-name"), ("clock-set-back", "wheels-stand-still"), ("repeated-scans", "shared-name"),
+])  # fmt: skip
+def test_a_map_of_two_faults_names_both(sound, one, other):
+    found = build_map(FAULTS[one](FAULTS[other](sound))).findings
+    assert {one, other} <= {f.kind for f in found}
