@@ -16,7 +16,7 @@ from ..graph.calibration import BIAS, HEIGHT
 from ..graph.graph import Graph, PriorEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.solver import SolverConfig, optimize
-from ..problem.alternatives import Alternative, EvidencePolicy, explanations
+from ..problem.alternatives import Alternative, EvidencePolicy, compared
 from ..problem.evidence import log_density
 from .estimate import Estimate, Task
 
@@ -56,8 +56,8 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
         likelier = (np.hypot(*(there.anchors - here.anchors).T) > MirrorPolicy.apart) & (odds > log_odds)
         log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], there.anchors, others)
     as_well, best = log_odds > -EvidencePolicy.very_strong, estimate.graph
-    other = found.ambiguous & np.any(second != best.anchors, axis=1)
-    images = np.where(other[:, None], second, mirrored)
+    twice = found.ambiguous & np.any(second != best.anchors, axis=1)
+    images = np.where(twice[:, None], second, mirrored)
     bent = np.flatnonzero(free & ~as_well & straight & (np.hypot(*(images - best.anchors).T) > MirrorPolicy.apart))
     if len(bent) and task.recordings.have_scans:
         # Anchors were estimated last and alone, and all together may be better.
@@ -94,14 +94,11 @@ def mirrored_whole(graph: Graph, ranges: RangeEdges, free: Bools, config: Solver
     anchors = graph.anchors.copy()
     anchors[free] -= 2.0 * ((anchors[free] - tags.mean(axis=0)) @ across)[:, None] * across
 
-    def mirrored(at: Graph) -> list[Alternative]:
-        return [Alternative(replace(graph, anchors=anchors))] if at is graph else []
-
-    for each in explanations(graph, mirrored, lambda start: optimize(start, config)[0], log_density):
-        apart = np.hypot(*(each.graph.anchors - graph.anchors)[free].T)
-        if each.open and apart.min(initial=np.inf) > MirrorPolicy.apart:
-            return each.graph
-    return None
+    image = compared(graph, Alternative(replace(graph, anchors=anchors)), lambda start: optimize(start, config)[0], log_density)
+    if image is None or not image.open:
+        return None
+    apart = np.hypot(*(image.graph.anchors - graph.anchors)[free].T)
+    return image.graph if apart.min(initial=np.inf) > MirrorPolicy.apart else None
 
 
 def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, task: Task) -> Floats | None:
@@ -113,18 +110,15 @@ def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, 
     """
     anchors = best.anchors.copy()
     anchors[k] = image
+    alternative, config = Alternative(replace(best, anchors=anchors)), task.config.solver
+    other = compared(best, alternative, lambda start: optimize(start, config)[0], log_density)
+    if other is None or not other.open:
+        return None
     own = ranges.pose[ranges.alive & (ranges.anchor == k)]
-
-    def mirrored(graph: Graph) -> list[Alternative]:
-        return [Alternative(replace(best, anchors=anchors))] if graph is best else []
-
-    for each in explanations(best, mirrored, lambda graph: optimize(graph, task.config.solver)[0], log_density):
-        bend = np.hypot(*(each.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
-        held = task.recordings.have_scans and bend < MirrorPolicy.bends
-        apart = np.hypot(*(each.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
-        if each.open and apart and not held:
-            return np.asarray(each.graph.anchors[k])
-    return None
+    bend = np.hypot(*(other.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
+    held = task.recordings.have_scans and bend < MirrorPolicy.bends
+    apart = np.hypot(*(other.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
+    return None if held or not apart else np.asarray(other.graph.anchors[k])
 
 
 def _images(estimate: Estimate, ranges: RangeEdges) -> tuple[Floats, Bools]:
