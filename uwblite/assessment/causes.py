@@ -56,6 +56,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
     "loose-links": frozenset({
         "free-space-violation", "no-closure", "untied-parts", "anchors-moved-together", "path-displaced",
     }),
+    "free-space-violation": _PLACES | {"range-scatter", "path-displaced"},
     "path-displaced": _PLACES,
     "range-scatter": _BY_RANGES - {"range-scatter", "path-displaced"},
     "drift": _PLACES | {"odometry-slips", "odometry-unit", "unusual-calibration"},
