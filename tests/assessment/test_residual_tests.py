@@ -107,7 +107,7 @@ def test_wheels_that_slip_are_a_warning_where_scans_fix_the_steps(spans):
     assert 44 <= notice.figures["end"] <= 50
     assert notice.recording == 1
     assert notice.stretches == ((50.0 + notice.figures["start"], 50.0 + notice.figures["end"]),)
-    assert f"--end {notice.figures['start']:.0f}`" in notice.cure
+    assert f"`end={notice.figures['start']:.0f}`" in notice.cure
 
 
 @pytest.mark.parametrize(("way", "kind"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])

@@ -148,25 +148,6 @@ def test_kill_and_append(bench, tmp_path):
 
 
 @pytest.mark.slow
-def test_unplugging_is_survived_and_reported(bench, tmp_path):
-    start, arguments, truth = bench
-    faults = [w for f in ("lidar:unplug@4+1", "uwb:unplug@4.5+1", "kobuki:unplug@5+1") for w in ("--fault", f)]
-    emulator = start(*faults)
-    code, out, _ = finish(record(arguments, tmp_path / "run.log", "--duration", "10", "--json"))
-    emulator.terminate()
-    emulator.wait()
-    assert code in (0, 3)
-    devices = json.loads(out)["devices"]
-    assert all(device["connects"] == 2 for device in devices.values())
-    text = (tmp_path / "run.log").read_text()
-    for name in ("lidar", "uwb", "odometry"):
-        assert f"warning {name}-gone" in text
-    for name, row in compare(tmp_path / "run.log", truth).items():
-        check_row(name, {**row, "missing": 0})
-    assert "odometry-gap" not in text  # encoders and gyro counted on
-
-
-@pytest.mark.slow
 def test_a_port_has_one_owner(bench, tmp_path):
     start, arguments, _ = bench
     start(devices=("lidar",))
@@ -267,25 +248,50 @@ def test_devices_names_an_anchor_and_a_dead_port(bench, capsys, tmp_path):
     assert "no such port" in out
 
 
-@pytest.mark.slow
-def test_a_minute_at_full_rates(tmp_path):
-    """In simulated time: crystals that are wrong, and clocks that wrap within the minute."""
-    world, clock, sent = RoomWorld(), WorldClock(), []
+def emulated(sent, lidar=None, clock_skew=0.0, **options):
+    """Return an emulated URG-04LX, tag and base with their sessions, and the clock of their world; `sent` gets the truth."""
+    world, clock = RoomWorld(), WorldClock()
 
     def truth(name):
         return lambda at, *content: sent.append([name, at, content[0]])
 
-    lidar = ScipOptions(clock_start=16747216, clock_skew=1e-4)
-    base = KobukiDevice(world.poses(), clock, clock_start=30000, clock_skew=-5e-5, on_packet=truth("odometry"))
-    devices = [
-        ("lidar", open_device("lidar", "port")[0], ScipDevice(world.scans(), clock, lidar, truth("lidar"))),
+    base = KobukiDevice(world.poses(), clock, clock_skew=clock_skew, on_packet=truth("odometry"), **options)
+    return clock, [
+        ("lidar", open_device("lidar", "port")[0], ScipDevice(world.scans(), clock, lidar or ScipOptions(), truth("lidar"))),
         ("uwb", open_device("uwb", "port")[0], DwmDevice(world.epochs(), clock, DwmOptions(), truth("uwb"))),
         ("odometry", open_device("odometry", "kobuki:port")[0], base),
     ]
+
+
+def compared(folder, sent):
+    (folder / "truth.jsonl").write_text("".join(json.dumps(row) + "\n" for row in sent))
+    return compare(folder / "run.log", folder / "truth.jsonl")
+
+
+def test_unplugging_is_survived_and_reported(tmp_path):
+    """In simulated time: each device is away for a second, one after the other."""
+    sent = []
+    clock, devices = emulated(sent)
+    away = {"lidar": (4.0, 5.0), "uwb": (4.5, 5.5), "odometry": (5.0, 6.0)}
+    path = tmp_path / "run.log"
+    recorder = virtual_recording.record(path, devices, 14.0, begin=lambda now: clock.start(now + 1.5), away=away)
+    assert [link.counts.connects for link in recorder.links] == [2, 2, 2]
+    text = path.read_text()
+    for name in away:
+        assert f"warning {name}-gone" in text
+    for name, row in compared(tmp_path, sent).items():
+        check_row(name, {**row, "missing": 0})
+    assert "odometry-gap" not in text  # encoders and gyro counted on
+
+
+@pytest.mark.slow
+def test_a_minute_at_full_rates(tmp_path):
+    """In simulated time: crystals that are wrong, and clocks that wrap within the minute."""
+    sent, lidar = [], ScipOptions(clock_start=16747216, clock_skew=1e-4)
+    clock, devices = emulated(sent, lidar, clock_start=30000, clock_skew=-5e-5)
     recorder = virtual_recording.record(tmp_path / "run.log", devices, 62.0, begin=lambda now: clock.start(now + 1.5))
     assert recorder.doubts() == []
-    (tmp_path / "truth.jsonl").write_text("".join(json.dumps(row) + "\n" for row in sent))
-    for name, row in compare(tmp_path / "run.log", tmp_path / "truth.jsonl").items():
+    for name, row in compared(tmp_path, sent).items():
         check_row(name, row)
         assert row["sent"] > (2900 if name == "odometry" else 580)
         assert row["p95_ms"] < 5.0

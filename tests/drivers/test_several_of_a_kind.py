@@ -42,7 +42,7 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     unused = log.notes.skipped["ROBOTLASER2"]
     assert unused > 15
     (warning,) = (text for text in log.notes.warnings if "one lidar, here the first" in text)
-    assert f"scans of others are left out ({unused} of ROBOTLASER2); --scan-topic ROBOTLASER2" in warning
+    assert f"scans of others are left out ({unused} of ROBOTLASER2); `topics.scan=ROBOTLASER2`" in warning
     assert set(log.ranges.tag.tolist()) == {0, 1}
     assert log.mounting.tags[1].tolist() == [-0.3, 0.0, 0.0]
     assert not log.mounting.laser_flipped

@@ -7,6 +7,7 @@ from uwblite.drivers import link as link_module
 from uwblite.drivers.link import Link, Mounting
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
+from uwblite.errors import DeviceError
 
 LATENCY = 0.0008
 """s from the host to a device."""
@@ -22,18 +23,29 @@ class VirtualTime:
         return self.now
 
 
-class VirtualPort:
-    """A port with an emulated device at its other end."""
+PLUGGED = (float("inf"), float("inf"))
 
-    def __init__(self, device, clock):
-        self.device, self._clock = device, clock
-        self._answers = []
+
+class VirtualPort:
+    """A port with an emulated device at its other end, which is unplugged between two times."""
+
+    def __init__(self, device, clock, away=PLUGGED):
+        self.device, self._clock, self._away = device, clock, away
+        self._answers, self._closed = [], False
+        self._check_plugged()
+        if clock.now >= away[1]:
+            device.advance(clock.now)
         device.power_up(clock.now)
+
+    def _check_plugged(self):
+        if self._away[0] <= self._clock.now < self._away[1]:
+            raise DeviceError("it was unplugged")
 
     def fileno(self):
         return None
 
     def read(self):
+        self._check_plugged()
         now, data = self._clock.now, b""
         self._send(self.device.advance(now), now)
         while self._answers and self._answers[0][0] <= now:
@@ -46,10 +58,14 @@ class VirtualPort:
             self._answers.append((max(due, self._answers[-1][0]) if self._answers else due, data))
 
     def write(self, data):
+        self._check_plugged()
         self._send(self.device.receive(data, self._clock.now), self._clock.now + LATENCY)
 
     def next_time(self):
-        return min(self.device.next_time(self._clock.now), self._answers[0][0] if self._answers else float("inf"))
+        if self._closed:
+            return float("inf")
+        times = [self.device.next_time(self._clock.now), *(due for due, _ in self._answers[:1])]
+        return min([*times, self._away[0]] if self._clock.now < self._away[0] else times)
 
     def set_baud(self, rate):
         pass
@@ -58,14 +74,17 @@ class VirtualPort:
         pass
 
     def close(self):
-        pass
+        self._closed = True
 
 
 class OpenedAtOnce:
     """Instead of a thread that opens a port."""
 
     def __init__(self, open_port, url, baud):
-        self._port = open_port(url, baud)
+        try:
+            self._port = open_port(url, baud)
+        except DeviceError as error:
+            self._port = error
 
     def result(self):
         return self._port
@@ -132,7 +151,7 @@ def live_devices(devices, seconds, *, begin=None):
         yield
 
 
-def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), params=(), begin=None):
+def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), params=(), begin=None, away=None):
     """Record emulated devices into a log.
 
     Parameters
@@ -141,6 +160,7 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), par
     devices : list of (sensor, session, device); several of a sensor are numbered in this order.
     seconds : how long.
     begin : called with the clock's time at the start.
+    away : s from and until when a device is unplugged, by its sensor.
 
     Returns
     -------
@@ -153,8 +173,10 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), par
         Link(name, f"virtual{i}", session, names[: i + 1].count(name)) for i, (name, session, _) in enumerate(devices)
     ]  # fmt: skip
 
+    spans = {f"virtual{i}": tuple(clock.now + t for t in (away or {}).get(name, PLUGGED)) for i, name in enumerate(names)}
+
     def open_port(url, _baud):
-        ports[url] = VirtualPort(by_url[url], clock)
+        ports[url] = VirtualPort(by_url[url], clock, spans[url])
         return ports[url]
 
     log = LogFile(path)

@@ -94,8 +94,8 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     ((begin, end),) = finding.stretches
     assert SLIP - 2.0 < begin < end < SLIP + 4.0
     assert finding.figures["off"] == pytest.approx(3.0, abs=0.5)
-    assert "--end 5" in finding.cure or "--end 6" in finding.cure
-    assert "--without lidar" in finding.cure
+    assert "`end=5" in finding.cure or "`end=6" in finding.cure
+    assert "`use_lidar=false`" in finding.cure
 
 
 def test_what_was_said_of_anchors_along_a_torn_path_names_its_cause():

@@ -68,14 +68,15 @@ class Continuity(Generic[Item]):
         ----------
         witnesses : how many must agree with one that leaps; 0 = it passes.
         """
+        dropped: list[Item] = []
         if witnesses == 0:
-            passed, dropped = [*self.waiting, item], []
+            passed = [*self.waiting, item]
         elif self.last is not None and self._follows(self.last, item):
             passed, dropped = [item], self.waiting
             if self.waiting and self._follows(self.waiting[-1], item):  # they were late, and not damaged
                 passed, dropped = [*self.waiting, item], []
         elif self.waiting and self._follows(self.waiting[-1], item):
-            passed, dropped = [*self.waiting, item], []
+            passed = [*self.waiting, item]
             if len(self.waiting) < witnesses:
                 passed, self.waiting = [], passed
         else:
