@@ -92,7 +92,9 @@ def _even_floor(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple
 INGREDIENTS: dict[str, LeftOut] = {
     "nothing (the defaults)": LeftOut(),
     "surfaces": LeftOut(patches=(("pipeline.surface_adjustment.adjust_surfaces", _pairs_alone),)),
-    "columns": LeftOut(patches=(("pipeline.surface_search.join_circles", lambda circles, poses: np.zeros((0, 3))),)),
+    "columns": LeftOut(patches=(
+        ("pipeline.surface_search.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
+    )),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
     "noise of wheels by residuals": LeftOut(patches=(
         ("pipeline.final_stages.with_noise_shown", lambda graph, certainty: graph),

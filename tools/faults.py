@@ -4,6 +4,7 @@
     python tools/faults.py                               3 min of a lab; writes into docs/lab/accuracy.md
     python tools/faults.py --only frozen                 cases whose names contain a word; the page stays
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
+    python tools/faults.py --sound                       sound recordings of every world: false alarms alone
 
 A map is wrong when its trajectory is off by more than 0.5 m (rms), or an anchor that is called ok by more than 1 m and
 three standard deviations. The truth of a real recording is its map without a fault, whose own standard deviations count as
@@ -33,6 +34,7 @@ from faulting.causes import causes_of
 from faulting.every import FAULTS
 from faulting.logs import two_buildings, two_robots
 from faulting.outcome import ANCHOR_BAR, CRASHED, VERDICTS, Outcome, by_kind, counted, summary
+from simulation.plans import PLANS
 from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
@@ -238,21 +240,22 @@ def write_page(page: Path, done: Sequence[Outcome], minutes: float) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--worlds", default="lab")
+    p.add_argument("--worlds", help="simulated ones, and kasdorf; lab, with --sound all that are simulated")
     p.add_argument("--minutes", type=float, default=3.0)
     p.add_argument("--seed", type=int, default=1)
     only = "faults whose names contain it; repeatable; the page stays"
     p.add_argument("--only", action="append", default=[], metavar="WORD", help=only)
     p.add_argument("--sensors", default="all,no-lidar,no-uwb")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
+    p.add_argument("--sound", action="store_true", help="no fault at all, in every world unless --worlds names some")
     p.add_argument("--print", action="store_true", help="do not write docs/lab/accuracy.md")
     p.add_argument("--verbose", action="store_true", help="show warnings too")
     args = p.parse_args(argv)
-    worlds, tasks = args.worlds.split(","), []
+    worlds, tasks = (args.worlds or (",".join(PLANS) if args.sound else "lab")).split(","), []
     cases = clean_cases(worlds, args.minutes, args.seed)
     for world, case in cases.items():
         for name, (fault, kinds) in FAULTS.items():
-            if args.only and not any(word in name for word in args.only):
+            if (args.sound and name != "none") or (args.only and not any(word in name for word in args.only)):
                 continue
             if name in WITH_ANOTHER:
                 if world == "kasdorf":
@@ -266,7 +269,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.verbose:
             print(*(f"      warning: {w}" for w in outcome.warnings), sep="\n", flush=True)
     print(summary(done))
-    if not args.print and not args.only:
+    if not args.print and not args.only and not args.sound:
         write_page(ROOT / "docs" / "lab" / "accuracy.md", done, args.minutes)
     return 1 if any(o.verdict.isupper() for o in done) else 0
 

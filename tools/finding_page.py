@@ -1,18 +1,24 @@
 """The page docs/findings.md: every kind of finding, from the rules' own code and texts and from the table of faults.
 
 A rule is a function of the package that makes a finding of a kind; its docstring says what it looks at and why, its text is the
-example, and the table of faults in docs/lab/accuracy.md shows which planted faults only this kind names.
+example. What the kind means and what to do stand in the table of docs/formats.md, what it explains in assessment/causes.py, and
+the table of faults in docs/lab/accuracy.md shows which planted faults only this kind names.
 """
 
 import ast
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from uwblite.assessment.causes import EXPLAINS
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "uwblite"
-FACTORIES = {"doubt": "doubt", "warning": "warning", "warn": "warning", "Finding": "", "say": "", "add": ""}
+FACTORIES = {"doubt": "doubt", "warning": "warning", "Finding": "", "say": "", "add": ""}
 """Functions that make a finding of the kind that is their first argument, and its severity where they say it."""
 KIND = re.compile(r"[a-z]+(-[a-z]+)+|gyro|drift|scales|carried|uncertain|mirrored")
 
@@ -23,8 +29,9 @@ Written by `tools/make_docs.py` from the rules themselves; do not edit.
 
 A finding says what is wrong in a recording, in a map or in a live pose. Its kind is a fixed name, for searching here and for
 scripts (`kind` in `report.json` and in `--json`). A **doubt** is a reason not to trust the result: the files are written and
-the exit code is 3. A **warning** was repaired or costs accuracy. No rule takes back what another one found. Where a doubt is
-about stretches of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states. Settings and
+the exit code is 3. A **warning** was repaired or costs accuracy; a **note** is good to know. No rule takes back what another
+found; what is a consequence of another finding names it (`explained_by`) and is told below it. Where a doubt is about stretches
+of the path, these are marked in `map.png` and `report.html`, and the rest is as good as it states. Settings and
 arguments stand in backticks; the command line puts its options there.
 
 *Planted faults* are those of `tools/faults.py` in a simulated laboratory and in a real recording: the faults after which this
@@ -117,18 +124,42 @@ def only_named_by() -> dict[str, list[str]]:
     return alone
 
 
+def short_form() -> dict[str, tuple[str, str]]:
+    """Return, by kind, what it means and what to do, from the table in docs/formats.md."""
+    table = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8").partition("### Warnings and doubts")[2]
+    rows = re.findall(r"^\| ((?:`[a-z-]+`(?:, )?)+) \| [A-Z/]+ \| (.+?) \| (.+?) \|$", table, re.M)
+    return {kind: (means, do) for kinds, means, do in rows for kind in re.findall(r"`([a-z-]+)`", kinds)}
+
+
+def listed(kinds: Iterable[str]) -> str:
+    """Return kinds as links to their paragraphs."""
+    return ", ".join(f"[{kind}](#{kind})" for kind in sorted(kinds))
+
+
 def page() -> str:
     """Return the text of docs/findings.md."""
-    parts, alone, every = [HEAD], only_named_by(), rules()
-    for kind in sorted({rule.kind for rule in every}):
-        own = [rule for rule in every if rule.kind == kind]
+    parts, alone, every, short = [HEAD], only_named_by(), rules(), short_form()
+    by_kind: dict[str, list[Rule]] = {}
+    for rule in every:
+        open_kind = re.compile(rule.kind.replace("x", "[a-z-]+")) if "x" in rule.kind.split("-") else None
+        for kind in (rule.kind,) if open_kind is None else filter(open_kind.fullmatch, short):
+            by_kind.setdefault(kind, []).append(rule)
+    for kind, own in sorted(by_kind.items()):
         severities = {rule.severity for rule in own}
-        parts.append(f"\n## {kind}\n\nA {severities.pop() if len(severities) == 1 else 'warning or doubt'}.\n")
+        means, do = short.get(kind, ("", ""))
+        head = f"A {severities.pop() if len(severities) == 1 else 'warning or doubt'}{f': {means}' if means else ''}."
+        parts.append(f"\n## {kind}\n\n{head}{f' **To do**: {do}.' if do else ''}\n")
         for rule in own:
             says = " ".join(rule.says.partition("\n\nParameters")[0].partition("\n\nReturns")[0].split())
             parts.append(f"\n{says} (`{rule.room}`)\n")
             if rule.text:
                 parts.append(f"\n> {rule.text}\n")
+        consequences = EXPLAINS.get(kind, frozenset()) & by_kind.keys()
+        causes = [cause for cause, explained in EXPLAINS.items() if kind in explained and cause in by_kind]
+        if consequences:
+            parts.append(f"\nIt explains {listed(consequences)}.\n")
+        if causes:
+            parts.append(f"\nIt is explained by {listed(causes)}.\n")
         if kind in alone:
             parts.append(f"\nPlanted faults that only this kind names: {'; '.join(alone[kind])}.\n")
     return "".join(parts)

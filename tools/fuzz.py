@@ -129,10 +129,10 @@ def main() -> int:
     args = parser.parse_args()
     chosen = {name: case for name, case in cases().items() if args.only in name}
     shares = sum(1.0 / case.cost for case in chosen.values())
-    limit_memory()
     print(f"seed {args.seed}\n{'case':<22}{'inputs':>8}{'bytes':>11}{'refused':>9}{'slowest':>9}{'faults':>8}", flush=True)
     total = Outcome("all")
     for name, case in chosen.items():
+        limit_memory()
         count = max(round(args.inputs / case.cost / shares), 1)
         numbers = range(count) if args.number is None else range(args.number, args.number + 1)
         # Verbs read what the readers have read already.

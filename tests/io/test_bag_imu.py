@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import bags
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.errors import ConfigError
@@ -85,7 +86,7 @@ def worst(log):
     """Return the largest error of the heading that the odometry has with the gyro, rad, and the remark."""
     turned, (remark,) = heading_from_gyro(log)
     off = se2.wrap_angle(turned.odometry.poses[:, 2] - turned.odometry.poses[0, 2] - HEADING)
-    return float(np.abs(off).max()), remark.text
+    return float(np.abs(off).max()), told([remark])[0].text
 
 
 @pytest.mark.parametrize("mount", [UPRIGHT, OVER, SIDEWAYS])

@@ -16,7 +16,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.lidar import joint_refinement, scan_matching
+from uwblite.lidar import joint_refinement, overlap, scan_matching
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
@@ -25,9 +25,9 @@ from uwblite.lidar.joint_refinement import (
     choose_pairs,
     measured_again,
     refine,
-    surface_cells,
     with_fewer_pairs,
 )
+from uwblite.lidar.overlap import surface_cells
 from uwblite.lidar.scan_matching import PairFactors, match, measured
 
 CONFIG = RefinementConfig()
@@ -180,10 +180,10 @@ def test_neighbours_are_of_one_recording():
 def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
-    whole, listed = joint_refinement.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
-    monkeypatch.setattr(joint_refinement, "_POINTS_AT_ONCE", 37)
+    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
+    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
     monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
-    parts = joint_refinement.surface_cells(clouds, truth)
+    parts = overlap.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
     assert parts.shape == whole.shape
     assert (parts != whole).nnz == 0

@@ -13,7 +13,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
-from uwblite.pipeline.mirror_images import _costs, _images, find_mirror_images, mirrored_whole
+from uwblite.pipeline.mirror_images import _costs, _images, _second_places, find_mirror_images, mirrored_whole
 
 ANCHOR = np.array([4.0, 3.0])
 
@@ -148,7 +148,7 @@ def test_an_anchor_that_is_fixed_keeps_what_was_said_of_it(fixed):
 
 
 def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best():
-    """Of each anchor's own ranges that count; where the bootstrap has a second place, that one."""
+    """Of each anchor's own ranges that count; the bootstrap's second place is one more."""
     rng = np.random.default_rng(3)
     tags = np.column_stack([rng.normal(size=40), 0.1 * rng.normal(size=40)]) @ np.array([[0.6, 0.8], [-0.8, 0.6]])
     anchor = np.repeat([0, 1, 2, 3], 10)
@@ -162,13 +162,34 @@ def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best
     )
     images, straight = _images(Estimate(graph, ranges, found, found.placed), ranges)
     assert straight.tolist() == [True, True, False, True]
-    np.testing.assert_array_equal(images[[1, 2]], [[7.0, 7.0], places[2]])
-    for k in (0, 3):
+    np.testing.assert_array_equal(images[2], places[2])
+    np.testing.assert_array_equal(_second_places(Estimate(graph, ranges, found, found.placed))[[0, 1]], [places[0], [7.0, 7.0]])
+    for k in (0, 1, 3):
         own = tags[(anchor == k) & alive]
         middle, (_, _, (along, across)) = own.mean(axis=0), np.linalg.svd(own - own.mean(axis=0))
         np.testing.assert_allclose((images[k] - middle) @ along, (places[k] - middle) @ along)
         np.testing.assert_allclose((images[k] - middle) @ across, -(places[k] - middle) @ across)
     np.testing.assert_array_equal(graph.anchors, places)
+
+
+def test_two_ranges_from_beside_a_straight_way_hide_no_mirror_image():
+    """They tilt the line that fits all places of the tag, but say little: the bootstrap's second place is tried as well."""
+    tags = np.concatenate([np.column_stack([np.linspace(0.0, 10.0, 18), np.zeros(18)]), [[21.4, 17.7], [21.8, 17.8]]])
+    place, image = np.array([-2.0, -36.0]), np.array([-2.0, 36.0])
+    noise = np.random.default_rng(2).normal(0.0, 0.1, 20)
+    measured = np.hypot(*(tags - image).T) + noise
+    # Seen from beside, both places are as far.
+    measured[18:] = np.hypot(*(tags[18:] - place).T)
+    ranges = plain_ranges(np.arange(20), np.zeros(20, dtype=np.intp), measured, 0.1)
+    ranges = replace(ranges, weights=np.where(np.arange(20) < 18, 1.0, 1e-5))
+    poses, known = np.column_stack([tags, np.zeros(20)]), np.ones(20, dtype=bool)
+    graph = Graph(poses, place[None], (ranges,), fixed_poses=known)
+    for second, ambiguous in (((), False), ((Hypothesis(image),), True)):
+        found = Bootstrap(np.ones(1, dtype=bool), np.zeros(1, dtype=bool), ((Hypothesis(place), *second),))
+        done = find_mirror_images(Estimate(graph, ranges, found, found.placed), TASK).bootstrap
+        assert done.ambiguous.tolist() == [ambiguous]
+        if ambiguous:
+            np.testing.assert_allclose(done.hypotheses[0][1].position, image, atol=1.0)
 
 
 def test_costs_are_those_of_the_ranges_and_of_the_priors_of_bias_and_height():

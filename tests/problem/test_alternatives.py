@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.solver import optimize
-from uwblite.problem.alternatives import Alternative, EvidencePolicy, apart, explanations
+from uwblite.problem.alternatives import Alternative, EvidencePolicy, apart, compared, explanations
 from uwblite.problem.evidence import log_density
 
 
@@ -107,6 +107,10 @@ def test_an_optimum_that_is_known_is_no_other_and_one_that_is_open_is_none():
     assert len(explanations(start, lambda at: [Alternative(path(7.0))], fails, log_density)) == 1
     with pytest.raises(SolverError):
         explanations(start, lambda at: [], solved, fails)
+    assert compared(start, Alternative(path(7.0)), fails, log_density) is None
+    assert compared(start, Alternative(path(7.0)), lambda graph: graph, fails) is None
+    assert compared(start, Alternative(moved), lambda graph: graph, log_density) is None
+    assert compared(start, Alternative(path(7.0)), lambda graph: graph, log_density).log_odds == pytest.approx(-48.0)
 
 
 def test_paths_are_apart_by_their_shapes():

@@ -170,11 +170,11 @@ def hardly_moving(way: float, seconds: float, turned: float) -> Finding:
 
 def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "") -> Finding:
     """Say in which share of the odometry the heading is the gyro's, and its bias; or why it is not used."""
-    if not used:
-        return warning("gyro", why)
     how = "by the robot's rests" if rests else "against the wheels"
-    text = f"the heading is the gyro's in {used:.0%} of the odometry; its bias is {bias:+.5f} rad/s {how}"
-    return warning("gyro", f"{text}; {why}" if why else text)
+    text = f"the heading is the gyro's in {used:.0%} of the odometry; its bias is {bias:+.5f} rad/s {how}" if used else why
+    if used and why:
+        text += f"; {why}"
+    return warning("gyro", text)
 
 
 def heading_against_path(inverted: str, settled: bool) -> Finding:

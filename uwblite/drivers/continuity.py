@@ -72,9 +72,9 @@ class Continuity(Generic[Item]):
         if witnesses == 0:
             passed = [*self.waiting, item]
         elif self.last is not None and self._follows(self.last, item):
-            # Those that wait were late, and not damaged, where this one goes on from them as well.
-            late = bool(self.waiting) and self._follows(self.waiting[-1], item)
-            passed, dropped = ([*self.waiting, item], []) if late else ([item], self.waiting)
+            passed, dropped = [item], self.waiting
+            if self.waiting and self._follows(self.waiting[-1], item):  # they were late, and not damaged
+                passed, dropped = [*self.waiting, item], []
         elif self.waiting and self._follows(self.waiting[-1], item):
             passed = [*self.waiting, item]
             if len(self.waiting) < witnesses:

@@ -68,7 +68,7 @@ def _of_ros1(stream: BinaryIO, size: int, add: Add) -> Iterator[Message]:
         fields = _fields(stream.read(length))
         kind, count = fields[b"op"][0], _uint32(stream.read(4))
         # A block that is being written states no length yet.
-        data = stream.read(count if count or kind != _CHUNK else size)
+        data = stream.read(min(count, size) if count or kind != _CHUNK else size)
         if kind == _CHUNK:
             yield from _of_ros1(io.BytesIO(_unpacked(fields[b"compression"], data)), size, add)
         elif len(data) < count:

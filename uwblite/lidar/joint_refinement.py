@@ -5,16 +5,15 @@ relative-pose edge and solves the whole graph again, wheels, radio and calibrati
 round to round. Both poses of a pair are free, so errors spread over the loop instead of piling up in one scan.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Wides
+from ..arrays import WIDE, Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
@@ -24,12 +23,11 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, SolverSummary
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
+from .overlap import surface_cells
 from .scan_matching import PairFactors, match, measured, pair_points
 
 _NEIGHBOURS = 4
 """Clouds no farther apart in the chain than this are neighbours."""
-_POINTS_AT_ONCE = 1 << 16
-"""Points brought into the map's frame at once."""
 _CLOUDS_AT_ONCE = 128
 """Clouds whose overlaps with all others are in memory at once; a bound on the memory."""
 
@@ -92,41 +90,6 @@ class RefinementResult:
     """Learnt standard deviation of a point-to-line distance, m."""
     rounds: int
     summary: SolverSummary
-
-
-_SURFACE_CELL = 0.5
-"""Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
-
-
-def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
-    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
-    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
-    cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
-    for first in range(0, len(usable), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
-        owner = clouds.owner[usable[part]]
-        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / _SURFACE_CELL)
-        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
-        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.intp) % 8
-    cell -= cell.min(axis=0, initial=0)
-    wide = int(cell[:, 1].max(initial=0)) + 1
-    row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
-    _, column = np.unique(key, return_inverse=True)
-    shape = (len(clouds), int(column.max(initial=-1)) + 1)
-    seen = sparse.csr_matrix((np.ones(len(column)), (row, column)), shape=shape)
-    seen.data[:] = 1.0
-    return seen
-
-
-def _seen_cells(
-    owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
-) -> Iterator[tuple[Wides, Wides]]:
-    """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
-    for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
-        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * 8 + facing[part]
-        many = int(key.max(initial=0)) + 1
-        yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)
 
 
 def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:

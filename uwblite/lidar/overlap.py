@@ -5,12 +5,14 @@ surfaces that face along the corridor. So only the direction with the least matc
 points and weights w, a direction u has the sum u^T (sum w n n^T) u, and eigenvalues give the least of all directions.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, Wides
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .free_space import FreeSpace, seen_beyond
@@ -103,3 +105,40 @@ def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, 
     """Return which points (e, n) were in view from the places at which clouds i (e,) were seen."""
     points = se2.transform(T_i_j[:, None, :], clouds.points[found.row])
     return np.array([seen_beyond(free[k], p, _MARGIN)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
+
+
+_POINTS_AT_ONCE = 1 << 16
+"""Points brought into the map's frame at once."""
+_SURFACE_CELL = 0.5
+"""Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
+
+
+def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
+    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
+    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
+    cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
+    for first in range(0, len(usable), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        owner = clouds.owner[usable[part]]
+        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / _SURFACE_CELL)
+        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
+        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.intp) % 8
+    cell -= cell.min(axis=0, initial=0)
+    wide = int(cell[:, 1].max(initial=0)) + 1
+    row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
+    _, column = np.unique(key, return_inverse=True)
+    shape = (len(clouds), int(column.max(initial=-1)) + 1)
+    seen = sparse.csr_matrix((np.ones(len(column)), (row, column)), shape=shape)
+    seen.data[:] = 1.0
+    return seen
+
+
+def _seen_cells(
+    owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
+) -> Iterator[tuple[Wides, Wides]]:
+    """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
+    for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * 8 + facing[part]
+        many = int(key.max(initial=0)) + 1
+        yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)

@@ -1,9 +1,9 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
 Neighbouring clouds are aligned from the odometry's guess, all at once; that shows the calibration and the noise of the wheels.
-Each step is also registered with the possibility that the wheels slipped, and where a pair shares few points the likelier mode
-counts. A slip lasts: the evidence of all steps together decides (see slips). Where the wheels slipped, their edges get the
-uncertainty of that, and the step is the one that the clouds show.
+A pair that then shares few points is searched for in the local sub-map of the keyframes before. Each step is also registered
+with the possibility that the wheels slipped. A slip lasts: the evidence of all steps together decides (see slips). Where the
+wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from .clouds import Clouds
 from .pair_alignment import align_pairs
 from .registration import Placed, Prior, Registration, RegistrationConfig, matched_by_chance
 from .scan_matching import match, measured, pair_points
+from .step_search import StepSearch
 from .visibility import nearest_by_bearing
 
 
@@ -33,6 +34,10 @@ class TrackingConfig:
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     good_share: ClassVar[float] = 0.75
     """Neighbours that share at least this part of their points are certain of their step, wherever the odometry put it."""
+    distance: float = 0.4
+    """Half-width of the search beyond twice the motion by the odometry, m: wheels may count backwards as forwards."""
+    angle: float = 0.45
+    """Half-width of the search in heading beyond half the turn by the odometry, rad."""
     gate: ClassVar[float] = 0.15
     """Farthest match at the end, m."""
     points: ClassVar[int] = 150
@@ -60,7 +65,7 @@ class ScanOdometry:
     miss: float
     """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
-    """Number of steps over which a slip was searched for."""
+    """Number of steps that were searched for."""
     slips: Floats
     """(e,) probability that the wheels slipped over each."""
     moving: Bools
@@ -131,23 +136,37 @@ def follow(
     found = registration.register(i, i + 1, points, prior, steps.pose)
     slips = posterior(found.log_odds, wheels.duration)
     placed = found.chosen(slips)
-    # Neighbours that share few points are placed by the likelier mode of the two; where that shows nothing, by the odometry.
-    mode = found.chosen(1.0 / (1.0 + np.exp(-found.log_odds)))
-    further = steps.enough & ~good & _shown(mode)
-    edges = certain.followed_by(_edges(clouds, raster, i[further], mode.pose[further], tight, config)[0])
-    edges = edges.rows(np.argsort(edges.i))
+    edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)
     # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.
     rejected = _contradicted(edges, noise, graph) & (found.log_odds < 0.0)
     edges = edges.rows(np.flatnonzero(~rejected[np.searchsorted(i, edges.i)]))
     learnt = with_uncounted_ways(noise, edges, graph)
-    seen, others = np.flatnonzero((slips > 0.5) & _shown(placed)), ~np.isin(edges.i, i[slips > 0.5])
+    lasting = (slips > 0.5) & (placed.factors.matched >= _FEWEST)
+    lasting &= placed.evidence > np.log(RegistrationConfig.useless)
+    seen, others = np.flatnonzero(lasting), ~np.isin(edges.i, i[slips > 0.5])
     slid = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
     both = edges.rows(np.flatnonzero(others)).followed_by(slid)
     miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
     return ScanOdometry(
         edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
-        float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving, rejected,
+        float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving, rejected,
     )
+
+
+def _measured_near(
+    clouds: Clouds, raster: CloudRasters, steps: Steps, certain: RelativePoseEdges, gate: float, config: TrackingConfig
+) -> tuple[RelativePoseEdges, int]:
+    """Return the steps as wheels that do not slip allow, and how many were searched.
+
+    Neighbours that share few points are searched for in the local sub-map of the keyframes before; where that finds nothing, or
+    two equally good places, the step is left to the odometry.
+    """
+    good = steps.enough & (steps.share >= config.good_share)
+    pose, lost, searched = _searched(clouds, steps.i, steps, steps.enough & ~good, config)
+    further = steps.enough & ~lost & ~good
+    measured_steps = certain.followed_by(_edges(clouds, raster, steps.i[further], pose[further], gate, config)[0])
+    measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
+    return measured_steps, searched
 
 
 def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph) -> Bools:
@@ -169,11 +188,6 @@ def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph)
 
 _MEDIAN, _CONTRADICTS = 2.366, 16.266
 """Median of chi2 with three degrees of freedom, and what one step in a thousand exceeds by chance."""
-def _shown(placed: Placed) -> Bools:
-    """Return which placements (e,) are likelier than that the clouds show nothing of each other's place."""
-    return (placed.factors.matched >= _FEWEST) & (placed.evidence > np.log(RegistrationConfig.useless))
-
-
 _FEWEST = 6
 """Matches from which on a step is measured: twice its unknowns."""
 
@@ -241,6 +255,46 @@ _LONGEST_RUN = 3
 def _lines_of(clouds: Clouds) -> Ints:
     """Return the number (k,) of points with a normal of each cloud."""
     return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
+
+
+def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools, int]:
+    """Search for doubtful steps (e,), each against the sub-map of those before it.
+
+    With noise of decimetres, foliage or few beams, every step has few matches. Where these are enough to measure the step, and
+    no surface stands in free space, no search is needed.
+
+    Returns
+    -------
+    Poses of all steps (e, 3), which were not found (e,), and how many were searched for.
+    """
+    pose, lost, searched = steps.pose.copy(), np.zeros(len(i), dtype=bool), 0
+    searching = StepSearch(clouds, config.distance, config.angle)
+    chain = np.zeros((len(clouds), 3))
+    chain[i] = pose
+    # Sub-maps begin after the last step that was not measured.
+    blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
+    first = 0
+    for row in np.flatnonzero(doubtful).tolist():
+        k, before = int(i[row]), blind[blind < i[row]]
+        first = max(first, int(before[-1]) + 1 if len(before) else 0)
+        guess, ended = steps.guess[row], steps.pose[row]
+        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _MOST_THROUGH:
+            continue
+        searched += 1
+        found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
+        # Where no search is clear, descent near the odometry's guess still measures the directions that the surfaces determine.
+        lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
+        if found.clear:
+            chain[k] = pose[row] = found.pose
+        elif lost[row]:
+            first = k + 1
+    return pose, lost, searched
+
+
+_LEAST_SHARE = 0.4
+"""Share of matching points from which on descent from the odometry's guess measures a step."""
+_MOST_THROUGH = 0.04
+"""Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:

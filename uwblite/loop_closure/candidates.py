@@ -13,7 +13,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.joint_covariance import JointCovariance
-from ..lidar.joint_refinement import surface_cells
+from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps
 from .closures import Closures, LoopClosureConfig
 

@@ -9,11 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..errors import SolverError
 from ..graph.calibration import HEIGHT, RADIO, CalibrationConfig, with_free
 from ..graph.graph import Graph
 from ..graph.optimizer import Optimizer
-from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, explanations
+from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, compared
 from ..problem.evidence import laplace_marginal_likelihood, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve
 from .estimate import Estimate, OtherHeights, Task
@@ -65,12 +64,7 @@ def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimize
         return laplace_marginal_likelihood(with_free(graph, HEIGHT))
 
     present = estimate.problem
-    high = Alternative(with_high_anchors(present, config.calibration))
-    try:
-        found = explanations(present, lambda graph: [high] if graph is present else [], solved, evidence)
-    except SolverError:
-        return None
-    return next((each for each in found if each.graph is not present), None)
+    return compared(present, Alternative(with_high_anchors(present, config.calibration)), solved, evidence)
 
 
 def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:

@@ -193,7 +193,7 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
     return _refined_neighbours(
         estimate, graph, gate, task, searched=track.searched, rejected=int(track.rejected.sum()),
-        slipped=int(np.sum(track.slips > _LIKELY)), moving=round(float(track.moving.mean()), 4),
+        slipped=int(np.sum(track.slips > _LIKELY)), moving=round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
     )  # fmt: skip
 
 

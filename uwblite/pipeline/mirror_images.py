@@ -16,7 +16,7 @@ from ..graph.calibration import BIAS, HEIGHT
 from ..graph.graph import Graph, PriorEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.solver import SolverConfig, optimize
-from ..problem.alternatives import Alternative, EvidencePolicy, explanations
+from ..problem.alternatives import Alternative, EvidencePolicy, compared
 from ..problem.evidence import log_density
 from .estimate import Estimate, Task
 
@@ -45,14 +45,19 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     free &= ~estimate.graph.fixed_anchors
     if not free.any():
         return estimate
-    config, (images, straight) = task.config.solver, _images(estimate, ranges)
+    config, (mirrored, straight), second = task.config.solver, _images(estimate, ranges), _second_places(estimate)
     here = _minimum(estimate.graph, ranges, free, estimate.graph.anchors, config)
     pace = MirrorPolicy.pace * EvidencePolicy.very_strong / (EvidencePolicy.very_strong - log_density(here))
     slow = replace(config, relative_decrease=max(config.relative_decrease, pace))
-    there = _minimum(estimate.graph, ranges, free, images, slow)
-    log_odds, others = 0.5 * (_costs(here, ranges) - _costs(there, ranges)), there.anchors
-    as_well = (np.hypot(*(others - here.anchors).T) > MirrorPolicy.apart) & (log_odds > -EvidencePolicy.very_strong)
-    best = estimate.graph
+    log_odds, others = np.full(len(free), -np.inf), here.anchors.copy()
+    for start in (mirrored, second):
+        there = _minimum(estimate.graph, ranges, free, start, slow)
+        odds = 0.5 * (_costs(here, ranges) - _costs(there, ranges))
+        likelier = (np.hypot(*(there.anchors - here.anchors).T) > MirrorPolicy.apart) & (odds > log_odds)
+        log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], there.anchors, others)
+    as_well, best = log_odds > -EvidencePolicy.very_strong, estimate.graph
+    twice = found.ambiguous & np.any(second != best.anchors, axis=1)
+    images = np.where(twice[:, None], second, mirrored)
     bent = np.flatnonzero(free & ~as_well & straight & (np.hypot(*(images - best.anchors).T) > MirrorPolicy.apart))
     if len(bent) and task.recordings.have_scans:
         # Anchors were estimated last and alone, and all together may be better.
@@ -89,14 +94,11 @@ def mirrored_whole(graph: Graph, ranges: RangeEdges, free: Bools, config: Solver
     anchors = graph.anchors.copy()
     anchors[free] -= 2.0 * ((anchors[free] - tags.mean(axis=0)) @ across)[:, None] * across
 
-    def mirrored(at: Graph) -> list[Alternative]:
-        return [Alternative(replace(graph, anchors=anchors))] if at is graph else []
-
-    for each in explanations(graph, mirrored, lambda start: optimize(start, config)[0], log_density):
-        apart = np.hypot(*(each.graph.anchors - graph.anchors)[free].T)
-        if each.open and apart.min(initial=np.inf) > MirrorPolicy.apart:
-            return each.graph
-    return None
+    image = compared(graph, Alternative(replace(graph, anchors=anchors)), lambda start: optimize(start, config)[0], log_density)
+    if image is None or not image.open:
+        return None
+    apart = np.hypot(*(image.graph.anchors - graph.anchors)[free].T)
+    return image.graph if apart.min(initial=np.inf) > MirrorPolicy.apart else None
 
 
 def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, task: Task) -> Floats | None:
@@ -108,37 +110,44 @@ def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, 
     """
     anchors = best.anchors.copy()
     anchors[k] = image
+    alternative, config = Alternative(replace(best, anchors=anchors)), task.config.solver
+    other = compared(best, alternative, lambda start: optimize(start, config)[0], log_density)
+    if other is None or not other.open:
+        return None
     own = ranges.pose[ranges.alive & (ranges.anchor == k)]
-
-    def mirrored(graph: Graph) -> list[Alternative]:
-        return [Alternative(replace(best, anchors=anchors))] if graph is best else []
-
-    for each in explanations(best, mirrored, lambda graph: optimize(graph, task.config.solver)[0], log_density):
-        bend = np.hypot(*(each.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
-        held = task.recordings.have_scans and bend < MirrorPolicy.bends
-        apart = np.hypot(*(each.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
-        if each.open and apart and not held:
-            return np.asarray(each.graph.anchors[k])
-    return None
+    bend = np.hypot(*(other.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
+    held = task.recordings.have_scans and bend < MirrorPolicy.bends
+    apart = np.hypot(*(other.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
+    return None if held or not apart else np.asarray(other.graph.anchors[k])
 
 
 def _images(estimate: Estimate, ranges: RangeEdges) -> tuple[Floats, Bools]:
-    """Return the other place (a, 2) of each anchor to be tried, m, mirrored at the line that fits the tag's places best; and
-    which anchors (a,) were measured from nearly a straight line alone."""
-    assert estimate.bootstrap is not None
+    """Return the anchors (a, 2), m, each mirrored at the line that fits the tag's places best; and which anchors (a,) were
+    measured from nearly a straight line alone."""
     anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
     straight = np.zeros(len(anchors), dtype=bool)
     for k in np.flatnonzero(estimate.placed).tolist():
         own = tags[ranges.alive & (ranges.anchor == k)]
         variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 2 else (np.full(2, np.inf), np.zeros((2, 2)))
         straight[k] = variances[0] <= MirrorPolicy.straight**2
-        found = estimate.bootstrap.hypotheses[k]
-        if estimate.bootstrap.ambiguous[k] and len(found) > 1:
-            # Later measurements may have moved the anchor from the first of the two places to the second.
-            anchors[k] = max((each.position for each in found[:2]), key=lambda place: float(np.hypot(*(place - anchors[k]))))
-        elif len(own) > 2:
+        if len(own) > 2:
             anchors[k] -= 2.0 * axes[:, 0] * float(axes[:, 0] @ (anchors[k] - own.mean(axis=0)))
     return anchors, straight
+
+
+def _second_places(estimate: Estimate) -> Floats:
+    """Return the anchors (a, 2), m, each at the other of the two places that the bootstrap found likeliest; where it found one,
+    at its own.
+
+    A few ranges from beside a straight way tilt the line that fits the tag's places, but not these.
+    """
+    assert estimate.bootstrap is not None
+    anchors = estimate.graph.anchors.copy()
+    for place, found in zip(anchors, estimate.bootstrap.hypotheses, strict=True):
+        if len(found) > 1:
+            # Later measurements may have moved the anchor from the first of the two places to the second.
+            place[:] = max((each.position for each in found[:2]), key=lambda other: float(np.hypot(*(other - place))))
+    return anchors
 
 
 def _minimum(graph: Graph, ranges: RangeEdges, free: Bools, anchors: Floats, config: SolverConfig) -> Graph:

@@ -8,8 +8,9 @@ unknowns themselves, with their offsets, and rays on them measure poses beside t
 are used again for the covariances.
 
 The weight of a ray is learnt from the residuals (lidar/ray_noise.py). Where rays are nearly independent, pairs add nothing
-on walls and columns, and their points there get hardly any weight; where walls bend and columns are no circles, as in most
-real offices, all rays of one place get the weight of a few, and pairs keep their weight.
+on walls, and their points there get hardly any weight; where walls bend, as in most real offices, all rays of one place get
+the weight of a few, and pairs keep their weight. On columns they get hardly any: lines through points of a column lie inside
+it, to the side from which it is seen, so that pairs err along the path by what the robot passes of them.
 """
 
 from dataclasses import dataclass, replace
@@ -175,8 +176,8 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
 def _measured_again(
     joint: ScanEdges, graph: Graph, scans: ScanClouds, kind: NDArray[np.int8], noise: RayNoise, task: Task
 ) -> ScanEdges:
-    """Return the pairs, with points on surfaces weighted by the information that the rays leave."""
-    weight = np.append(np.maximum(1.0 - 1.0 / noise.alike, _LEAST), 1.0)[kind]
+    """Return the pairs, with points on walls weighted by the information that the rays leave, and hardly any on columns."""
+    weight = np.array([max(1.0 - 1.0 / noise.alike[0], _LEAST), _LEAST, 1.0])[kind]
     return measured_again(joint, graph, scans.clouds, scans.raster, task.config.refinement, weight)
 
 

@@ -96,6 +96,18 @@ def explanations(
     return found
 
 
+def compared(
+    present: Graph, alternative: Alternative, solve: Callable[[Graph], Graph],
+    evidence: Callable[[Graph], float] = laplace_marginal_likelihood,
+) -> Explanation | None:  # fmt: skip
+    """Return the explanation by one alternative; None where it is the present one, or they are not determined."""
+    try:
+        found = explanations(present, lambda graph: [alternative] if graph is present else [], solve, evidence)
+    except SolverError:
+        return None
+    return next((each for each in found if each.graph is not present), None)
+
+
 def _same(one: Graph, other: Graph) -> bool:
     """Return whether two graphs are one optimum of one problem."""
     if one.edges != other.edges or apart(one, other) > EvidencePolicy.same_path:
