@@ -1,1 +1,1 @@
-"""The measurements with their weights: their solution, parts of it, and its evidence."""
+"""The measurements with their weights: their solution, parts of it, its evidence, and alternatives to it."""
