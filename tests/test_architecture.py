@@ -215,9 +215,18 @@ def options_in_messages(module):
                 yield f"{module}:{node.lineno} {text!r}"
 
 
+def findings_made_elsewhere(module):
+    """Screening and stages hand over facts; what they mean for people is said in one room, and of live poses beside it."""
+    if room_of(module) in ("assessment", "localization", "findings"):
+        return
+    for node in nodes_of(module):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("doubt", "warning", "Finding"):
+            yield f"{module}:{node.lineno} makes a finding; note a fact, and let a rule of assessment/ say it"
+
+
 RULES = (
     algorithms_in_files_and_devices, imports_from_above, imports_by_the_name_of_the_package, noise_and_impurity,
-    numbers_of_a_fixed_width, mutable_state, options_in_messages,
+    numbers_of_a_fixed_width, mutable_state, options_in_messages, findings_made_elsewhere,
 )  # fmt: skip
 
 

@@ -260,7 +260,7 @@ def document(found: dict[Key, Outcome]) -> str:
             without, len(own), f"{np.exp(np.mean(np.log(ratios))):.2f}", f"{ratios[worst].mean():.2f}",
             ", ".join(f"{own[k][0][0]} {own[k][1].error:.3f} -> {own[k][2].error:.3f}" for k in worst[:2]),
             f"{np.nanmax(anchors):.2f}" if np.isfinite(anchors).any() else "-",
-            "-" if not nees else " -> ".join(f"{np.mean(side):.2f}" for side in zip(*nees, strict=True)), falsely,
+            "-" if not nees else " -> ".join(f"{np.median(side):.2f}" for side in zip(*nees, strict=True)), falsely,
         ])
     defaults = [
         [name, seed, o.error, o.anchors, o.nees, ", ".join(o.doubts)]
@@ -269,8 +269,8 @@ def document(found: dict[Key, Outcome]) -> str:
     head = ["left out", "maps", "mean ratio", "worst tenth", "there", "anchors, worst ratio", "NEES / dof", "newly doubted"]
     return (
         "## What each ingredient buys\n\nRatio of the error without it to that with it: geometric mean, and mean of the worst "
-        "tenth of the recordings (m there); worst ratio of\nthe anchors' errors; mean normalised errors of poses per degree "
-        "of freedom (simulated recordings alone), before and after; maps that are\ndoubted only without it. Simulated "
+        "tenth of the recordings (m there); worst ratio of\nthe anchors' errors; median of the normalised errors of poses per "
+        "degree of freedom (simulated recordings alone), before and after; maps that are\ndoubted only without it. Simulated "
         "recordings of 4 min in rooms with errors of real ones, and recordings of others.\n\n"
         + table(head, rows) + "\n" + table(["defaults", "seed", "error, m", "anchors, m", "NEES / dof", "doubts"], defaults)
     )

@@ -286,19 +286,17 @@ def test_names_left_out_count_as_distrusted_anchors(used, left_out, lidar, doubt
     assert all(f"{left_out} of {used + left_out} anchors" in n.text and "too few" in n.text for n in stages.doubts)
 
 
-@pytest.mark.parametrize(("accepted", "contradicted", "other", "placed", "grid", "kind"), [
-    (0, 0, 3, True, True, "warning no-closure"), (0, 0, 3, False, True, "doubt no-closure"), (0, 0, 3, False, False, None),
-    (1, 0, 3, False, True, None), (0, 0, 0, False, True, None), (5, 5, 0, True, True, None),
-    (5, 6, 0, True, True, "doubt contradicting-closures"), (1, 4, 0, True, True, None),
-    (1, 5, 0, True, True, "doubt contradicting-closures"),
+@pytest.mark.parametrize(("accepted", "contradicted", "other", "grid", "kind"), [
+    (0, 0, 3, True, "warning no-closure"), (0, 0, 3, False, None), (1, 0, 3, True, None), (0, 0, 0, True, None),
+    (5, 5, 0, True, None), (5, 6, 0, True, "doubt contradicting-closures"), (1, 4, 0, True, None),
+    (1, 5, 0, True, "doubt contradicting-closures"),
 ])  # fmt: skip
-def test_a_map_without_closures_or_with_more_that_contradict_is_named(accepted, contradicted, other, placed, grid, kind):
+def test_a_map_without_closures_or_with_more_that_contradict_is_named(accepted, contradicted, other, grid, kind):
     outcomes = ["accepted"] * accepted + ["contradicts-closures"] * contradicted + ["too-few-matches"] * other
     found = tuple(SimpleNamespace(outcome=o, accepted=o == "accepted") for o in outcomes)
-    anchors = [SimpleNamespace(status="unplaced"), *([SimpleNamespace(status="ok")] if placed else [])]
     stages = Stages(None, None)
     estimate = SimpleNamespace(closures=SimpleNamespace(candidates=found))
-    stages.findings.extend(check_closures(estimate, anchors, object() if grid else None, SimpleNamespace(stages=stages)))
+    stages.findings.extend(check_closures(estimate, object() if grid else None))
     said = [f"doubt {n.kind}" for n in stages.doubts] + [f"warning {n.kind}" for n in stages.warnings]
     assert said == ([] if kind is None else [kind])
 

@@ -50,3 +50,16 @@ def test_only_rays_that_face_a_column_count():
     assert np.all(found.surface == 7)
     far = on_columns(replace(near, points=near.points + 0.3 * near.directions), POSES, columns, 7)
     assert len(far.keyframe) == 0
+
+
+def test_coarse_rays_on_a_column_lie_on_it():
+    """Beams of a degree at 5 m: the mean of four neighbours would lie 14 mm behind a column of 0.35 m."""
+    bearing = np.deg2rad(np.arange(-3.0, 4.0))
+    way = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    along = 5.0 * way[:, 0]
+    reach = along - np.sqrt(0.35**2 - 25.0 + along**2)
+    zero = np.zeros(7, dtype=np.intp)
+    rays = as_rays(ScanPoints(zero, reach[:, None] * way, np.zeros((7, 2)), np.arange(7), zero))
+    found = on_columns(rays, np.zeros((1, 3)), np.array([[5.0, 0.0, 0.35]]), 0)
+    assert len(found.keyframe) >= 5
+    np.testing.assert_allclose(np.hypot(*(found.points - [5.0, 0.0]).T), 0.35, atol=1e-9)

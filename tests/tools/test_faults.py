@@ -25,6 +25,7 @@ DOUBTED = replace(RIGHT, exit_code=3, stated=("the map may be mirrored",), kinds
         (replace(RIGHT, ate=0.499), "right 0.50"),
         (replace(RIGHT, beyond=0.01, anchor=1.9), "**SILENT** 0.01, anchor 1.9"),
         (replace(DOUBTED, name="none"), "**FALSE ALARM** 0.01"),
+        (replace(DOUBTED, name="none", ate=0.81), "caught 0.81"),
         (replace(RIGHT, ate=NAN, exit_code=1, stated=("the ranges look like millimetres",)), "refused"),
         (replace(RIGHT, ate=NAN, exit_code=4, stated=("KeyError: 'a' (x.py:3)",)), "**CRASH**"),
         (replace(RIGHT, ate=NAN, exit_code=4, stated=("stopped after 60 s",)), "**TOO LONG**"),

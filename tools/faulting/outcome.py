@@ -68,7 +68,7 @@ class Outcome:
             return "SILENT" if wrong else "right"
         if self.exit_code == 1:
             return "refused"
-        return "FALSE ALARM" if self.name == "none" else "caught" if wrong else "doubted"
+        return "caught" if wrong else "FALSE ALARM" if self.name == "none" else "doubted"
 
 
 def cell(outcome: Outcome) -> str:

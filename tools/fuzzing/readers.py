@@ -166,7 +166,7 @@ def _verb(name: str, data: bytes, *words: str, cost: int = 20, prepare: Callable
             if wrong:
                 raise Fault(what)
         if code == 1:
-            raise UwbliteError(last)
+            raise UwbliteError(last or "what became of each recording stands in the table")
 
     return Case(name, run, made, cost)
 

@@ -56,6 +56,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
     "loose-links": frozenset({
         "free-space-violation", "no-closure", "untied-parts", "anchors-moved-together", "path-displaced",
     }),
+    "free-space-violation": _PLACES | {"range-scatter", "path-displaced"},
     "path-displaced": _PLACES,
     "range-scatter": _BY_RANGES - {"range-scatter", "path-displaced"},
     "drift": _PLACES | {"odometry-slips", "odometry-unit", "unusual-calibration"},
@@ -72,7 +73,7 @@ _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType({
     "radio": _TIMES | _BY_RANGES | {
         "carried", "spikes", "few-in-reach", "few-ranges", "no-ranges", "untied-parts", "odometry-alone",
     },
-    "lidar": _TIMES | _BY_SCANS | {"wheels-against-lidar", "carried", "no-lidar", "range-scatter", "anchors-moved-together"},
+    "lidar": _TIMES | _BY_SCANS | _PLACES | {"wheels-against-lidar", "carried", "no-lidar", "range-scatter", "path-displaced"},
 })  # fmt: skip
 """What a fault of one sensor alone can explain; one of the odometry may explain all."""
 _RANK = {kind: number for number, kind in enumerate(EXPLAINS)}

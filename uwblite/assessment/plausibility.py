@@ -63,7 +63,7 @@ def judge(
         lambda: check_anchors(anchors, task),
         lambda: check_moved_together(anchors, table, task),
         lambda: check_sensors(grid, task),
-        lambda: check_closures(estimate, anchors, grid, task),
+        lambda: check_closures(estimate, grid),
         lambda: check_calibration(calibrated, usual, task),
         lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
         lambda: check_residuals(estimate, residuals, grid, task),
@@ -202,17 +202,16 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
         yield warning("empty-scans", "no scan has a reading: the map is empty")
 
 
-def check_closures(
-    estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task
-) -> Iterator[Finding]:
-    """Warn of a map without loop closures; doubt one that more closures contradict than support."""
+def check_closures(estimate: Estimate, grid: OccupancyGrid | None) -> Iterator[Finding]:
+    """Warn of a map without loop closures; doubt one that more closures contradict than support.
+
+    How far it has drifted without closures, its uncertainty says (see check_certainty).
+    """
     candidates = estimate.closures.candidates
     accepted = sum(c.accepted for c in candidates)
-    placed = any(a.status != "unplaced" for a in anchors)
     if grid is not None and candidates and accepted == 0:
-        add = warning if placed else doubt
         text = "no loop closure was accepted: drift is not corrected; drive through places twice"
-        yield add("no-closure", text, candidates=len(candidates))
+        yield warning("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
         text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them"

@@ -23,7 +23,7 @@ from . import plausibility
 from .range_agreement import many_short
 from .residual_tests import NO_DISTANCES
 
-_ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
+_ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor")
 """Doubts that do not concern all anchors."""
 _SHORT = 0.5
 """m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
