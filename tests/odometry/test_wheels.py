@@ -93,18 +93,22 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
 
 def test_errors_that_telescope_are_not_the_wheels():
     """Clouds that are turned each by itself, four times the wheels' noise of a step, are in two steps with opposite signs."""
-    rng = np.random.default_rng(4)
-    stamps, truth = wander(rng, 300.0)
-    frames = select(Odometry(stamps, truth), KeyframeConfig())
-    exact = wheel_edges(frames, NOISE, Calibration())
-    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
-    turned = np.concatenate([np.zeros((1, 3)), rng.standard_normal((len(exact), 3)) * [0.0, 0.0, 4.0 * np.median(sigma[:, 2])]])
-    wheels = replace(exact, motion=se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma))
-    steps = RelativePoseEdges(exact.i, exact.j, exact.motion + np.diff(turned, axis=0), 10.0 * exact.end_sqrt_information)
-    learnt = reestimate_wheel_noise(wheels, steps, Graph(frames.odometry))
-    factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
+    factors = []
+    for seed in range(1, 5):
+        rng = np.random.default_rng(seed)
+        stamps, truth = wander(rng, 300.0)
+        frames = select(Odometry(stamps, truth), KeyframeConfig())
+        exact = wheel_edges(frames, NOISE, Calibration())
+        sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+        noise = rng.standard_normal((len(exact), 3)) * [0.0, 0.0, 4.0 * np.median(sigma[:, 2])]
+        turned = np.concatenate([np.zeros((1, 3)), noise])
+        wheels = replace(exact, motion=se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma))
+        steps = RelativePoseEdges(exact.i, exact.j, exact.motion + np.diff(turned, axis=0), 10.0 * exact.end_sqrt_information)
+        learnt = reestimate_wheel_noise(wheels, steps, Graph(frames.odometry))
+        factors.append([np.einsum("eii->ei", e.sqrt_information)[0] for e in (exact, learnt)])
     # Of the sum over eight steps, two of 4 sigma are left of the clouds: a variance of 8 + 32 for 8.
-    assert factor == pytest.approx([1.0, 1.0, np.sqrt(5.0)], rel=0.25)
+    ratio = np.divide(*np.mean(factors, axis=0))
+    assert ratio == pytest.approx([1.0, 1.0, np.sqrt(5.0)], rel=0.2)
 
 
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():

@@ -12,7 +12,7 @@ svg{max-height:62vh;touch-action:none}.closure{stroke:var(--accepted);stroke-wid
 .hit{stroke:transparent;stroke-width:12;cursor:pointer}line.chosen{stroke-width:5}
 circle.chosen{stroke:var(--ink);stroke-width:2}.closure,.hit,circle{vector-effect:non-scaling-stroke}
 .hideno .no{display:none}.anchor{cursor:pointer}.anchor.pinned{fill:var(--start)}
-.start,.end{pointer-events:none}.start{fill:var(--start)}.end{fill:#fff;stroke:var(--path);stroke-width:2}
+.start,.end{pointer-events:none}.start{fill:var(--start)}.end{fill:var(--card);stroke:var(--path);stroke-width:2}
 .end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}
 button,input{font:inherit;border:1px solid var(--line);border-radius:.4rem;background:var(--card);color:inherit}
 button{padding:.35rem .8rem;cursor:pointer;min-height:2.4rem}input{width:6rem;padding:.25rem}
