@@ -8,6 +8,7 @@ the table of faults in docs/lab/accuracy.md shows which planted faults only this
 import ast
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,9 +141,10 @@ def page() -> str:
     """Return the text of docs/findings.md."""
     parts, alone, every, short = [HEAD], only_named_by(), rules(), short_form()
     by_kind: dict[str, list[Rule]] = {}
+    named, made = {rule.kind for rule in every}, Counter((rule.room, rule.says) for rule in every)
     for rule in every:
         open_kind = re.compile(rule.kind.replace("x", "[a-z-]+")) if "x" in rule.kind.split("-") else None
-        for kind in (rule.kind,) if open_kind is None else filter(open_kind.fullmatch, short):
+        for kind in (rule.kind,) if open_kind is None else filter(open_kind.fullmatch, short.keys() - named):
             by_kind.setdefault(kind, []).append(rule)
     for kind, own in sorted(by_kind.items()):
         severities = {rule.severity for rule in own}
@@ -151,7 +153,8 @@ def page() -> str:
         parts.append(f"\n## {kind}\n\n{head}{f' **To do**: {do}.' if do else ''}\n")
         for rule in own:
             says = " ".join(rule.says.partition("\n\nParameters")[0].partition("\n\nReturns")[0].split())
-            parts.append(f"\n{says} (`{rule.room}`)\n")
+            # What makes several kinds describes none of them.
+            parts.append(f"\n{says} (`{rule.room}`)\n" if made[rule.room, rule.says] == 1 else f"\nIn `{rule.room}`:\n")
             if rule.text:
                 parts.append(f"\n> {rule.text}\n")
         consequences = EXPLAINS.get(kind, frozenset()) & by_kind.keys()
