@@ -44,7 +44,7 @@ def test_check_expects_what_its_own_trial_map_took(log, monkeypatch, slow):
 
     def build_map(part, config):
         clock[0] += slow
-        return SimpleNamespace(anchors=(), calibration=(), doubts=())
+        return SimpleNamespace(anchors=(), calibration=(), doubts=(), findings=())
 
     monkeypatch.setattr("uwblite.mapping.build_map", build_map)
     monkeypatch.setattr(check.time, "perf_counter", lambda: clock[0])

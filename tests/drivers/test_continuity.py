@@ -126,11 +126,12 @@ def test_a_series_that_begins_again_is_followed():
     assert taken == [([], []), ([1, 2], []), ([], []), ([3], [50]), ([], []), ([80, 81], []), ([82], [])]
 
 
-def test_a_reading_that_was_late_passes_with_the_next_that_goes_on_from_both():
-    series = Continuity(lambda before, after: abs(after - before) < 2)
-    series.take(0, 0)
-    assert series.take(2.5, 1) == ([], [])
-    assert series.take(1.0, 1) == ([2.5, 1.0], [])
+def test_a_reading_with_a_sum_that_was_late_passes_with_the_next_that_goes_on_from_both():
+    for summed, taken in ((True, ([2.5, 1.0], [])), (False, ([1.0], [2.5]))):
+        series = Continuity(lambda before, after: abs(after - before) < 2, summed=summed)
+        series.take(0, 0)
+        assert series.take(2.5, 1) == ([], [])
+        assert series.take(1.0, 1) == taken
 
 
 @pytest.mark.parametrize("pause", [0.2, 0.3, 0.4, 0.6])

@@ -38,6 +38,6 @@ def test_kinds_of_all_rooms_are_on_the_page_with_what_to_do():
     assert kinds | {"anchor-unplaced", "scans-outside-odometry"} <= paragraphs.keys()
     assert not kinds - short.keys()
     for kind, text in paragraphs.items():
-        assert all(part in text for part in ("A ", "**To do**", ".py`)", "\n> ")), kind
+        assert all(part in text for part in ("A ", "**To do**", ".py`", "\n> ")), kind
     assert "Planted faults that only this kind names" in page
     assert "It is explained by [clock-set-back](#clock-set-back)" in page

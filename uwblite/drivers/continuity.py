@@ -47,15 +47,16 @@ def device_time(counted: float, elapsed: float, turn: float) -> float | None:
 
 
 class Continuity(Generic[Item]):
-    """A series of readings without a sum.
+    """A series of readings without a sum, or with a weak one.
 
     Parameters
     ----------
     follows : (earlier, later) -> whether one can go on from the other.
+    summed : with a sum, one that leaps and from which the next goes on, as from the one before, came late; else it is damage.
     """
 
-    def __init__(self, follows: Callable[[Item, Item], bool]) -> None:
-        self._follows = follows
+    def __init__(self, follows: Callable[[Item, Item], bool], *, summed: bool = False) -> None:
+        self._follows, self._summed = follows, summed
         self.last: Item | None = None
         """The latest that passed."""
         self.waiting: list[Item] = []
@@ -73,7 +74,7 @@ class Continuity(Generic[Item]):
             passed = [*self.waiting, item]
         elif self.last is not None and self._follows(self.last, item):
             passed, dropped = [item], self.waiting
-            if self.waiting and self._follows(self.waiting[-1], item):  # they were late, and not damaged
+            if self._summed and self.waiting and self._follows(self.waiting[-1], item):
                 passed, dropped = [*self.waiting, item], []
         elif self.waiting and self._follows(self.waiting[-1], item):
             passed = [*self.waiting, item]

@@ -122,7 +122,7 @@ class KobukiDriver(BaseDriver):
         odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
         super().__init__(KobukiProtocol(), "Kobuki base", odometer, LOW_BATTERY)
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
-        self._series = Continuity(_follows)
+        self._series = Continuity(_follows, summed=True)
         self._packets = 0
         self._last: Feedback | None = None
 

@@ -87,7 +87,7 @@ class LdLidarDriver(SpinningDriver):
     def __init__(self) -> None:
         clock = DeviceClock(CLOCK_TICK, CLOCK_MODULUS, period=READINGS / RATE)
         super().__init__(LdLidarProtocol(), FAN, clock)
-        self._series = Continuity(_follows)
+        self._series = Continuity(_follows, summed=True)
 
     def take(self, event: Samples) -> list[Action]:
         """Turn packets into scans. One whose time leaps, and the first, count only if the next one goes on from it."""

@@ -60,7 +60,7 @@ class ScipDriver(ScipUnit):
         self._stream = stream
         self._rates_tried: set[int] = set()
         self._rounds = 0
-        self._series = Continuity(_follows)
+        self._series = Continuity(_follows, summed=True)
 
     def stop(self) -> list[Action]:
         """Return what switches the laser off and ends the stream."""
