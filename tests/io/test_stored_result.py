@@ -49,7 +49,7 @@ def test_a_damaged_report_is_named_and_a_missing_one_is_none(written):
         with pytest.raises(FormatError, match=r"report.json.*no JSON"):
             read_result(folder)
     (folder / "report.json").write_text("[]")
-    with pytest.raises(FormatError, match="not a report"):
+    with pytest.raises(FormatError, match="not the report"):
         read_result(folder)
     (folder / "report.json").unlink()
     assert read_result(folder).closures == ()
