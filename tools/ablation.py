@@ -40,7 +40,6 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.floor import Floor, even
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.estimate import Task as Pipeline
-from uwblite.pipeline.lidar_stages import solved
 from uwblite.sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
@@ -82,7 +81,7 @@ def _repair(name: str) -> LeftOut:
 
 
 def _pairs_alone(estimate: Estimate, task: Pipeline) -> Estimate:
-    return solved(estimate, task.config.solver)
+    return estimate.solved(task.config.solver)[0]
 
 
 def _even_floor(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[OdometryEdges, Floor]:

@@ -77,9 +77,9 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
         height = np.array([False, True, False, False])
         values = np.where(height, 0.0, given.calibration.values)
         moved = given.updated(given.poses, given.anchors + 2.0, values)
-        return replace(estimate, graph=replace(moved, fixed_calibration=given.fixed_calibration | height))
+        return replace(estimate, graph=replace(moved, fixed_calibration=given.fixed_calibration | height)), None
 
-    monkeypatch.setattr(final_stages, "solved", solved)
+    monkeypatch.setattr(Estimate, "solved", solved)
     found = final_stages._anchors_alone(Estimate(graph, None, None, ()), SimpleNamespace(config=MappingConfig())).graph
     assert found.fixed_calibration.tolist() == [False, True, False, False]
     assert found.fixed_poses.tolist() == [True, False, False]

@@ -108,7 +108,7 @@ def _released(estimate: Estimate, task: Task, step: BrokenStep, stretch: tuple[i
     lidar = estimate.joint.rows(_kept(estimate.joint, far, first, last))
     other = replace(estimate, graph=graph, joint=lidar, steps=None, surfaces=None, odometry=wheels)
     for _ in range(_NOISE_ROUNDS):
-        other = lidar_stages.solved(with_range_noise(other, task.config), rough(task.config.solver))
+        other = with_range_noise(other, task.config).solved(rough(task.config.solver))[0]
     other = lidar_stages.refine_jointly(replace(other, joint=None), task)
     edges = other.closures.edges
     agrees = np.abs(edges.residuals(other.graph)).max(axis=1, initial=0.0) <= _SUDDEN

@@ -25,7 +25,6 @@ from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
 from .estimate import Estimate, Task
-from .lidar_stages import solved
 from .map_frame import cropped
 from .progress import Stage
 from .radio_stages import with_range_noise
@@ -135,7 +134,7 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     if not any(free.any() for free in free_unknowns(given).values()):
         return estimate
     given = _with_alike_heights(with_free(given, HEIGHT), estimate, task)
-    done = solved(replace(estimate, graph=given), task.config.solver).graph
+    done = replace(estimate, graph=given).solved(task.config.solver)[0].graph
     # What the search itself has fixed are heights put back to 0.
     heights = graph.calibration.of_kinds(HEIGHT)
     fixed = np.where(heights, done.fixed_calibration, graph.fixed_calibration)

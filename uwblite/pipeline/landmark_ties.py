@@ -24,7 +24,7 @@ from ..lidar.columns import Landmarks, find_columns, fit_circle
 from ..problem.solution import rough
 from . import map_frame
 from .estimate import Estimate, Task
-from .lidar_stages import refine_jointly, solve_by_own_errors, solved
+from .lidar_stages import refine_jointly, solve_by_own_errors
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
@@ -104,7 +104,7 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
     optimum = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
     estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(optimum)
     if estimate.joint is not None:
-        estimate = solved(solve_by_own_errors(refine_jointly(estimate, task), task), rough(config.solver))
+        estimate = solve_by_own_errors(refine_jointly(estimate, task), task).solved(rough(config.solver))[0]
     figures = outcome(task, tied, estimate.graph)
     task.stages.end("landmark distances", distances=figures)
     return estimate

@@ -15,7 +15,7 @@ from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
-from ..graph.solver import SolverConfig, optimize
+from ..graph.solver import optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps
@@ -286,13 +286,13 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     before, optimizer = estimate.graph.poses, Optimizer()
     quick = replace(rough(task.config.solver), relative_decrease=_TO_COME)
-    estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
+    estimate = with_range_noise(estimate, task.config).solved(quick, optimizer)[0]
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
         # The analysis of other pairs of clouds cannot be used again, and it is large.
         optimizer = Optimizer()
         estimate = _matched_once_more(estimate, shift, task)
         before = estimate.graph.poses
-        estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
+        estimate = with_range_noise(estimate, task.config).solved(quick, optimizer)[0]
     if estimate.moved_since(before) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
     del optimizer  # The optimizer's analysis takes as much memory as the covariances.
@@ -322,11 +322,6 @@ def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate
     task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     return replace(estimate, graph=graph, joint=refined.edges)
-
-
-def solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer | None = None) -> Estimate:
-    """Return the estimate at the optimum of all of its measurements; for the parameters see problem/solution.py."""
-    return estimate.solved(solver, optimizer)[0]
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:

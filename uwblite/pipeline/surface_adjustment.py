@@ -32,7 +32,6 @@ from ..lidar.ray_noise import RayNoise
 from ..lidar.surface_rays import MeasuredSurfaces, Surfaces, points_on
 from ..odometry import floor as floors
 from .estimate import Estimate, ScanClouds, Task
-from .lidar_stages import solved
 from .surface_search import find_surfaces, with_round_columns
 
 _ROUNDS, _STILL = 6, 1e-3
@@ -57,12 +56,12 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     if joint is None or scans is None:
         return estimate
     if not len(joint):
-        return solved(estimate, task.config.solver)
+        return estimate.solved(task.config.solver)[0]
     fixed = estimate.graph.fixed_calibration | estimate.graph.calibration.of_kinds(*LASER)
     graph = replace(estimate.graph, fixed_calibration=fixed)
     graph, found = _adjusted(graph, estimate, task)
     if not len(found.rays.keyframe):
-        return solved(estimate, task.config.solver)
+        return estimate.solved(task.config.solver)[0]
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
