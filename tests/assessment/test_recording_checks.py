@@ -8,9 +8,10 @@ import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
+from uwblite.assessment import repairs
 from uwblite.assessment.recording import diagnose
 from uwblite.findings import doubt, warning
-from uwblite.sensor_log import LogNotes, Odometry, SensorLog, SensorMounting
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting
 
 PER_RANGE = ("stamps", "anchor", "ranges", "quality")
 
@@ -189,3 +190,24 @@ def test_the_shortest_recordings_are_examined_too(sound, samples):
     ranges = replace(sound.ranges, **{n: getattr(sound.ranges, n)[:samples] for n in PER_RANGE})
     scans = replace(sound.scans, stamps=sound.scans.stamps[:samples], ranges=sound.scans.ranges[:samples])
     assert diagnose(SensorLog(odometry, ranges, scans)).doubts
+
+
+def test_the_rhythm_of_a_log_that_a_program_wrote_blames_no_cable():
+    """A pose with each scan, as GMapping writes them; the same rhythm of a raw log is the sensors'."""
+    stamps = np.concatenate([np.arange(0.0, 100.0, 2.0), np.arange(150.0, 250.0, 2.0)])
+    poses = np.column_stack([0.2 * np.arange(len(stamps)), np.zeros((len(stamps), 2))])
+    scans = LaserScans(stamps, np.full((len(stamps), 90), 2.0, np.float32), -0.8, 0.018, 0.0, 0.02, 5.6)
+    for written in (False, True):
+        notes = LogNotes(one_clock=written)
+        found = [
+            f
+            for f in diagnose(SensorLog(Odometry(stamps, poses), None, scans, notes=notes)).findings
+            if f.kind in ("silences", "slow-odometry")
+        ]
+        assert {f.kind for f in found} == {"silences", "slow-odometry"}
+        assert all((f.severity == "note") == written for f in found if f.kind == "slow-odometry")
+        assert any("cable" in f.cure for f in found) == (not written)
+
+
+def test_a_stretch_within_a_second_is_a_moment():
+    assert repairs.spans([(39.1, 39.3), (60.0, 64.2)]) == "t = 39 s, t = 60 to 64 s"

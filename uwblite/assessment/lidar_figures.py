@@ -90,10 +90,10 @@ def check_turning(turning: Turning | None, turn_ratio: tuple[float, float]) -> I
         return
     if abs(turning.delay) > _LATE and turning.delay_clear:
         text = (
-            f"the laser's stamps are {abs(turning.delay):.2f} s too {'early' if turning.delay > 0.0 else 'late'} for the "
+            f"the laser's stamps are about {abs(turning.delay):.2f} s too {'early' if turning.delay > 0.0 else 'late'} for the "
             f"odometry's clock (laser_delay {turning.delay:+.2f} s, to be added to them)"
         )
-        cure = "uwblite corrects small offsets; stamp both with one clock, each when its reading begins"
+        cure = "a map measures it better and corrects small offsets; stamp both with one clock, each when its reading begins"
         yield Finding("laser-delay", WARNING, text, cure, "lidar")
     ratio, sigma = turn_ratio
     if ratio > 0.0 and abs(ratio - 1.0) > max(_TURNS, _SIGMAS * sigma):

@@ -5,7 +5,7 @@ itself shows a fault (heading in degrees, a laser upside down, clocks that diffe
 findings are those of the recording as well.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -152,10 +152,23 @@ def _check_sensors(view: RecordingView) -> Iterator[Finding]:
 
 def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
     """Say what the figures of each sensor show."""
-    yield from check_odometry(view.log.odometry, view.figures["odometry"])
+    yield from _as_written(view, check_odometry(view.log.odometry, view.figures["odometry"]))
     if "uwb" in view.figures:
         yield from check_radio(view.figures["uwb"])
     if "lidar" in view.figures:
-        yield from check_lidar(view.figures["lidar"])
+        yield from _as_written(view, check_lidar(view.figures["lidar"]))
         if shows_turns(view.log.scans):
             yield from check_turning(view.turning, view.turn_ratio)
+
+
+def _as_written(view: RecordingView, findings: Iterable[Finding]) -> Iterator[Finding]:
+    """Yield findings, those about the rhythm of a log whose odometry and scans share messages as what they are.
+
+    Such a log was corrected or thinned by a program: its rhythm is the program's, and not that of sensors, cables or computer.
+    """
+    for finding in findings:
+        if view.log.notes.one_clock and finding.kind in ("silences", "slow-odometry"):
+            cure = "a program wrote a pose with each scan that it used; where the raw log is left, map that"
+            yield replace(finding, severity=NOTE, cure=cure)
+        else:
+            yield finding

@@ -43,7 +43,8 @@ def listed(times: Sequence[float], digits: int = 0, most: int = 5) -> str:
 def spans(stretches: Sequence[tuple[float, float]]) -> str:
     """Return the first three stretches, s, as words, and how many more there are."""
     more = f", and {len(stretches) - 3} more stretches" if len(stretches) > 3 else ""
-    return ", ".join(f"t = {a:.0f} to {b:.0f} s" for a, b in stretches[:3]) + more
+    words = (f"t = {a:.0f} to {b:.0f} s" if round(a) < round(b) else f"t = {a:.0f} s" for a, b in stretches[:3])
+    return ", ".join(words) + more
 
 
 def made_up_stamps(period: float) -> Finding:
@@ -105,7 +106,7 @@ def stamps_in_bursts(readings: str, size: float, period: float) -> Finding:
 
 def repeated_odometry(count: int) -> Finding:
     """Warn of readings of the odometry that are in the log twice."""
-    return warning("repeated-odometry", f"{count} odometry readings are in the log twice; one of each was left out")
+    return warning("repeated-odometry", f"odometry readings that are in the log twice: {count}; one of each was left out")
 
 
 def odometry_glitches(count: int, first: float) -> Finding:
