@@ -38,7 +38,7 @@ def test_everything_comes_back(written):
 
 
 def test_what_is_no_result_is_one_clear_error(tmp_path):
-    with pytest.raises(FormatError, match="holds no map's result"):
+    with pytest.raises(FormatError, match="holds no result of a map"):
         read_result(tmp_path)
 
 

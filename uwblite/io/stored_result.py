@@ -112,7 +112,7 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
     path = Path(folder)
     repair_result(path)
     if not (path / "trajectory.tum").is_file():
-        raise FormatError("holds no map's result (no trajectory.tum)", os.fspath(path))
+        raise FormatError("holds no result of a map (no trajectory.tum)", os.fspath(path))
     later = (path / f"trajectory_{k}.tum" for k in range(2, 1 + len(list(path.glob("trajectory*.tum")))))
     trajectories = tuple(read_tum(p) for p in (path / "trajectory.tum", *(p for p in later if p.is_file())))
     report = _report(path / "report.json")
