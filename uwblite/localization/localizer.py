@@ -15,7 +15,7 @@ from .. import se2
 from ..arrays import Floats
 from ..clocks.sensor_clock import JUMP, SensorClock
 from ..errors import DataError
-from ..odometry.gyro_turns import GyroTurns
+from ..odometry.gyro import GyroTurns
 from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from ..validation import as_array, require_shape, require_type

@@ -10,7 +10,7 @@ from ..errors import DataError
 from ..findings import Fact
 from ..lidar.scan_odometry import scan_steps
 from ..odometry.attached import OUTSIDE
-from ..sensor_log import LaserScans, Odometry, SensorLog, UwbRanges, odometry_in_bursts
+from ..sensor_log import LaserScans, Odometry, SensorLog, UwbRanges, odometry_in_bursts, stand_still
 from ..sensor_log import in_bursts as stamps_in_bursts
 
 _FEW_STAMPS = 20
@@ -25,30 +25,6 @@ _SAME_END = 2.0
 """Sensors of one recording end within so much of each other, s."""
 _SOME = 0.02
 """Share of scans outside the odometry's time from which on it is reported."""
-
-
-def stand_still(stamps: Floats, travelled: Floats) -> bool:
-    """Return whether stamps (n,), s, in the order of the readings, stand still while the robot drives.
-
-    Readings that waited in a buffer share a stamp as well, and then a robot drives no farther within one than it does while a
-    buffer fills.
-
-    Parameters
-    ----------
-    travelled : (n,) m, distance driven until each reading.
-    """
-    if len(stamps) < _FEW_STAMPS or travelled[-1] - travelled[0] <= 0.0:
-        return False
-    way = np.diff(travelled)
-    group = np.concatenate([[0], np.cumsum(np.diff(stamps) != 0.0)])
-    within = np.where(group[1:] == group[:-1], way, 0.0)
-    far = np.bincount(group[1:], within) > min(_BUFFERED, _HALF * float(way.sum()))
-    return float(within[far[group[1:]]].sum()) > _HALF * float(way.sum())
-
-
-_BUFFERED = 10.0
-"""m; more than a robot drives while readings wait in a buffer: a few seconds at 3 m/s at most."""
-_HALF = 0.5
 
 
 def refuse_without_stamps(log: SensorLog) -> None:
