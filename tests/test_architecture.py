@@ -18,7 +18,7 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "arrays", "findings"),
+    ("errors", "arrays", "findings", "work"),
     ("validation", "field_docs"),
     ("se2", "config", "clocks"),
     ("sensor_log", "graph", "drivers"),
