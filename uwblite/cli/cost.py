@@ -69,9 +69,9 @@ def expected_cost(log: "SensorLog", config: "MappingConfig | None" = None) -> di
     """
     import numpy as np
 
-    from ..mapping import MappingConfig
+    from ..grid.occupancy_grid import GridConfig
 
-    grid = (config or MappingConfig()).grid
+    grid = GridConfig() if config is None else config.grid
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)
