@@ -84,7 +84,7 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     priors = tuple(_loose(e, places[0]) for e in graph.calibration_priors)
     fixed_values = graph.fixed_calibration | graph.calibration.of_kinds(RANGE_SCALE)
     fixed_values[places] = False
-    alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, fixed_values)
+    alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, fixed_values, graph.work)
     solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(used)), task.config.solver)[0]
     return np.column_stack([solved.calibration.values[places], marginals(solved).covariances.calibration[places]])
 
@@ -151,7 +151,7 @@ def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -
     some = np.arange(0, len(log.ranges.stamps), -(-len(log.ranges.stamps) // _RANGES_ALONE))
     thinned = gather([replace(log, ranges=log.ranges.rows(some))], task.config.keyframes)
     own = replace(task, recordings=thinned, stages=Stages(None, None))
-    found = bootstrapped(dead_reckoning(thinned.each[0], task.config), 0, own)
+    found = bootstrapped(dead_reckoning(thinned.each[0], task.config, task.stages.work), 0, own)
     places = found.graph.poses[:, :2]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     if found.ranges is None or spread[1] < _WIDE * spread[0]:
