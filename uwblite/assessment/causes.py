@@ -19,7 +19,7 @@ _PLACES = frozenset({
 })  # fmt: skip
 """What anchors seem to do along a path that is wrong, or by ranges that are no distances."""
 _BY_RANGES = _PLACES | {
-    "range-scatter", "odometry-unit", "odometry-slips", "drift", "halves-disagree", "other-side", "anchor-heights", "mirrored",
+    "range-scatter", "odometry-unit", "odometry-slips", "drift", "other-side", "anchor-heights", "mirrored",
     "unusual-calibration", "uncertain", "poor-fit", "path-displaced",
 }
 """What a map by ranges and wheels alone shows of a fault of either."""
@@ -50,7 +50,6 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
     "repeated-scans": frozenset({"odometry-alone", "untied-parts", "silences"}),
     "worse-than-parts": _PLACES | {"path-displaced", "odometry-steps", "free-space-violation"},
     "wheels-against-lidar": _BY_SCANS | {"range-scatter", "anchors-moved-together", "moved-anchor"},
-    "halves-disagree": _BY_RANGES - {"halves-disagree"},
     "turn-factor": frozenset({"unusual-calibration"}),
     "mirrored": frozenset({"unusual-calibration", "odometry-unit"}),
     "loose-links": frozenset({

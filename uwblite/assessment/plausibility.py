@@ -20,7 +20,6 @@ from .causes import explained
 from .certainty import check_certainty, check_other_side
 from .decisions import RULES
 from .drift_tests import check_drifts, check_turn_scales
-from .half_tests import check_halves
 from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
@@ -66,7 +65,6 @@ def judge(
         lambda: check_residuals(estimate, residuals, grid, task),
         lambda: check_unit(anchors, task),
         lambda: check_short_ranges(anchors, estimate, sigma, task),
-        lambda: check_halves(estimate, task),
         lambda: check_drifts(estimate, task),
         lambda: check_untied_parts(estimate, task),
         lambda: check_untied_recordings(estimate, task),
