@@ -49,28 +49,36 @@ def text_mask(text: str, scale: int = 1) -> Bools:
 
 
 Colour = tuple[int, int, int]
+"""Red, green, blue, 0..255."""
 
-PATH: Colour = (37, 99, 235)
-PATHS: tuple[Colour, ...] = (PATH, (124, 58, 180), (0, 128, 140), (92, 64, 51))
+
+def rgb(code: str) -> Colour:
+    """Return a colour given in hexadecimal, as HTML has it."""
+    red, green, blue = bytes.fromhex(code)
+    return red, green, blue
+
+
+PATH: Colour = rgb("2563eb")
+PATHS: tuple[Colour, ...] = (PATH, rgb("7c3ab4"), rgb("00808c"), rgb("5c4033"))
 """Of the recordings, in turn."""
-ACCEPTED: Colour = (234, 120, 20)
-REJECTED: Colour = (138, 147, 160)
-ANCHOR: Colour = (208, 28, 60)
-PROPOSED: Colour = (110, 40, 160)
+ACCEPTED: Colour = rgb("ea7814")
+REJECTED: Colour = rgb("8a93a0")
+ANCHOR: Colour = rgb("d01c3c")
+PROPOSED: Colour = rgb("6e28a0")
 """Anchors that do not stand there yet."""
-START: Colour = (22, 150, 80)
-DOUBTED: Colour = (250, 190, 20)
+START: Colour = rgb("169650")
+DOUBTED: Colour = rgb("fabe14")
 """Stretches of a path that are not to be trusted."""
-NLOS: Colour = (216, 27, 96)
+NLOS: Colour = rgb("d81b60")
 """Ranges that do not agree with the map."""
 
 ON_DARK: dict[Colour, Colour] = {
-    PATH: (106, 155, 255),
-    ACCEPTED: (255, 154, 64),
-    REJECTED: (150, 160, 174),
-    ANCHOR: (255, 100, 128),
-    START: (63, 196, 124),
-    NLOS: (255, 106, 165),
+    PATH: rgb("6a9bff"),
+    ACCEPTED: rgb("ff9a40"),
+    REJECTED: rgb("96a0ae"),
+    ANCHOR: rgb("ff6480"),
+    START: rgb("3fc47c"),
+    NLOS: rgb("ff6aa5"),
 }
 """What stands for a colour on a dark ground."""
 
