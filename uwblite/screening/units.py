@@ -142,9 +142,15 @@ def _seldom_stamps(odometry: Odometry) -> str:
         return ""
     turns = np.minimum(steps[:, 2] % (2.0 * np.pi), -steps[:, 2] % (2.0 * np.pi))
     speed, spin = float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / span, float(turns.sum()) / span
-    found = [(abs(np.log(speed / unit / _USUAL_SPEED)), name, unit) for name, unit in _LONG_TIMES.items()
-             if speed > FASTEST and (spin > _SPIN or period < _RAPID) and spin / unit < _SPIN
-             and _PERIODS[0] <= period * unit <= _PERIODS[1] and _SPEEDS[0] <= speed / unit <= _SPEEDS[1]]  # fmt: skip
+    found = [
+        (abs(np.log(speed / unit / _USUAL_SPEED)), name, unit)
+        for name, unit in _LONG_TIMES.items()
+        if speed > FASTEST
+        and (spin > _SPIN or period < _RAPID)
+        and spin / unit < _SPIN
+        and _PERIODS[0] <= period * unit <= _PERIODS[1]
+        and _SPEEDS[0] <= speed / unit <= _SPEEDS[1]
+    ]
     return _other_time(*min(found)[1:], period, speed) if found else ""
 
 
