@@ -13,7 +13,7 @@ from ..errors import ConfigError
 from ..io.carmen import write_log
 from ..io.corrected_log import write_graph_with_scans
 from ..io.csv_folder import write_csv_folder
-from ..io.nav2_bundle import FILES, write_nav2_bundle
+from ..io.ros_results import FILES, write_nav2_bundle
 from ..io.stored_result import read_result
 from ..io.tum import read_tum, write_trajectory
 from ..sensor_log import Odometry, SensorLog
@@ -84,7 +84,7 @@ def _convert_graph(args: argparse.Namespace) -> int:
 
 
 def _convert_map(args: argparse.Namespace, to: str) -> int:
-    from ..io.result_bag import write_result_bag
+    from ..io.ros_results import write_result_bag
 
     if to not in ("mcap", "sqlite3", "g2o", "tum", "kitti", "nav2"):
         raise ConfigError(f"{args.target}: not a format for a map; use --to nav2, mcap, sqlite3, g2o, tum or kitti")

@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 
 from ..errors import ConfigError, UwbliteError
-from ..io.log_tail import LogTail
+from ..io.carmen_live import LogTail
 from ..io.results import check_target
 from ..io.stored_result import StoredResult, read_result
 from ..server.live import LivePage, watch_status
