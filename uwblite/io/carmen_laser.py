@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
-from .carmen_params import Params
 from .carmen_readings import Block, Pending
-from .carmen_stamps import LineClock
-from .carmen_words import HEAD, RANK, BrokenLine, Layout, kinds_of, numbers, parse_head, split_tail, time_order
+from .carmen_stamps import LineClock, time_order
+from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
 from .readings import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02

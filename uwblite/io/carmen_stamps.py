@@ -13,8 +13,11 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
 from ..screening.clocks import stand_still
-from .carmen_words import CONFIRMED
 
+CONFIRMED = 0.5
+"""s; a recorder may hold a range back until the next one confirms it."""
+_NEXT = 2.0
+"""s; a part of a log that follows another begins so much later at most."""
 _FAR = 10.0
 """s; no message waits so long for its line."""
 _IN_A_ROW = 3
@@ -214,3 +217,31 @@ def placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[
         f" {stamps[first]:.4g} s in line {lines[first]}): they are placed by the order of the lines"
     )
     return np.where(false, np.interp(lines, lines[~false], stamps[~false]), stamps)
+
+
+def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> Ints:
+    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
+
+    Parameters
+    ----------
+    set_back : takes by how much the clock was set back at most, s, by what.
+    """
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - CONFIRMED))
+    if late:
+        warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
+        if set_back is not None:
+            set_back[what] = 0.0 if _in_parts(stamps) else float(np.max(np.maximum.accumulate(stamps) - stamps))
+    return np.argsort(stamps, kind="stable")
+
+
+def _in_parts(stamps: Floats) -> bool:
+    """Return whether stamps (n,) are those of one clock in parts that only stand in another order, as `cat` writes them.
+
+    Sorted, one part follows the other; a clock that was set back goes through the same time again, or leaves a gap.
+    """
+    steps = np.diff(stamps, prepend=np.inf)
+    begins = np.flatnonzero((steps < -CONFIRMED) | (steps > _NEXT))
+    first, last = np.minimum.reduceat(stamps, begins), np.maximum.reduceat(stamps, begins)
+    order = np.argsort(first)
+    gap, as_written = first[order][1:] - last[order][:-1], np.diff(order) == 1
+    return bool(np.all((gap >= -CONFIRMED) & (as_written | (gap <= _NEXT))))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..sensor_log import LaserScans, SensorLog
-from .carmen_params import LASER_IS_BASE
+from .carmen_words import LASER_IS_BASE
 from .files import replacing
 
 HOST = "uwblite"
