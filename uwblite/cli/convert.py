@@ -76,8 +76,7 @@ def _convert_graph(args: argparse.Namespace) -> int:
     graph_format(args.target)
     refuse_existing(args.force, args.target)
     file = read_graph(args.source)
-    for warning in file.warnings:
-        console.note(f"uwblite: {args.source}: {warning}")
+    console.note_of(args.source, file.warnings)
     write_graph(args.target, file)
     skipped = {f"{name} skipped": count for name, count in file.skipped.items()}
     return _say(args, {"poses": len(file.graph.poses), "landmarks": len(file.graph.anchors), **skipped}, warnings=file.warnings)
@@ -152,8 +151,7 @@ def _convert_recording(args: argparse.Namespace, to: str) -> int:
     refuse_existing(args.force, args.target)
     log = _scaled(recording(args, args.source), args)
     log = _cropped(log, args.start, args.end)
-    for warning in log.notes.warnings:
-        console.note(f"uwblite: {args.source}: {warning}")
+    console.note_of(args.source, log.notes.warnings)
     _write(args, to, log)
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     scans = 0 if log.scans is None else len(log.scans.stamps)

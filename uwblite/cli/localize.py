@@ -3,7 +3,7 @@
 import argparse
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 from ..errors import ConfigError, UsageError
@@ -37,11 +37,8 @@ def run(args: argparse.Namespace) -> int:
     tell_doubts(earlier)
     known = from_result(earlier)
     log = recording(args, args.log).without(uwb=not config.use_uwb, lidar=not config.use_lidar)
-    progress = console.Progress()
-    try:
+    with closing(console.Progress()) as progress:
         found = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
-    finally:
-        progress.close()
     summary = _summary(found, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
     picture = _picture(found, earlier, os.path.basename(args.log)) if "picture" in files else None

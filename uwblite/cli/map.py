@@ -4,6 +4,7 @@ import argparse
 import os
 import shlex
 import time
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -88,11 +89,8 @@ def _make_shown(args: argparse.Namespace, logs: list[SensorLog], reading: float)
             console.note(f"uwblite: {stage}")
         progress(stage, done, total, overall.take(stage, done, total))
 
-    try:
-        with workers(args.jobs, args.scheduler) as executor:
-            return make(args, logs, reading, report, executor, console.note)
-    finally:
-        progress.close()
+    with closing(progress), workers(args.jobs, args.scheduler) as executor:
+        return make(args, logs, reading, report, executor, console.note)
 
 
 def _report_reader_warnings(logs: list[SensorLog]) -> None:
@@ -100,8 +98,7 @@ def _report_reader_warnings(logs: list[SensorLog]) -> None:
         if notes.broken:
             number, why = notes.broken_lines[0]
             console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
-        for warning in notes.warnings:
-            console.note(f"uwblite: {notes.source}: {warning}")
+        console.note_of(notes.source, notes.warnings)
 
 
 def _dry_run(args: argparse.Namespace) -> int:

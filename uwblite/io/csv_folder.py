@@ -25,7 +25,7 @@ from .carmen_stamps import false_stamps, placed
 from .csv_table import csv_rows
 from .files import replacing, write_text
 from .folders import refuse_foreign, replacing_folder, unmarked
-from .readings import largest_reading, ranges_of, without_reach
+from .readings import ranges_of, reach_of
 from .settings_toml import to_toml
 from .source import finite, open_source
 
@@ -266,7 +266,5 @@ def _read_scans(path: Path, geometry: Scans, digest: "hashlib._Hash", warnings: 
     with np.errstate(invalid="ignore"):
         ranges[~(ranges >= g.range_min)] = np.nan
         if not g.range_min < reach < np.inf:
-            reach = largest_reading(ranges)
-            warnings.append(without_reach(reach))
-            ranges[ranges > np.float32(reach)] = np.inf
+            reach = reach_of(ranges, warnings)
     return LaserScans(times[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)

@@ -46,10 +46,6 @@ def write_map(
     Returns
     -------
     Paths of the image and of the YAML file.
-
-    Raises
-    ------
-    OSError : a file cannot be written.
     """
     image = Path(folder) / (f"{name}.png" if mode == "scale" else f"{name}.pgm")
     yaml = Path(folder) / f"{name}.yaml"
