@@ -4,6 +4,8 @@ A reader that leaves early (``uwblite map ... | head -1``) does not stop the wor
 does a full disk behind stdout, which is reported at the end. No line has what a terminal would obey, whatever a file's name.
 """
 
+import errno
+import json
 import logging
 import os
 import sys
@@ -95,7 +97,7 @@ def os_error_text(error: OSError) -> str:
         "EACCES": "; check who owns it, or choose another place",
         "EROFS": "; choose a place that can be written to",
         "ENOENT": "; check the spelling",
-    }.get(_name_of(error.errno), "")
+    }.get(errno.errorcode.get(error.errno or 0, ""), "")
     return f"{where}{reason}{hint}"
 
 
@@ -105,12 +107,6 @@ def _folder_is_gone() -> bool:
     except OSError:
         return True
     return False
-
-
-def _name_of(number: int | None) -> str:
-    import errno
-
-    return errno.errorcode.get(number or 0, "")
 
 
 def flush() -> bool:
@@ -224,8 +220,6 @@ def progress_line(stage: str, share: float | None, elapsed: float) -> str:
 
 def say_json(value: Any) -> None:
     """Write one JSON object to stdout; numbers that are not finite become null."""
-    import json
-
     say_lines(json.dumps(plain(value), indent=2, allow_nan=False))
 
 

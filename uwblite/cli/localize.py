@@ -11,7 +11,7 @@ from ..io.files import write_text
 from ..io.folders import replacing_folder
 from ..io.png import write_png
 from ..io.result_text import covariance_csv, json_lines, notices
-from ..io.stored_result import StoredResult, read_result
+from ..io.stored_result import read_result
 from ..io.tum import write_tum
 from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
@@ -41,7 +41,8 @@ def run(args: argparse.Namespace) -> int:
         found = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
     summary = _summary(found, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
-    picture = _picture(found, earlier, os.path.basename(args.log)) if "picture" in files else None
+    anchors, caption = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors], os.path.basename(args.log)
+    picture = draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, found, picture, json_lines(about | summary))
     if args.json:
@@ -91,11 +92,6 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
     names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
     own = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
     return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
-
-
-def _picture(found: Localization, earlier: StoredResult, caption: str) -> Any:
-    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors]
-    return draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption)
 
 
 def _summary(found: Localization, files: list[str]) -> dict[str, Any]:
