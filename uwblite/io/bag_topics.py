@@ -165,12 +165,7 @@ def _usable(topic: BagTopic, samples: Samples, mappings: Sequence[UwbMapping]) -
 
 
 def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
-    """Return the topic of a name.
-
-    Raises
-    ------
-    ConfigError : there is none.
-    """
+    """Return the topic of a name, or raise ConfigError."""
     found = next((t for t in topics if t.name == name), None)
     if found is None:
         names = [t.name for t in topics]

@@ -122,14 +122,10 @@ def judged(
 
 
 def _without_leaps(poses: Floats, own: Bools) -> Floats:
-    """Return the poses (n, 3) of a corrected log without leaps.
+    """Return the poses (n, 3) of a corrected log without leaps; some (n,) are the odometry's own, the others of laser messages.
 
     Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
     X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
-
-    Parameters
-    ----------
-    own : (n,) which poses are the odometry's, not those of a laser message.
     """
     laser, number = np.flatnonzero(~own), np.arange(len(own))
     following = np.searchsorted(laser, number)

@@ -126,12 +126,7 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
 
 
 def _origin(settings: Settings, name: str) -> list[float]:
-    """Return the pose of the lower left corner.
-
-    Raises
-    ------
-    FormatError : it is none; older map savers wrote a yaw that is no number.
-    """
+    """Return the pose of the lower left corner; older map savers wrote a yaw that is no number."""
     value = settings.get("origin")
     if not isinstance(value, list):
         raise FormatError("origin must be a list of numbers", name)
