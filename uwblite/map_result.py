@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .arrays import Bools, Floats, Ints
-from .field_docs import documented
+from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid

@@ -9,14 +9,11 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.assessment import half_tests
-from uwblite.constraints import Constraints
 from uwblite.graph.graph import PriorEdges
 from uwblite.mapping import build_map
-from uwblite.pipeline.estimate import Task
-from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.se2 import chain as chained
-from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
+from uwblite.sensor_log import Odometry
 
 
 @pytest.fixture(scope="module")
@@ -62,23 +59,6 @@ def test_halves_differ_by_their_limit_and_four_standard_deviations(kind, limit):
         assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
 
 
-@pytest.mark.parametrize(("count", "every"), [(1500, 1), (1501, 2), (3000, 2), (3001, 3)])
-def test_a_half_is_bootstrapped_with_evenly_thinned_ranges(monkeypatch, count, every):
-    """1,500 at most, the first of them and each k-th from then on."""
-    stamps, taken = np.linspace(0.0, 99.0, count), []
-    ranges = UwbRanges(stamps, np.zeros(count, int), np.ones(count), np.ones(count), ("A",))
-    log = SensorLog(Odometry(np.arange(100.0), np.zeros((100, 3))), ranges)
-
-    def gathered(logs, config):
-        taken.append(logs[0].ranges.stamps)
-        raise StopIteration
-
-    monkeypatch.setattr(half_tests, "gather", gathered)
-    with pytest.raises(StopIteration):
-        half_tests._anchors_alone(SimpleNamespace(log=log), -np.inf, np.inf, Task(None, MappingConfig(), Constraints(), None))
-    np.testing.assert_array_equal(taken[0], stamps[::every])
-
-
 def test_a_prior_on_the_unit_of_the_wheels_is_twenty_times_as_wide():
     priors = PriorEdges("calibration", np.array([2, 0, 1]), np.zeros((3, 1)), np.array([5.0, 6.0, 7.0])[:, None, None])
     loose = half_tests._loose(priors, 0)
@@ -110,28 +90,3 @@ def test_anchors_of_both_halves_that_are_mirror_images_are_a_doubt(monkeypatch, 
 def test_a_radio_with_several_places_in_a_half_is_not_compared():
     places = {"A": LEFT[0], "B@2": LEFT[1], "C": LEFT[2], "C@2": LEFT[3]}
     assert list(half_tests._radios_at_one_place(places)) == ["A", "B"]
-
-
-@pytest.mark.parametrize(
-    ("wide", "ranged", "image", "found"),
-    [(0.11, True, None, ["A"]), (0.09, True, None, []), (0.11, False, None, []), (0.11, True, "as good", [])],
-)
-def test_a_half_says_where_anchors_are_that_it_shows_well(monkeypatch, wide, ranged, image, found):
-    """From a path a tenth as wide as it is long, with eight ranges that count to an anchor that was placed, not mirrored."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
-    poses = np.column_stack([7.0 + np.cos(angle), wide * np.sin(angle) - 4.0, angle])
-    anchor = np.repeat([0, 1, 2], [8, 7, 9])
-    ranges = SimpleNamespace(anchor=anchor, alive=np.ones(24, dtype=bool)) if ranged else None
-    graph = SimpleNamespace(poses=poses, anchors=np.arange(6.0).reshape(3, 2), fixed_anchors=np.zeros(3, dtype=bool))
-    estimate = SimpleNamespace(graph=graph, ranges=ranges, anchor_ids=("A", "B", "C"), placed=np.array([True, True, False]))
-    estimate.problem = graph
-    monkeypatch.setattr(half_tests, "bootstrapped", lambda *args: estimate)
-    monkeypatch.setattr(half_tests, "optimize", lambda problem, config: (problem, None))
-    monkeypatch.setattr(half_tests, "mirrored_whole", lambda *args: image)
-    monkeypatch.setattr(half_tests, "dead_reckoning", lambda *args: None)
-    measured = UwbRanges(np.linspace(0.0, 99.0, 50), np.zeros(50, int), np.ones(50), np.ones(50), ("A",))
-    log = SensorLog(Odometry(np.arange(100.0), np.zeros((100, 3))), measured)
-    task = Task(None, MappingConfig(), Constraints(), None)
-    places = half_tests._anchors_alone(SimpleNamespace(log=log), -np.inf, np.inf, task)
-    assert list(places) == found
-    assert all(place.tolist() == [0.0, 1.0] for place in places.values())

@@ -115,7 +115,7 @@ def limited(monkeypatch, size):
 def test_a_map_that_will_not_fit_is_refused_before_it_begins(short_log, tmp_path, monkeypatch, capsys):
     limited(monkeypatch, 10_000_000)
     words = ["map", str(short_log), "--out", str(tmp_path / "map")]
-    monkeypatch.setattr("uwblite.mapping.build_map", lambda *_, **__: pytest.fail("nothing is to be mapped"))
+    monkeypatch.setattr("uwblite.cli.making.build_map", lambda *_, **__: pytest.fail("nothing is to be mapped"))
     assert main(words) == 1
     said = capsys.readouterr().err
     assert "the limit of this test is 10 MB" in said

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from uwblite.cli import console
-from uwblite.cli.stage_shares import Overall
+from uwblite.cli.map import Overall
 from uwblite.mapping import Stage, build_map
 
 

@@ -17,17 +17,14 @@ from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
 from .causes import explained
-from .certainty import check_certainty
+from .certainty import check_certainty, check_other_side
 from .decisions import RULES
-from .drift_tests import check_drifts
+from .drift_tests import check_drifts, check_turn_scales
 from .half_tests import check_halves
-from .other_side import check_other_side
 from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
-from .turn_scale_tests import check_turn_scales
-from .untied_parts import check_untied_parts
-from .untied_recordings import check_untied_recordings
+from .untied_parts import check_untied_parts, check_untied_recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate gets a warning."""

@@ -9,8 +9,7 @@ from ..arrays import Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, SensorLog, UwbRanges, plausible
-from .odometry_figures import STRAIGHT, straightness
-from .rhythm import check_equal_stamps, check_silences, rhythm
+from .odometry_figures import STRAIGHT, check_equal_stamps, check_silences, rhythm, straightness
 
 FEW = 10
 """Ranges from which an anchor cannot be placed."""

@@ -3,28 +3,15 @@
 import argparse
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
+from ..drivers.device_options import Options, Setup
+from ..drivers.devices import DEVICES, SENSORS, DeviceKind, kinds_on_usb
+from ..drivers.events import Action, Note, Reopen, Send, SetBaud, SetDtr
+from ..drivers.ports import plugged_in
+from ..drivers.session import Session
+from ..drivers.transport import Port, check_url, open_port
+from ..errors import DeviceError
 from .console import note, say, say_json
-
-if TYPE_CHECKING:
-    from ..drivers.devices import DeviceKind
-    from ..drivers.events import Action
-    from ..drivers.transport import Port
-
-HELP = "list tag, lidar and base that are plugged in, and say how to fix what is not right"
-EPILOG = """
-examples:
-  uwblite devices                              look at every port of a known kind
-  uwblite devices /dev/ttyUSB0 /dev/serial0    look at these ports, whatever they are
-  uwblite devices --pan-id 0xC0DE              and is the tag in this network?
-  uwblite devices --list                       only list ports; nothing is opened
-  uwblite devices --kinds                      what can be recorded, with names and options
-
-Looking at a port opens it, listens for a moment and asks who is there. Ports of an unknown kind are only opened when they
-are named. Nothing is changed: every finding names what to type. Exit code 0: all is well; 1: no device was found; 3: something
-needs mending.
-"""
 
 LISTEN, ASK = 0.6, 5.0
 """s to wait for a device that talks unasked, and for one that answers."""
@@ -43,22 +30,8 @@ class PortReport:
     """(level, what and how to mend it)."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("ports", metavar="PORT", nargs="*", help="ports to look at (default: those of a known kind)")
-    parser.add_argument("--list", action="store_true", help="list the ports and open none")
-    parser.add_argument("--kinds", action="store_true", help="list the devices that can be recorded, with their options")
-    parser.add_argument("--pan-id", metavar="ID", type=_pan_id, help="network id that the tag should have, e.g. 0xC0DE")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-
-
 def run(args: argparse.Namespace) -> int:
     """Look at the ports and report."""
-    from ..drivers.devices import kinds_on_usb
-    from ..drivers.ports import plugged_in
-    from ..drivers.transport import check_url
-    from ..errors import DeviceError
-
     if args.kinds:
         return _list_kinds()
     reports = []
@@ -86,8 +59,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _list_kinds() -> int:
-    from ..drivers.devices import DEVICES, SENSORS
-
     for sensor in SENSORS:
         for kind in DEVICES.values():
             if kind.sensor == sensor:
@@ -122,7 +93,7 @@ def _report(reports: list[PortReport], as_json: bool) -> None:
         note("all is well")
 
 
-def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport:
+def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
     """Open a port, find out who is there, and judge its settings.
 
     Parameters
@@ -134,10 +105,6 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport
     -------
     PortReport
     """
-    from ..drivers.devices import DEVICES
-    from ..drivers.transport import open_port
-    from ..errors import DeviceError
-
     port_report = PortReport(path)
     tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:
@@ -161,16 +128,12 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport
     return port_report
 
 
-def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
+def _ask(port: Port, kind: DeviceKind, port_report: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
-    from ..drivers.device_options import Options, Setup
-    from ..drivers.events import Note, Reopen, Send, SetBaud, SetDtr
-    from ..drivers.session import Session
-
     driver = kind.make(Options(kind.name, {}), Setup(stream=False))
     session, notes = Session(driver), []
 
-    def do(actions: "list[Action]") -> bool:
+    def do(actions: list[Action]) -> bool:
         for action in actions:
             if isinstance(action, Send):
                 port.write(action.data)
@@ -216,13 +179,3 @@ def _compare_networks(reports: list[PortReport]) -> None:
         for port_report in reports:
             if "network" in port_report.details:
                 port_report.findings.append(("warning", f"nodes differ in network id ({', '.join(sorted(networks))})"))
-
-
-def _pan_id(text: str) -> Any:
-    try:
-        value = int(text, 16)
-    except ValueError:
-        value = -1
-    if not 0 < value <= 0xFFFF:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a network id such as 0xC0DE")
-    return value

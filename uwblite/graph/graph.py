@@ -20,10 +20,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Shape, array_fields, require_index, require_type, settle
+from ..config import documented
 from ..errors import DataError
-from ..field_docs import documented
-from ..validation import Shape, array_fields, require_index, require_type, settle
 from ..work import Work
 from .robust import SQUARED, Kernel
 

@@ -44,9 +44,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import Floats
-from ..config import setting
+from ..config import documented, setting
 from ..errors import ConfigError, SolverError
-from ..field_docs import documented
 from ..work import ENTRIES
 from .anchor_subproblem import with_anchors_solved
 from .descent_rules import as_much_again, extrapolated, relaxed

@@ -186,7 +186,7 @@ class LogReader:
         self.broken += len(broken)
         self.broken_lines += broken[: BROKEN_LINES_KEPT - len(self.broken_lines)]
         self.ends_broken = bool(broken) and broken[-1][0] == self.lines
-        if self.broken > _HOPELESS and self.broken > 0.9 * self.messages:
+        if self.broken > _HOPELESS and self.broken > max(0.9, self.max_broken_share) * self.messages:
             self._refuse()
 
     def _refuse(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
-from ..screening.clocks import stand_still
+from ..sensor_log import stand_still
 from .carmen_words import CONFIRMED
 
 _FAR = 10.0

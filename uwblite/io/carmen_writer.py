@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from .. import se2
 from ..sensor_log import LaserScans, SensorLog
 from .carmen_params import LASER_IS_BASE
-from .decimal_text import encode_fixed_point
 from .files import replacing
 
 HOST = "uwblite"
@@ -104,9 +103,10 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
         f"ROBOTLASER1 {_LASER_TYPE} {scans.angle_min:.9f} {fov:.9f} {scans.angle_increment:.9f} "
         f"{_reach(scans):g} 0.01 0 {beams} "
     ).encode()
+    form = b" ".join([b"%.3f"] * beams)
     for start in range(0, len(scans.stamps), _SCANS_AT_A_TIME):
         part = slice(start, start + _SCANS_AT_A_TIME)
-        readings = encode_fixed_point(_without_signs(scans, part), 3)
+        readings = map(form.__mod__, map(tuple, _without_signs(scans, part).tolist()))
         rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
         for text, l, r, stamp in rows:
             yield (

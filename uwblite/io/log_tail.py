@@ -14,9 +14,8 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import FormatError
-from .carmen_words import RANK, numbers, stamp_of
+from .carmen_live import LiveReader
 from .log_parts import GrowingFile
-from .source import MAX_LINE_BYTES
 
 WINDOW = 10.0
 """s over which rates are taken."""
@@ -74,7 +73,7 @@ class LogTail:
         self.first, self.last = float("inf"), float("-inf")
         self._odometry = array("d")
         self._latest: tuple[float, ...] = ()
-        self._carry = b""
+        self._reader = LiveReader()
 
     @property
     def seconds(self) -> float:
@@ -131,38 +130,17 @@ class LogTail:
 
     def _take(self, data: bytes) -> None:
         self.bytes += len(data)
-        *lines, self._carry = (self._carry + data).split(b"\n")
-        if len(self._carry) > MAX_LINE_BYTES:
-            self._carry = b""
-        for line in lines:
-            try:
-                self._message(line)
-            except (ValueError, IndexError):
-                self.broken += 1
-
-    def _message(self, line: bytes) -> None:
-        name = line[: line.find(b" ")]
-        sensor = _sensor_of(name)
-        if not sensor:
-            return
-        stamp = stamp_of(line.rsplit(None, 3)[1:])
-        self.first, self.last = min(self.first, stamp), max(self.last, stamp)
-        self.sensors.setdefault(sensor, Sensor()).received(stamp)
-        if sensor == "radio":
-            anchor = line.split(None, 2)[1].decode("utf-8", "replace")
-            if anchor in self.anchors or len(self.anchors) < _MOST_ANCHORS:
-                self.anchors.setdefault(anchor, Sensor()).received(stamp)
-        elif sensor == "odometry":
-            self._pose(stamp, numbers(line.split(None, 4)[1:4], "odometry", 3))
+        for measured in self._reader.feed(data):
+            stamp, name = measured.stamp, "radio" if measured.sensor == "uwb" else measured.sensor
+            self.first, self.last = min(self.first, stamp), max(self.last, stamp)
+            self.sensors.setdefault(name, Sensor()).received(stamp)
+            if name == "odometry":
+                self._pose(stamp, measured.value.tolist())
+            elif measured.anchor_id in self.anchors or (measured.anchor_id and len(self.anchors) < _MOST_ANCHORS):
+                self.anchors.setdefault(measured.anchor_id, Sensor()).received(stamp)
+        self.broken = self._reader.broken
 
     def _pose(self, stamp: float, pose: list[float]) -> None:
         kept, self._latest = self._odometry, (stamp, *pose)
         if len(kept) < 4 * _MOST_POSES and (not kept or stamp >= kept[-4] + _ODOMETRY_STEP):
             kept.extend((stamp, *pose))
-
-
-def _sensor_of(name: bytes) -> str:
-    """Return which sensor a message is of; "" of none."""
-    if name[:3] == b"UWB" and (len(name) == 3 or name[3:].isdigit()):
-        return "radio"
-    return "lidar" if name in RANK else {b"ODOM": "odometry", b"GYRO": "gyro"}.get(name, "")

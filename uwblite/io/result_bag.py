@@ -10,8 +10,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..errors import ConfigError
-from ..report import palette
-from ..report.palette import share
+from ..report import canvas
+from ..report.canvas import share
 from ..sensor_log import SensorLog
 from . import ros_messages as ros
 from .rosbag_writer import TF, Stamped, recording_messages, write_messages
@@ -21,7 +21,7 @@ _MOST_POSES = 10_000
 """Of a path; more are thinned out evenly."""
 _LINES, _SPHERE, _CYLINDER, _TEXT = 5, 2, 3, 9
 """Types of visualization_msgs/Marker."""
-_ANCHOR, _ACCEPTED, _REJECTED = share(palette.ANCHOR), share(palette.ACCEPTED), share(palette.REJECTED, 0.5)
+_ANCHOR, _ACCEPTED, _REJECTED = share(canvas.ANCHOR), share(canvas.ACCEPTED), share(canvas.REJECTED, 0.5)
 
 
 def write_result_bag(

@@ -20,7 +20,7 @@ from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..problem.solution import rough, with_nonnegative_heights
-from ..radio.tag_pattern import without_pattern
+from ..radio.range_errors import without_pattern
 from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes

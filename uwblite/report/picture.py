@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ..arrays import Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
-from .canvas import Canvas, Colour
-from .palette import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START
+from .canvas import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START, Canvas, Colour
 from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
 
 Image = NDArray[np.uint8]
