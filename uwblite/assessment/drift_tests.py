@@ -153,14 +153,16 @@ def _judge(found: TurnScale, used: float, task: Task) -> Iterator[Finding]:
             f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no calibration "
             "changes so; the map's heading is wrong, or the odometry failed",
             stretches=found.stretches.tolist(),
-        )  # fmt: skip
+        )
     elif abs(used - found.value) > _WRONG and found.contradicts(used):
         yield doubt(
             "turn-scale",
             f"the map multiplies the odometry's turns by {1.0 + used:.2f}, but from step to step the lidar turns "
             f"{shown(found.value, found.sigma)} times as much: a turn of the map or a loop closure is wrong",
-            by_steps=found.value, sigma=found.sigma, by_all=used,
-        )  # fmt: skip
+            by_steps=found.value,
+            sigma=found.sigma,
+            by_all=used,
+        )
 
 
 _WRONG = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..findings import NOTE, WARNING, Finding
-from ..screening.units import heading_agreement
+from ..screening.units import CLEARLY, heading_agreement, heading_reading
 from ..sensor_log import Odometry
 
 _FINEST = 1e-6
@@ -74,8 +74,6 @@ STRAIGHT = 0.02
 """Width of the path by its length below which the two sides of it cannot be distinguished."""
 _SLOWEST = 5.0
 """Hz; ranges and rays between two readings that are farther apart are placed badly at usual speeds."""
-_ACROSS, _CLEARLY = 0.7, 0.2
-"""Agreement of heading and motion below which a robot moves across its heading, and by which a unit or a sign explains it."""
 
 
 def odometry_figures(odometry: Odometry) -> dict[str, Any]:
@@ -106,10 +104,9 @@ def check_odometry(odometry: Odometry, figures: dict[str, Any]) -> Iterator[Find
 
 def check_motion_along_heading(odometry: Odometry) -> Iterator[Finding]:
     """Warn of a robot that moves across its heading, where neither another sign nor another unit explains that."""
-    plain, varied = heading_agreement(odometry)
-    others = (heading_agreement(odometry, -1.0)[0], heading_agreement(odometry, np.pi / 180.0)[0])
-    if varied and plain < _ACROSS and max(others) < plain + _CLEARLY:
-        text = f"the robot often moves across its heading (agreement {plain:.2f} of 1)"
+    reading = heading_reading(odometry)
+    if not reading.sound and max(reading.mirrored, reading.degrees) < reading.plain + CLEARLY:
+        text = f"the robot often moves across its heading (agreement {reading.plain:.2f} of 1)"
         cure = "right for an omnidirectional base; otherwise check the heading's unit and sign, and the axes"
         yield Finding("moves-across-heading", WARNING, text, cure, "odometry")
 

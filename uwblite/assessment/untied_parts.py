@@ -50,8 +50,9 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
                 f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors "
                 "connect the parts before and after: each may be right, but their relative pose rests on the odometry alone; "
                 "drive through the first part once more, or map the parts separately",
-                start=before, end=after,
-            )  # fmt: skip
+                start=before,
+                end=after,
+            )
 
 
 def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> Iterator[Finding]:
@@ -79,8 +80,10 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
                     f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
                     f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "
                     "why no sensor measured there",
-                    at=float(frames.stamps[at]), way=float(lengths.sum()), error=off,
-                )  # fmt: skip
+                    at=float(frames.stamps[at]),
+                    way=float(lengths.sum()),
+                    error=off,
+                )
                 ends_at = sorted((float(frames.stamps[at]), float(frames.stamps[0 if word == "until" else -1])))
                 edge = "start" if word == "until" else "end"
                 cure = f"`{edge}={seconds:.0f}` leaves that part out"
@@ -195,8 +198,9 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]
                 f"{recording.name} has {int(same.sum())} anchors where the others have them and {len(moved)} elsewhere "
                 f"({', '.join(moved.tolist())}), and no loop closure with them: it may lie elsewhere, or be of another place; "
                 "record where both were, or map it alone",
-                recording=n + 1, moved=moved.tolist(),
-            )  # fmt: skip
+                recording=n + 1,
+                moved=moved.tolist(),
+            )
 
 
 _HEARD = 3

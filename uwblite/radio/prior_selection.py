@@ -251,8 +251,9 @@ def _with_priors(graph: Graph, which: Ints, about: Floats, sigma: Floats) -> Gra
             own = np.isin(e.index, which)[:, None]
             root = (1.0 / sigma[e.index])[:, None, None]
             e = replace(
-                e, value=np.where(own, about[e.index][:, None], e.value),
+                e,
+                value=np.where(own, about[e.index][:, None], e.value),
                 sqrt_information=np.where(own[:, None], root, e.sqrt_information),
-            )  # fmt: skip
+            )
         edges.append(e)
     return replace(graph, edges=tuple(edges))

@@ -85,10 +85,15 @@ figure{margin:.6rem 0}figcaption{font-weight:600}
 def coloured(style: str) -> str:
     """Return a style with the palette's colours in place of their names, such as @path@ and @path-dark@."""
     names = {
-        "path": canvas.PATH, "doubted": canvas.DOUBTED,
-        "accepted": canvas.ACCEPTED, "rejected": canvas.REJECTED, "anchor": canvas.ANCHOR,
-        "start": canvas.START, "nlos": canvas.NLOS, **{f"path{k}": c for k, c in enumerate(canvas.PATHS)},
-    }  # fmt: skip
+        "path": canvas.PATH,
+        "doubted": canvas.DOUBTED,
+        "accepted": canvas.ACCEPTED,
+        "rejected": canvas.REJECTED,
+        "anchor": canvas.ANCHOR,
+        "start": canvas.START,
+        "nlos": canvas.NLOS,
+        **{f"path{k}": c for k, c in enumerate(canvas.PATHS)},
+    }
     for name, colour in names.items():
         style = style.replace(f"@{name}@", hexadecimal(colour)).replace(f"@{name}-dark@", hexadecimal(colour, dark=True))
     return style

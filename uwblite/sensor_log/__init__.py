@@ -9,7 +9,24 @@ from .sensors import LONGEST_RANGE, SHORTEST_RANGE, Gyro, LaserScans, Odometry, 
 from .stamps import in_bursts, odometry_in_bursts, stand_still
 
 __all__ = [
-    "LONGEST_RANGE", "MOST_ANCHORS", "MOST_METRES", "MOST_SECONDS", "SHORTEST_RANGE", "Gyro", "LaserScans", "LogNotes",
-    "Odometry", "OdometryBreaks", "Screening", "SensorLog", "SensorMounting", "UwbRanges", "fault_of_id", "in_bursts",
-    "odometry_in_bursts", "one_word", "plausible", "stand_still",
-]  # fmt: skip
+    "LONGEST_RANGE",
+    "MOST_ANCHORS",
+    "MOST_METRES",
+    "MOST_SECONDS",
+    "SHORTEST_RANGE",
+    "Gyro",
+    "LaserScans",
+    "LogNotes",
+    "Odometry",
+    "OdometryBreaks",
+    "Screening",
+    "SensorLog",
+    "SensorMounting",
+    "UwbRanges",
+    "fault_of_id",
+    "in_bursts",
+    "odometry_in_bursts",
+    "one_word",
+    "plausible",
+    "stand_still",
+]
