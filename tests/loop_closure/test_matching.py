@@ -46,7 +46,7 @@ def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypat
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
     monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[3]), 13.7))
     for candidates, net in ((stretches, 13.7), (replace(stretches, long=False), np.inf)):
-        found = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
+        found, _ = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
         assert found.net.tolist() == [net, net]
         np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
         assert found.found.all()
