@@ -120,6 +120,8 @@ class StageSummary:
     """Wall time; filled in by the caller's clock, 0 where no clock was given."""
     figures: dict[str, Any] = field(default_factory=dict)
     """Named counts and figures (JSON-ready)."""
+    work: dict[str, int] = field(default_factory=dict)
+    """Operations counted by kind, see work.KINDS; the same on every computer."""
 
 
 @documented

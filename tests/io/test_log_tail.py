@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwblite.drivers.log_file import LogFile
-from uwblite.io.log_tail import LogTail
+from uwblite.io.carmen_live import LogTail
 from uwblite.server.live import watch_status
 
 

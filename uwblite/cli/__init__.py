@@ -11,6 +11,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, NoReturn
@@ -191,9 +192,8 @@ def _carry_out(name: str, args: argparse.Namespace, interrupted: list[int]) -> i
             if not args.debug:
                 # numpy's remarks on overflows say nothing to a user; what comes of them is in a message of ours.
                 warnings.simplefilter("ignore", RuntimeWarning)
-            if VERBS[name].matrices:
-                memory.load_libraries()
-            return int(import_module(f".{name.replace('-', '_')}", __name__).run(args))
+            with memory.within_limits() if VERBS[name].matrices else nullcontext():
+                return int(import_module(f".{name.replace('-', '_')}", __name__).run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
     except Exception as error:
@@ -210,8 +210,7 @@ def failure(error: BaseException) -> tuple[int, str]:
     # A library that does not fit is an ImportError; one that is absent is a ModuleNotFoundError.
     unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
     if isinstance(error, MemoryError) or unfit:
-        limited = f"; the shell allows {size / 1e6:.0f} MB (ulimit -v)" if (size := memory.address_space()) else ""
-        return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY}{limited}"
+        return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY + memory.allowed()}"
     if isinstance(error, OSError):
         return 1, console.os_error_text(error)
     if isinstance(error, ImportError):

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         os.makedirs(args.out, exist_ok=True)
         rows = _rows(args, tasks)
     if args.json:
-        console.say_json({"out": args.out, "recordings": [_fields(row) for row in rows], "exit_code": _exit_code(rows)})
+        console.say_json({"out": args.out, "recordings": [asdict(row) for row in rows], "exit_code": _exit_code(rows)})
     else:
         console.say(f"the table: {os.path.join(args.out, 'batch.html')} and {os.path.join(args.out, 'batch.csv')}")
     return _exit_code(rows)
@@ -72,19 +72,14 @@ def folder_names(logs: Sequence[str]) -> list[str]:
     ------
     ConfigError : two recordings are alike in both.
     """
-    short = [_stem(log) for log in logs]
-    parents = [os.path.basename(os.path.dirname(os.path.abspath(log))) for log in logs]
+    paths = [os.path.abspath(log).removesuffix(".gz") for log in logs]
+    short = [os.path.splitext(os.path.basename(path))[0] or os.path.basename(path) for path in paths]
+    parents = [os.path.basename(os.path.dirname(path)) for path in paths]
     names = [f"{parent}_{name}" if short.count(name) > 1 else name for name, parent in zip(short, parents, strict=True)]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise ConfigError(f"{logs[names.index(name)]} and {logs[k]} would both go to the folder {name}; rename one of them")
     return names
-
-
-def _stem(log: str) -> str:
-    """Return the name of a recording without .gz and what names its format."""
-    name = os.path.basename(os.path.abspath(log)).removesuffix(".gz")
-    return os.path.splitext(name)[0] or name
 
 
 def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> list[BatchRow]:
@@ -112,15 +107,11 @@ def is_finished(task: argparse.Namespace) -> bool:
     config = settings(task)
     return (
         report.get("command") == repeat_command(task, config)
-        and report.get("config_sha256") == _hash_of_settings(config)
+        and report.get("config_sha256") == hashlib.sha256(config_text(config).encode()).hexdigest()
         and report.get("given") == given_files(task)
         and report.get("versions") == versions()
         and [entry.get("sha256") for entry in report.get("inputs", ())] == [sha256_of(task.logs[0])]
     )
-
-
-def _hash_of_settings(config: Any) -> str:
-    return hashlib.sha256(config_text(config).encode()).hexdigest()
 
 
 def _report(folder: str) -> dict[str, Any]:
@@ -202,10 +193,6 @@ def _write_table(out: str, rows: dict[int, BatchRow]) -> None:
     ordered = [rows[k] for k in sorted(rows)]
     write_text(Path(out) / "batch.csv", table_csv(ordered))
     write_text(Path(out) / "batch.html", table_html(ordered, os.path.basename(os.path.abspath(out))))
-
-
-def _fields(row: BatchRow) -> dict[str, Any]:
-    return asdict(row)
 
 
 def _exit_code(rows: Sequence[BatchRow]) -> int:

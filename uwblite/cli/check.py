@@ -80,7 +80,9 @@ def report_lines(name: str, diagnosis: Diagnosis, cost: dict[str, float], *, map
         lines += [f"         explains {other.severity}: {other.text}" for other in explains]
     if not diagnosis.findings:
         lines.append("nothing to complain about")
-    lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
+    lines += ["", *_anchor_lines(diagnosis.figures)]
+    values = diagnosis.figures.get("radio calibration", {}).items()
+    lines += [calibration_text(name, **value) for name, value in values if "value" in value and ":" not in name]
     if cost:
         grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
         lines.append(f"expected cost: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
@@ -132,8 +134,3 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
     if coverage := figures.get("uwb", {}).get("coverage"):
         lines.append("anchors in reach: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
     return lines
-
-
-def _calibration_lines(figures: dict[str, Any]) -> list[str]:
-    values = {k: v for k, v in figures.get("radio calibration", {}).items() if "value" in v and ":" not in k}
-    return [calibration_text(name, **value) for name, value in values.items()]

@@ -13,7 +13,7 @@ from ..errors import ConfigError
 from ..io.carmen import write_log
 from ..io.corrected_log import write_graph_with_scans
 from ..io.csv_folder import write_csv_folder
-from ..io.nav2_bundle import FILES, write_nav2_bundle
+from ..io.ros_results import FILES, write_nav2_bundle
 from ..io.stored_result import read_result
 from ..io.tum import read_tum, write_trajectory
 from ..sensor_log import Odometry, SensorLog
@@ -76,15 +76,14 @@ def _convert_graph(args: argparse.Namespace) -> int:
     graph_format(args.target)
     refuse_existing(args.force, args.target)
     file = read_graph(args.source)
-    for warning in file.warnings:
-        console.note(f"uwblite: {args.source}: {warning}")
+    console.note_of(args.source, file.warnings)
     write_graph(args.target, file)
     skipped = {f"{name} skipped": count for name, count in file.skipped.items()}
     return _say(args, {"poses": len(file.graph.poses), "landmarks": len(file.graph.anchors), **skipped}, warnings=file.warnings)
 
 
 def _convert_map(args: argparse.Namespace, to: str) -> int:
-    from ..io.result_bag import write_result_bag
+    from ..io.ros_results import write_result_bag
 
     if to not in ("mcap", "sqlite3", "g2o", "tum", "kitti", "nav2"):
         raise ConfigError(f"{args.target}: not a format for a map; use --to nav2, mcap, sqlite3, g2o, tum or kitti")
@@ -152,8 +151,7 @@ def _convert_recording(args: argparse.Namespace, to: str) -> int:
     refuse_existing(args.force, args.target)
     log = _scaled(recording(args, args.source), args)
     log = _cropped(log, args.start, args.end)
-    for warning in log.notes.warnings:
-        console.note(f"uwblite: {args.source}: {warning}")
+    console.note_of(args.source, log.notes.warnings)
     _write(args, to, log)
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     scans = 0 if log.scans is None else len(log.scans.stamps)

@@ -1,13 +1,17 @@
 """What `uwblite map` will cost, by the size of a recording."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats
-from ..pipeline.mapping_config import MappingConfig
+from ..grid.occupancy_grid import GridConfig
 from ..sensor_log import SensorLog
+
+if TYPE_CHECKING:
+    from ..pipeline.mapping_config import MappingConfig
 
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
@@ -57,12 +61,12 @@ def seen_size(log: SensorLog) -> Floats:
     return np.asarray(np.ptp(np.concatenate(points), axis=0))
 
 
-def expected_cost(log: SensorLog, config: MappingConfig | None = None) -> dict[str, float]:
+def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict[str, float]:
     """Return the time and memory that the map of a screened recording is expected to need, and the size of the map.
 
     The time is that on the computer of docs/performance.md; a Raspberry Pi 4 takes several times as long.
     """
-    grid = (config or MappingConfig()).grid
+    grid = GridConfig() if config is None else config.grid
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)

@@ -3,7 +3,7 @@
 import argparse
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 from ..errors import ConfigError, UsageError
@@ -11,7 +11,7 @@ from ..io.files import write_text
 from ..io.folders import replacing_folder
 from ..io.png import write_png
 from ..io.result_text import covariance_csv, json_lines, notices
-from ..io.stored_result import StoredResult, read_result
+from ..io.stored_result import read_result
 from ..io.tum import write_tum
 from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
@@ -37,14 +37,12 @@ def run(args: argparse.Namespace) -> int:
     tell_doubts(earlier)
     known = from_result(earlier)
     log = recording(args, args.log).without(uwb=not config.use_uwb, lidar=not config.use_lidar)
-    progress = console.Progress()
-    try:
+    with closing(console.Progress()) as progress:
         found = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
-    finally:
-        progress.close()
     summary = _summary(found, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
-    picture = _picture(found, earlier, os.path.basename(args.log)) if "picture" in files else None
+    anchors, caption = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors], os.path.basename(args.log)
+    picture = draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, found, picture, json_lines(about | summary))
     if args.json:
@@ -94,11 +92,6 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
     names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
     own = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
     return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
-
-
-def _picture(found: Localization, earlier: StoredResult, caption: str) -> Any:
-    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors]
-    return draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption)
 
 
 def _summary(found: Localization, files: list[str]) -> dict[str, Any]:

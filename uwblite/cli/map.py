@@ -4,6 +4,7 @@ import argparse
 import os
 import shlex
 import time
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,11 @@ def _read(args: argparse.Namespace) -> list[SensorLog]:
     """Return the recordings of the command line; what is wrong with their files is said."""
     with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
         logs = read_logs(args, executor)
-    _report_reader_warnings(logs)
+    for notes in (log.notes for log in logs):
+        if notes.broken:
+            number, why = notes.broken_lines[0]
+            console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
+        console.note_of(notes.source, notes.warnings)
     return logs
 
 
@@ -88,20 +93,8 @@ def _make_shown(args: argparse.Namespace, logs: list[SensorLog], reading: float)
             console.note(f"uwblite: {stage}")
         progress(stage, done, total, overall.take(stage, done, total))
 
-    try:
-        with workers(args.jobs, args.scheduler) as executor:
-            return make(args, logs, reading, report, executor, console.note)
-    finally:
-        progress.close()
-
-
-def _report_reader_warnings(logs: list[SensorLog]) -> None:
-    for notes in (log.notes for log in logs):
-        if notes.broken:
-            number, why = notes.broken_lines[0]
-            console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
-        for warning in notes.warnings:
-            console.note(f"uwblite: {notes.source}: {warning}")
+    with closing(progress), workers(args.jobs, args.scheduler) as executor:
+        return make(args, logs, reading, report, executor, console.note)
 
 
 def _dry_run(args: argparse.Namespace) -> int:

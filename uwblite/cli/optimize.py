@@ -2,7 +2,9 @@
 
 import argparse
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -31,15 +33,11 @@ def run(args: argparse.Namespace) -> int:
     file = read_graph(args.graph, from_odometry=args.from_odometry or args.incremental)
     if args.incremental and (count := len(set(file.chains.tolist()))) > 1:
         raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
-    for warning in file.warnings:
-        console.note(f"uwblite: {args.graph}: {warning}")
+    console.note_of(args.graph, file.warnings)
     file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
-    progress = console.Progress()
-    try:
+    with closing(console.Progress()) as progress:
         search = _Search(args, config, lambda done, most: progress("optimising", done, most), _allowed(args, file.graph))
         best, known = _best(search, file, args)
-    finally:
-        progress.close()
     solved_file = dataclasses.replace(file, graph=best.start.placed(best.graph))
     if args.out:
         write_graph(args.out, solved_file)
@@ -118,16 +116,14 @@ class _Search:
             return self._without_outliers(start)
         if self.args.incremental:
             return _Solution(*optimize_incrementally(start.graph, self.config, self.progress, self.left), {}, start)
-
         return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
 
     def _without_outliers(self, start: Start) -> "_Solution":
         graph = start.graph
         solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), self.config, self.progress, self.left)
-        outliers: dict[str, int] = {}
+        outliers = Counter[str]()
         for k, weight in weights.items():
-            name = type(graph.edges[k]).__name__
-            outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
+            outliers[type(graph.edges[k]).__name__] += int((weight == 0.0).sum())
         # The file keeps every edge; which ones were left out is not a property of the measurements.
         return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
 
@@ -141,25 +137,22 @@ class _Search:
 
 
 def _figures(file: GraphFile, summary: SolverSummary, lost: list[str]) -> dict[str, Any]:
-    edges: dict[str, int] = {}
+    edges = Counter[str]()
     for kind in file.graph.edges:
-        edges[type(kind).__name__] = edges.get(type(kind).__name__, 0) + len(kind)
+        edges[type(kind).__name__] += len(kind)
     return {
         "poses": len(file.graph.poses),
         "anchors": len(file.graph.anchors),
         "edges": edges,
         "skipped": file.skipped,
-        "chi2_initial": summary.chi2_initial,
-        "chi2": summary.chi2,
-        "dof": summary.dof,
-        "chi2_per_dof": summary.chi2_per_dof,
-        "iterations": summary.iterations,
-        "converged": summary.converged,
-        "reason": summary.reason,
+        **{name: getattr(summary, name) for name in _OF_SUMMARY},
         "chains": len(set(file.chains.tolist())),
         "unplaced_anchors": lost,
         "exit_code": 0 if summary.converged else 3,
     }
+
+
+_OF_SUMMARY = ("chi2_initial", "chi2", "dof", "chi2_per_dof", "iterations", "converged", "reason")
 
 
 def _closures(graph: Graph, names: tuple[str, ...]) -> dict[str, Any]:

@@ -50,8 +50,7 @@ def _read(folder: str) -> tuple[OccupancyGrid, tuple[StoredAnchor, ...]]:
     if not os.path.isdir(folder):
         warnings = list[str]()
         grid = read_map(folder, warnings)
-        for warning in warnings:
-            console.note(f"uwblite: {folder}: {warning}")
+        console.note_of(folder, warnings)
         return grid, ()
     result = read_result(folder)
     if result.grid is None:

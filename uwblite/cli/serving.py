@@ -18,7 +18,8 @@ def serving(page: LivePage, host: str, port: int) -> Iterator[str]:
     ------
     OSError : the port is taken, or the address is none of this computer's.
     """
-    server = server_for(page, port, host, _own_names())
+    name = socket.gethostname()
+    server = server_for(page, port, host, (name, f"{name}.local") if name else ())
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True)
     thread.start()
     try:
@@ -27,12 +28,6 @@ def serving(page: LivePage, host: str, port: int) -> Iterator[str]:
         page.feed.close()
         server.shutdown()
         server.server_close()
-
-
-def _own_names() -> tuple[str, ...]:
-    """Return the names under which other computers may know this one."""
-    name = socket.gethostname()
-    return (name, f"{name}.local") if name else ()
 
 
 def _address(listening: str) -> str:

@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 
 from ..errors import ConfigError, UwbliteError
-from ..io.log_tail import LogTail
+from ..io.carmen_live import LogTail
 from ..io.results import check_target
 from ..io.stored_result import StoredResult, read_result
 from ..server.live import LivePage, watch_status
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
             with suppress(OSError, AttributeError):
                 os.nice(_OWN_NICENESS)
             with suppress(ValueError):  # not the main thread: signals are somebody else's
-                signal.signal(signal.SIGTERM, _interrupt)
+                signal.signal(signal.SIGTERM, signal.default_int_handler)
             console.say(f"open {address} in a browser; Ctrl-C ends it")
             console.note(f"uwblite: the latest map is in {folder}")
             console.flush()
@@ -48,10 +48,6 @@ def run(args: argparse.Namespace) -> int:
         finally:
             watch.close()
     return 0
-
-
-def _interrupt(_number: int, _frame: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _folder(args: argparse.Namespace) -> str:

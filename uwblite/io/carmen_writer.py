@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..sensor_log import LaserScans, SensorLog
-from .carmen_params import LASER_IS_BASE
+from .carmen_words import LASER_IS_BASE
 from .files import replacing
 
 HOST = "uwblite"
@@ -23,14 +23,6 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
     Stamps are written to the microsecond, odometry to the micrometre and microradian, UWB ranges to 0.1 mm and laser
     readings to the millimetre. An invalid reading is written as 0, "saw nothing" as the maximum range. Messages stand
     in time order; at equal stamps odometry comes first and the laser last.
-
-    Parameters
-    ----------
-    path : the file; replaced only when the new one is complete.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
     """
     with replacing(path) as stream:
         stream.write(b"# CARMEN Logfile\n")
