@@ -18,8 +18,8 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "arrays", "findings"),
-    ("validation", "field_docs"),
+    ("errors", "findings", "work"),
+    ("arrays",),
     ("se2", "config", "clocks"),
     ("sensor_log", "graph", "drivers"),
     ("problem",),
@@ -279,7 +279,7 @@ def vendored(tmp_path_factory):
 USE = """
 from acme._x import uwblite
 from acme._x.uwblite.cli import main
-from acme._x.uwblite.field_docs import field_docs
+from acme._x.uwblite.config import field_docs
 from acme._x.uwblite.odometry.keyframes import KeyframeConfig
 assert field_docs(KeyframeConfig)["distance"]
 assert not [m for m in sys.modules if m.split(".")[0] == "uwblite"]

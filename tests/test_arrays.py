@@ -1,14 +1,21 @@
 """Robust spreads: laws of the median absolute deviation, and normal errors with outliers."""
 
-from dataclasses import dataclass
+import inspect
+import sys
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
 
+from uwblite import SensorLog, build_map
 from uwblite.arrays import (
     MAD_TO_SIGMA,
+    array_fields,
+    as_array,
     concatenated,
     renumbered,
+    require_index,
+    require_shape,
     rms_length,
     row_medians,
     runs_of,
@@ -17,6 +24,14 @@ from uwblite.arrays import (
     spread_about_median,
     unique_rows,
 )
+from uwblite.errors import DataError, SolverError
+from uwblite.graph import distance_edges, graph, point_edges, pose_edges, range_edges
+from uwblite.graph.distance_edges import AnchorDistanceEdges
+from uwblite.graph.graph import Calibration, EdgeTable, Graph, PriorEdges, UnknownKey
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.solver import optimize
+from uwblite.lidar.point_to_point import align
+from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorMounting, UwbRanges
 
 
 def test_the_factor_is_that_of_normal_errors():
@@ -92,3 +107,167 @@ def test_dataclasses_of_arrays_are_concatenated_field_by_field():
     whole = concatenated(parts)
     assert whole.inner.rows.tolist() == [[1, 1], [2, 2], [2, 2]]
     assert whole.flags.tolist() == [False, True, True]
+
+
+KINDS = [
+    cls for module in (graph, pose_edges, range_edges, point_edges, distance_edges)
+    for _, cls in inspect.getmembers(sys.modules[module.__name__], inspect.isclass)
+    if issubclass(cls, EdgeTable) and cls is not EdgeTable and cls.__module__ == module.__name__
+]  # fmt: skip
+
+
+def table(cls, edges=2):
+    """Return edges of a kind, all zero."""
+    if cls is PriorEdges:
+        return PriorEdges("poses", np.zeros(edges, dtype=np.int64), np.zeros((edges, 3)), np.zeros((edges, 3, 3)))
+    arrays = {}
+    for name, (kind, _, may_be_empty) in array_fields(cls).items():
+        row = cls.ROWS.get(name, ())
+        if name != "weights" and not may_be_empty:
+            arrays[name] = np.zeros(row if name in cls.SHARED else (edges, *row), dtype=kind)
+    return cls(**arrays)
+
+
+def test_every_kind_of_edges_is_tested():
+    assert len(KINDS) == 8
+    assert all(len(table(cls, 3)) == 3 for cls in KINDS)
+
+
+@pytest.mark.parametrize("cls", KINDS, ids=lambda c: c.__name__)
+def test_every_array_of_every_kind_of_edges_is_checked(cls):
+    """A row too many, an axis too many, text; numbers that are not whole for indices; the message has class and field."""
+    good = table(cls)
+    for name, (kind, _, _) in array_fields(cls).items():
+        values = getattr(good, name)
+        if values is None or not len(values):
+            values = np.zeros(2)
+        bad = [values[None], np.full(values.shape, "x"), *([values + 0.5] if issubclass(kind, np.integer) else [])]
+        for wrong in bad:
+            with pytest.raises(DataError, match=rf"^{cls.__name__}.*\b{name} (has shape|must hold)"):
+                replace(good, **{name: wrong})
+        with pytest.raises(DataError, match=rf"^{cls.__name__}.* has shape .*(e = \d as of {cls.__name__}|expected \(\d)"):
+            replace(good, **{name: np.concatenate([values, values[:1]])})
+
+
+@pytest.mark.parametrize("cls", KINDS, ids=lambda c: c.__name__)
+def test_indices_outside_the_graph_are_refused(cls):
+    unknowns = Graph(np.zeros((2, 3)), np.zeros((2, 2)), calibration=Calibration((UnknownKey("range_scale"),), np.zeros(1)))
+    good = table(cls)
+    unknowns.with_edges(good)
+    for name in cls.UNKNOWNS:
+        for wrong in (-2, 2):
+            index = getattr(good, name).copy()
+            index.flat[-1] = wrong
+            with pytest.raises(DataError, match=rf"{cls.__name__}.*{name}\[\d\] = {wrong} is no index of \d (poses|anch|cal)"):
+                unknowns.with_edges(replace(good, **{name: index}))
+
+
+def test_lists_and_whole_numbers_are_taken_like_arrays():
+    edges = RelativePoseEdges([0, 1], [1, 2], [[1, 0, 0], [1, 0, 0]], [np.eye(3)] * 2)
+    solved, summary = optimize(Graph([[0, 0, 0], [2, 0, 0], [3, 1, 0]], edges=[edges]))
+    assert summary.converged
+    np.testing.assert_allclose(solved.poses, [[0, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-9)
+    scans = LaserScans([0, 1], [[1, 2, np.inf], [2, 1, np.nan]], 0, 1, 0, 0, 9)
+    assert scans.ranges.dtype == np.float32
+    log = SensorLog(
+        Odometry([0, 1], [[0, 0, 0], [1, 0, 0]]), UwbRanges([0, 1], [0, 0], [1, 2], [100, 100], ["A"]), scans,
+        SensorMounting([0.1, 0, 0], tag_position=[0, 0, 1], more_tags=[]), gyro=Gyro([0, 1], [0, 0]),
+    )  # fmt: skip
+    assert log.ranges.anchor_ids == ("A",)
+    assert log.mounting.tags.shape == (1, 3)
+    assert {log.odometry.poses.dtype, log.ranges.ranges.dtype, log.gyro.heading.dtype} == {np.dtype(np.float64)}
+
+
+ODOMETRY = Odometry(np.arange(2.0), np.zeros((2, 3)))
+SCANS = LaserScans(np.arange(2.0), np.ones((2, 4), dtype=np.float32), 0.0, 0.1, 0.0, 0.0, 9.0)
+RANGES = UwbRanges(np.arange(2.0), np.zeros(2, dtype=np.int64), np.ones(2), np.ones(2), ("A", "B"))
+
+
+@pytest.mark.parametrize(("make", "words"), [
+    (lambda: SensorLog("run.log"), "odometry must be a Odometry, not str 'run.log'"),
+    (lambda: SensorLog(None), "odometry must be a Odometry, not NoneType"),
+    (lambda: SensorLog(ODOMETRY, SCANS), "ranges must be a UwbRanges, not LaserScans"),
+    (lambda: SensorLog(ODOMETRY, mounting={}), "mounting must be a SensorMounting, not dict"),
+    (lambda: Odometry(np.zeros(2), np.zeros((2, 2))), r"odometry\.poses has shape \(2, 2\), expected \(n, 3\) with n = 2"),
+    (lambda: Odometry("now", np.zeros((1, 3))), "odometry.stamps must hold numbers, not str"),
+    (lambda: Odometry([[0], [0, 1]], []), "odometry.stamps is no array: "),
+    (lambda: Odometry([0], [[0, 0, None]]), "odometry.poses must hold numbers, not object such as 0"),
+    (lambda: UwbRanges([0.0], [0.0], [1.0], [1.0], ("A",)), "ranges.anchor must hold whole numbers, not float64 such as"),
+    (lambda: SensorLog(ODOMETRY, replace(RANGES, anchor=np.array([0, -1]))), r"anchor\[1\] = -1 is no index of 2 anchor_ids"),
+    (lambda: SensorLog(ODOMETRY, replace(RANGES, anchor_ids=("A", "A"))), "anchor_ids has 'A' twice"),
+    (lambda: SensorLog(ODOMETRY, replace(RANGES, anchor_ids=(1, 2))), r"anchor_ids\[0\] must be a str, not int 1"),
+    (lambda: SensorLog(ODOMETRY, replace(RANGES, tag=np.array([0, 1]))), r"tag\[1\] = 1 is no index of 1 tags of the mounting"),
+    (lambda: SensorLog(ODOMETRY, replace(RANGES, ranges=[1.0, np.inf])), r"ranges\.ranges\[1\] is not finite"),
+    (lambda: replace(SCANS, ranges=np.ones(4)), r"scans\.ranges has shape \(4,\), expected \(k, b\)"),
+    (lambda: SensorLog(ODOMETRY, scans=replace(SCANS, angle_min=np.nan)), "scans.angle_min is nan"),
+    (lambda: SensorLog(ODOMETRY, scans=replace(SCANS, range_max=None)), "scans.range_max must be a number, not NoneType"),
+    (lambda: SensorMounting(T_base_laser=np.zeros(2)), r"mounting\.T_base_laser has shape \(2,\), expected \(3,\)"),
+    (lambda: Graph(np.zeros((3, 2))), r"Graph\.poses has shape \(3, 2\), expected \(n, 3\)"),
+    (lambda: Graph(np.zeros((3, 3)), fixed_poses=np.ones(2, dtype=bool)), r"fixed_poses has shape \(2,\), expected \(n,\) w"),
+    (lambda: Graph(np.zeros((3, 3)), fixed_poses=[0, 1, 0]), "Graph.fixed_poses must hold True or False, not int"),
+    (lambda: Graph(np.zeros((3, 3)), edges=table(RelativePoseEdges)), "edges must be a tuple of tables of edges, not Relative"),
+    (lambda: Graph(np.zeros((3, 3)), edges=("x",)), r"Graph\.edges\[0\] is a str, which is no table of edges"),
+    (lambda: Graph(np.zeros((3, 3)), calibration=Calibration((), np.zeros(1))), "Calibration has 1 values for 0 keys"),
+    (lambda: optimize(Graph([[0, 0, 0], [np.nan, 0, 0]], edges=[table(RelativePoseEdges)])), r"not finite: poses\[1\]"),
+    (lambda: optimize(Graph(np.zeros((1, 3)), np.zeros((2, 2)), (AnchorDistanceEdges([0], [1], [1], [0]),))),
+     r"edge 0 of AnchorDistanceEdges .*its sigma is 0\.0"),
+    (lambda: optimize(Graph(np.zeros((2, 3)), edges=[RelativePoseEdges([0], [1], [[0, 0, np.nan]], [np.eye(3)])])),
+     r"edge 0 of RelativePoseEdges .*its T_i_j is \[0\.0, 0\.0, nan\]"),
+    (lambda: align(np.zeros((20, 3)), np.zeros((20, 2))), r"target has shape \(20, 3\), expected \(n, 2\)"),
+    (lambda: align(np.zeros((20, 2)), [[np.nan, 0]]), r"source\[0\] is not finite"),
+    (lambda: align(np.zeros((20, 2)), np.zeros((20, 2)), [0, 0]), r"T_target_source has shape \(2,\), expected \(3,\)"),
+    (lambda: build_map("run.log"), "logs must be a SensorLog, not str 'run.log'"),
+    (lambda: build_map([]), "logs is empty"),
+    (lambda: build_map([SensorLog(ODOMETRY), 3]), r"logs\[1\] must be a SensorLog, not int 3"),
+    (lambda: build_map(SensorLog(ODOMETRY), {}), "config must be a MappingConfig, not dict"),
+    (lambda: build_map(SensorLog(ODOMETRY), constraints=()), "constraints must be a Constraints, not tuple"),
+])  # fmt: skip
+def test_the_argument_that_is_wrong_is_named(make, words):
+    with pytest.raises((DataError, SolverError), match=words):
+        make()
+
+
+def test_icp_takes_points_as_lists():
+    corner = [[0.1 * k, 0.0] for k in range(30)] + [[0.0, 0.1 * k] for k in range(1, 30)]
+    found = align(corner, (np.array(corner) - [0.03, 0.02]).tolist())
+    assert found.converged
+    np.testing.assert_allclose(found.T_target_source, [0.03, 0.02, 0.0], atol=1e-6)
+
+
+def test_arrays_of_the_right_kind_are_not_copied():
+    values = np.zeros((4, 3))
+    assert as_array(values, "x") is values
+    assert as_array(np.zeros(2, dtype=np.int32), "x", np.int64).dtype == np.int32
+    assert Graph(values).poses is values
+
+
+def test_lengths_that_have_a_name_are_the_same_everywhere():
+    known = {}
+    require_shape(np.zeros((4, 2)), "one", ("n", 2), known)
+    assert known == {"n": (4, "one")}
+    with pytest.raises(DataError, match=r"other has shape \(5,\), expected \(n,\) with n = 4 as of one"):
+        require_shape(np.zeros(5), "other", ("n",), known)
+
+
+def test_an_index_into_nothing():
+    require_index(np.zeros(0, dtype=int), "i", 0, "poses")
+    with pytest.raises(DataError, match=r"i\[0\] = 0 is no index of 0 poses \(there are none\)"):
+        require_index(np.zeros(1, dtype=int), "i", 0, "poses")
+
+
+def test_arrays_are_found_by_their_annotations():
+    found = array_fields(UwbRanges)
+    assert set(found) == {f.name for f in fields(UwbRanges)} - {"anchor_ids"}
+    assert issubclass(found["anchor"][0], np.integer)
+    assert found["tag"][1]
+    assert not found["ranges"][1]
+
+
+def test_indices_wider_than_addresses_are_narrowed_where_they_fit():
+    """As random integers are on 32-bit machines, whose indices are int32 there."""
+    wide = np.array([0, 7], dtype=np.int64)
+    assert as_array(wide, "pose", np.int32).dtype == np.int32
+    assert as_array(wide, "pose", np.int64) is wide
+    assert as_array(wide.astype(np.int16), "pose", np.int32).dtype == np.int16
+    with pytest.raises(DataError, match="pose holds 8589934592, which does not fit into int32"):
+        as_array(wide + (1 << 33), "pose", np.int32)

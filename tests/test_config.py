@@ -1,15 +1,27 @@
 """Settings: round trips, strictness, names nearly right, documentation of fields."""
 
 import dataclasses
+import inspect
 import math
+import pydoc
 import re
+import subprocess
+import sys
+from dataclasses import dataclass, fields, replace
 
 import pytest
 from helpers.example_settings import Outer
 
-from uwblite.config import from_dict, leaves, merge, override, parse_toml, setting, to_dict
+import uwblite
+from uwblite.config import documented, field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict
 from uwblite.errors import ConfigError
+from uwblite.graph.graph import Graph
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.lidar.point_to_point import Registration
+from uwblite.localization import LocalizerState
+from uwblite.map_result import AnchorEstimate, MapResult
 from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
 
 def test_defaults_survive_dict():
@@ -144,3 +156,43 @@ def test_what_is_not_understood_is_shown_up_to_sixty_characters(length, shown):
     with pytest.raises(ConfigError) as error:
         from_dict(Reach, {"reach": length * "x"})
     assert str(error.value).endswith(f"not {shown}")
+
+
+CLASSES = [SensorLog, Odometry, UwbRanges, LaserScans, SensorMounting, MapResult, AnchorEstimate, Graph, RangeEdges,
+           Registration, LocalizerState, uwblite.MappingConfig]  # fmt: skip
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
+def test_the_docstring_lists_every_field_with_its_line(cls):
+    text = inspect.getdoc(cls)
+    below = text.split("Attributes\n----------\n")[1]
+    assert [line.split(" : ")[0] for line in below.splitlines()] == [f.name for f in fields(cls)]
+    for name, line in field_docs(cls).items():
+        if line and name in {f.name for f in fields(cls)}:
+            assert f"{name} : {line}" in below
+
+
+def test_help_of_the_package_states_shapes_and_units():
+    text = pydoc.render_doc(uwblite, renderer=pydoc.plaintext)
+    assert "trajectory : (n, 3) T_map_base at the stamps." in text
+    assert "keyframe_stamps : (k,) s." in text
+
+
+def test_a_class_whose_source_is_not_at_hand_keeps_its_docstring():
+    space = {"dataclass": dataclass, "documented": documented, "__name__": "elsewhere"}
+    sys.modules["elsewhere"] = type(sys)("elsewhere")
+    exec('@documented\n@dataclass(frozen=True, slots=True)\nclass Point:\n    """A point."""\n    x: float', space)
+    point = space["Point"](1.0)
+    assert space["Point"].__doc__ == "A point."
+    assert replace(point, x=2.0).x == 2.0
+    del sys.modules["elsewhere"]
+
+
+def test_nobody_reads_sources_while_importing():
+    code = (
+        "import inspect, sys\n"
+        "def refuse(*_): raise AssertionError('a source was read')\n"
+        "inspect.getsource = refuse\n"
+        "import uwblite.graph.range_edges, uwblite.sensor_log, uwblite.map_result\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

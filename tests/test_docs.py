@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from uwblite.cli import VERBS, main, module_of
+from uwblite.cli import VERBS, main
 from uwblite.config import leaves
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.io.uwb_mapping import parse_mappings
@@ -43,9 +43,8 @@ def parses(words):
     """Return whether the command line understands these words, without running them."""
     if words in (["--version"], ["--help"]):
         return True
-    module = module_of(words[0])
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
-    module.add_arguments(parser)
+    VERBS[words[0]].add_arguments(parser)
     for option in ("-q", "-v", "--debug"):
         parser.add_argument(option, action="store_true")
     try:
@@ -77,7 +76,7 @@ def test_every_setting_that_is_named_exists(document):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_examples_of_every_verb_are_understood(verb):
-    epilog = module_of(verb).EPILOG
+    epilog = VERBS[verb].epilog
     examples = [re.sub(r"\s\s+\S.*", "", line.strip()) for line in epilog.replace("\\\n", " ").splitlines()]
     examples = [re.sub(r"\s+", " ", line) for line in examples if line.startswith("uwblite ")]
     assert examples

@@ -43,7 +43,7 @@ from uwblite.assessment.recording import diagnose
 from uwblite.errors import UwbliteError
 from uwblite.findings import DOUBT, folded
 from uwblite.io.carmen import read_log
-from uwblite.io.carmen_words import time_order
+from uwblite.io.carmen_stamps import time_order
 from uwblite.map_result import AnchorEstimate, MapResult
 from uwblite.mapping import build_map
 from uwblite.sensor_log import Odometry, SensorLog, UwbRanges

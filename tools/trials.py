@@ -21,7 +21,7 @@ from simulation import logfile
 from simulation.recording import Recording, Settings, simulate
 
 from uwblite import se2
-from uwblite.cli.comparison import read_landmarks
+from uwblite.cli.evaluate import read_landmarks
 from uwblite.evaluation.map import LandmarkErrors, landmark_errors, landmark_errors_along
 from uwblite.evaluation.relations import Relations, evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory

@@ -8,9 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from .arrays import Bools, Floats, Ints
-from .config import setting
+from .config import documented, setting
 from .errors import ConfigError
-from .field_docs import documented
 
 
 @documented

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .arrays import Bools, Floats, Ints
-from .field_docs import documented
+from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
@@ -120,6 +120,8 @@ class StageSummary:
     """Wall time; filled in by the caller's clock, 0 where no clock was given."""
     figures: dict[str, Any] = field(default_factory=dict)
     """Named counts and figures (JSON-ready)."""
+    work: dict[str, int] = field(default_factory=dict)
+    """Operations counted by kind, see work.KINDS; the same on every computer."""
 
 
 @documented

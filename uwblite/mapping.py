@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .arrays import require_type
 from .assessment import summary
 from .constraints import Constraints
 from .errors import DataError
@@ -39,7 +40,6 @@ from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stage, Stages
 from .pipeline.recordings import check_distinct, gather
 from .sensor_log import SensorLog
-from .validation import require_type
 
 __all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
 

@@ -104,3 +104,30 @@ def test_a_path_that_is_moved_or_turned_as_a_whole_is_not_bent():
     assert _bent(places, turned) == pytest.approx(0.0, abs=1e-9)
     longer = 0.1 * (places - places.mean(axis=0))
     assert _bent(places, turned + longer) == pytest.approx(np.sqrt(np.mean(np.sum(longer**2, axis=1))), rel=1e-9)
+
+
+def with_steps(log, change):
+    """Return a recording whose odometry has other steps (n-1, 3)."""
+    poses = log.odometry.poses
+    return replace(log, odometry=Odometry(log.odometry.stamps, se2.chain(poses[0], change(se2.between(poses[:-1], poses[1:])))))
+
+
+def turned_from_half_way(steps):
+    way = np.hypot(*steps[:, :2].T) * (np.arange(len(steps)) >= len(steps) // 2)
+    return steps + np.column_stack([0.0 * way, 0.0 * way, 0.15 * way])
+
+
+def mirrored_from_half_way(steps):
+    return steps * np.where(np.arange(len(steps))[:, None] < len(steps) // 2, 1.0, [1.0, 1.0, -1.0])
+
+
+@pytest.mark.parametrize("change", [turned_from_half_way, mirrored_from_half_way])
+def test_a_change_of_the_wheels_half_way(sound, change):
+    assert drifts(with_steps(sound, change), "odometry-slips")
+
+
+def test_a_heading_that_drifts_throughout_is_calibrated(sound):
+    def drifting(steps):
+        return steps + 0.05 * np.hypot(*steps[:, :2].T)[:, None] * [0.0, 0.0, 1.0]
+
+    assert not build_map(with_steps(sound, drifting)).doubts

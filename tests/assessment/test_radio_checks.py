@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.assessment.odometry_figures import STRAIGHT
+from uwblite.assessment.odometry_figures import STRAIGHT, rhythm
 from uwblite.assessment.radio_figures import (
     FEW,
     _anchor_figures,
@@ -14,7 +14,6 @@ from uwblite.assessment.radio_figures import (
     calibration_figures,
     check_radio,
 )
-from uwblite.assessment.rhythm import rhythm
 from uwblite.graph.graph import UnknownKey
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate
 from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorLog, UwbRanges

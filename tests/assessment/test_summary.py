@@ -199,7 +199,7 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
     def anchor(status):
         return AnchorEstimate("A", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, status, "" if status == "ok" else "few")
 
-    anchors, part, whole = (anchor("ok"), anchor("unplaced")), doubt("no-anchor", ""), doubt("halves-disagree", "")
+    anchors, part, whole = (anchor("ok"), anchor("unplaced")), doubt("no-anchor", ""), doubt("drift", "")
     assert _distrusted(anchors, []) is anchors
     assert _distrusted(anchors, [part]) is anchors
     found = _distrusted(anchors, [part, whole])

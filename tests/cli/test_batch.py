@@ -15,8 +15,8 @@ import pytest
 from conftest import ROOT
 from helpers.results import contents
 
-from uwblite.cli import batch, console, main, memory
-from uwblite.cli.options import name_recordings_once
+from uwblite.cli import VERBS, batch, console, main, memory
+from uwblite.cli.inputs import name_recordings_once
 from uwblite.errors import ConfigError
 from uwblite.io.carmen import read_log, write_log
 
@@ -127,7 +127,7 @@ def batch_args(recordings, out, *more):
     import argparse
 
     parser = argparse.ArgumentParser()
-    batch.add_arguments(parser)
+    VERBS["batch"].add_arguments(parser)
     return parser.parse_args([*recordings, "--out", str(out), *more])
 
 

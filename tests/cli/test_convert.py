@@ -157,7 +157,7 @@ def test_json_is_one_object(tmp_path, room_log, target, capsys):
 def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):
     from helpers.results import small_folder
 
-    from uwblite.io.nav2_bundle import FILES
+    from uwblite.io.ros_results import FILES
 
     small_folder(tmp_path / "map")
     words = ["convert", str(tmp_path / "map"), str(tmp_path / "nav2"), "--to", "nav2"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwblite.cli import freed_memory, main
+from uwblite.cli import main, memory
 
 MEGABYTE = 1 << 20
 
@@ -16,10 +16,10 @@ def resident():
     return int(words[1]) * 4096 / MEGABYTE
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux") or freed_memory._trim() is None, reason="no glibc")
+@pytest.mark.skipif(not sys.platform.startswith("linux") or memory._trim() is None, reason="no glibc")
 def test_what_is_freed_between_living_arrays_goes_back():
     """4,000 arrays of 64 kB, the size of which the heap keeps; every second of them lives on."""
-    freed = freed_memory.FreedMemory()
+    freed = memory.FreedMemory()
     freed.give_back(over=True)
     arrays = [np.ones(8192) for _ in range(4000)]
     before = resident()
@@ -31,9 +31,9 @@ def test_what_is_freed_between_living_arrays_goes_back():
 
 def test_within_a_stage_it_is_given_back_only_where_the_process_has_grown(monkeypatch):
     trimmed, resident = [], iter([300, 200, 250, 263, 265, 210, 260])
-    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
-    monkeypatch.setattr(freed_memory, "_resident", lambda: next(resident) * MEGABYTE)
-    freed, counts = freed_memory.FreedMemory(), []
+    monkeypatch.setattr(memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(memory, "_resident", lambda: next(resident) * MEGABYTE)
+    freed, counts = memory.FreedMemory(), []
     for _ in range(5):
         freed.give_back(over=False)
         counts.append(len(trimmed))
@@ -42,23 +42,23 @@ def test_within_a_stage_it_is_given_back_only_where_the_process_has_grown(monkey
 
 def test_at_the_end_of_a_stage_it_is_given_back_in_any_case(monkeypatch):
     trimmed = []
-    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
-    monkeypatch.setattr(freed_memory, "_resident", lambda: 0)
-    freed_memory.FreedMemory().give_back(over=True)
+    monkeypatch.setattr(memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(memory, "_resident", lambda: 0)
+    memory.FreedMemory().give_back(over=True)
     assert trimmed == [0]
 
 
 def test_where_the_library_has_no_such_function_nothing_happens(monkeypatch):
-    monkeypatch.setattr(freed_memory, "_trim", lambda: None)
-    monkeypatch.setattr(freed_memory, "_resident", lambda: pytest.fail("nothing is to be measured"))
-    freed_memory.FreedMemory().give_back(over=True)
+    monkeypatch.setattr(memory, "_trim", lambda: None)
+    monkeypatch.setattr(memory, "_resident", lambda: pytest.fail("nothing is to be measured"))
+    memory.FreedMemory().give_back(over=True)
 
 
 def test_without_proc_it_is_given_back_where_a_stage_is_over(monkeypatch, tmp_path):
     trimmed = []
-    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
-    monkeypatch.setattr(freed_memory, "_OF_STATM", str(tmp_path / "statm"))
-    freed = freed_memory.FreedMemory()
+    monkeypatch.setattr(memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(memory, "_OF_STATM", str(tmp_path / "statm"))
+    freed = memory.FreedMemory()
     freed.give_back(over=False)
     freed.give_back(over=True)
     (tmp_path / "statm").write_text("no numbers")
@@ -68,7 +68,7 @@ def test_without_proc_it_is_given_back_where_a_stage_is_over(monkeypatch, tmp_pa
 
 def test_memory_is_given_back_within_and_between_the_stages_of_a_map(monkeypatch, short_log, tmp_path):
     times = []
-    monkeypatch.setattr(freed_memory.FreedMemory, "give_back", lambda self, *, over: times.append(over))
+    monkeypatch.setattr(memory.FreedMemory, "give_back", lambda self, *, over: times.append(over))
     assert main(["map", str(short_log), "--out", str(tmp_path / "map"), "-q"]) in (0, 3)
     assert sum(times) > 10
     assert not all(times)

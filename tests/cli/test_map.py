@@ -164,7 +164,7 @@ def test_mounting_and_settings_of_the_command_line_count(minute_log, tmp_path, c
 
 def test_a_dry_run_maps_and_writes_nothing(short_log, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("uwblite.mapping.build_map", None)
+    monkeypatch.setattr("uwblite.cli.making.build_map", None)
     assert main(["map", str(short_log), "--dry-run"]) == 0
     line = r".*short.log.gz: about \d+ s of a desktop computer, \d+ MB, a map of \d+ x \d+ m\n"
     assert re.fullmatch(line, capsys.readouterr().out)
@@ -385,7 +385,7 @@ def test_a_folder_of_localize_is_exchanged_as_a_whole(mapped, room_log, tmp_path
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("uwblite.io.png.write_png", full)
+        patch.setattr("uwblite.cli.localize.write_png", full)
         assert main([*words, "--force"]) == 1
     assert {p.name: p.read_bytes() for p in (tmp_path / "where").iterdir()} == before
     assert main([*words, "--force"]) == 0

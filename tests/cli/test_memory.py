@@ -95,8 +95,8 @@ def test_a_group_that_does_not_hold_the_libraries_is_refused_before_they_are_loa
 
 def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeypatch):
     monkeypatch.setattr(memory, "address_space", lambda: 300_000_000)
-    system("proc/self/statm", "61000 1000 3 4\n")
-    page = memory._pages()[0] // 61_000
+    system("proc/self/statm", "61000 1000 3 4 0 5 0\n")
+    page = memory._pages().mapped // 61_000
     assert memory.shortage(299.0 - 60_000 * page / 1e6) is None
     assert "ulimit -v" in memory.shortage(301.0 - 60_000 * page / 1e6).text
 
@@ -115,7 +115,7 @@ def limited(monkeypatch, size):
 def test_a_map_that_will_not_fit_is_refused_before_it_begins(short_log, tmp_path, monkeypatch, capsys):
     limited(monkeypatch, 10_000_000)
     words = ["map", str(short_log), "--out", str(tmp_path / "map")]
-    monkeypatch.setattr("uwblite.mapping.build_map", lambda *_, **__: pytest.fail("nothing is to be mapped"))
+    monkeypatch.setattr("uwblite.cli.making.build_map", lambda *_, **__: pytest.fail("nothing is to be mapped"))
     assert main(words) == 1
     said = capsys.readouterr().err
     assert "the limit of this test is 10 MB" in said
@@ -161,4 +161,22 @@ def test_with_too_little_address_space_the_end_comes_soon_and_in_one_line(megaby
     assert done.returncode == 1, done.stdout + done.stderr
     assert done.stderr.startswith("uwblite: error: out of memory; numpy and scipy alone need 300 MB of addresses")
     assert f"{megabytes} MB (ulimit -v)" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+GROUPED = """
+import sys
+from uwblite.cli import main, memory
+memory._group_limits = lambda: iter([int(sys.argv[1]) * 1_000_000])
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="private memory is limited on Linux")
+def test_a_control_group_ends_a_map_by_an_error_before_the_system_kills_it(room_log, tmp_path):
+    words = ["80", "map", str(room_log), "--out", str(tmp_path / "map"), "-q", "--ignore-memory"]
+    done = subprocess.run([sys.executable, "-c", GROUPED, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert done.stderr.startswith("uwblite: error: out of memory; ")
+    assert done.stderr.endswith("this control group allows 80 MB\n")
     assert done.stderr.count("\n") == 1

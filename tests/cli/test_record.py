@@ -108,7 +108,7 @@ class FakeChild:
     ("value", "address"), [([], "127.0.0.1:8000"), (["8001"], "127.0.0.1:8001"), (["0.0.0.0:8002"], "0.0.0.0:8002")]
 )
 def test_a_page_that_ends_does_not_end_the_recording(tmp_path, monkeypatch, capfd, value, address):
-    monkeypatch.setattr("uwblite.cli.child.Child", FakeChild)
+    monkeypatch.setattr("uwblite.cli.record.Child", FakeChild)
     monkeypatch.setattr(FakeChild, "made", ())
     out = tmp_path / "run.log"
     port = str(tmp_path / "ttyLATER")
@@ -127,7 +127,7 @@ def test_without_processes_the_recording_goes_on(tmp_path, monkeypatch, capfd):
     def refuse(*_):
         raise OSError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr("uwblite.cli.child.Child", refuse)
+    monkeypatch.setattr("uwblite.cli.record.Child", refuse)
     out = tmp_path / "run.log"
     assert main(["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--duration", "0.3", "--wait", "--watch"]) == 3
     assert "no page" in capfd.readouterr().err
@@ -195,7 +195,7 @@ def test_without_pyserial_nothing_is_tried_for_ever(tmp_path, monkeypatch, capfd
 
 def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
     """A Raspberry Pi's header has a UART, whether something hangs on it or not."""
-    monkeypatch.setattr(ports, "plugged_in", lambda: [ports.PluggedIn("/dev/ttyS0", "ttyS0", "")])
+    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [ports.PluggedIn("/dev/ttyS0", "ttyS0", "")])
     assert main(["devices"]) == 1
     output = capfd.readouterr()
     assert "all is well" not in output.err + output.out
@@ -204,7 +204,7 @@ def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
 
 
 def test_with_a_usb_device_nothing_is_said_to_be_missing(monkeypatch, capfd):
-    monkeypatch.setattr(ports, "plugged_in", lambda: [ports.PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")])
+    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [ports.PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")])
     assert main(["devices", "--list"]) == 0
     assert "no USB device" not in capfd.readouterr().err
 

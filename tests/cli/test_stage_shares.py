@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from uwblite.cli import console
-from uwblite.cli.stage_shares import Overall
+from uwblite.cli.map import Overall
 from uwblite.mapping import Stage, build_map
 
 
@@ -42,6 +42,6 @@ def test_unknown_stages_and_empty_ones_change_nothing():
 
 
 def test_the_line_reports_the_time_left_once_it_can_be_reported():
-    assert "left" not in console.overall_line("clouds", 0.02, 60.0)
-    assert "left" not in console.overall_line("clouds", 0.5, 1.0)
-    assert console.overall_line("clouds", 0.25, 30.0) == "[#####               ]  25 %  clouds  about 1 min 30 s left"
+    assert "left" not in console.progress_line("clouds", 0.02, 60.0)
+    assert "left" not in console.progress_line("clouds", 0.5, 1.0)
+    assert console.progress_line("clouds", 0.25, 30.0) == "[#####               ]  25 %  clouds  about 1 min 30 s left"

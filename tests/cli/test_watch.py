@@ -44,7 +44,7 @@ class FakeChild:
 @pytest.fixture
 def watched(tmp_path, monkeypatch):
     """A watch of a log with fake rounds: (watch, log, folder, states)."""
-    monkeypatch.setattr("uwblite.cli.child.Child", FakeChild)
+    monkeypatch.setattr("uwblite.cli.watch.Child", FakeChild)
     monkeypatch.setattr(watch, "_spent_on_rounds", lambda now: now)
     FakeChild.made = []
     log, folder, page = tmp_path / "run.log", tmp_path / "run_watch", LivePage("watch")

@@ -5,7 +5,7 @@ import argparse
 import pytest
 from conftest import ROOT
 
-from uwblite.cli import VERBS, console, module_of
+from uwblite.cli import VERBS, console
 from uwblite.cli.wording import OPTIONS, findings_with_options, with_options
 from uwblite.findings import doubt
 
@@ -38,9 +38,9 @@ def test_what_is_printed_and_what_is_written_says_the_same(capsys):
 
 def test_every_option_exists_and_every_name_is_said():
     known = set()
-    for verb in VERBS:
+    for verb in VERBS.values():
         parser = argparse.ArgumentParser()
-        module_of(verb).add_arguments(parser)
+        verb.add_arguments(parser)
         known |= set(parser._option_string_actions)
     core = (f for f in (ROOT / "uwblite").rglob("*.py") if "cli" not in f.parts)
     texts = "".join(f.read_text(encoding="utf-8") for f in core)

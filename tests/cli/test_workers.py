@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 import uwblite
-from uwblite.cli import main, workers
+from uwblite.cli import VERBS, main, workers
 from uwblite.errors import ConfigError
 
 
 def parsed(words):
     parser = argparse.ArgumentParser()
-    workers.add_worker_arguments(parser, "so many")
-    return parser.parse_args(words)
+    VERBS["map"].add_arguments(parser)
+    return parser.parse_args(["run.log", "--out", "map", *words])
 
 
 def test_processes_and_a_scheduler_exclude_each_other(capsys):

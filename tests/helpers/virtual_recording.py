@@ -124,7 +124,7 @@ def live_devices(devices, seconds, *, begin=None):
     seconds : after which somebody stops it.
     begin : called with the clock's time at the start.
     """
-    from uwblite.cli import live_devices as module
+    from uwblite.cli import named_devices as module
 
     clock, ports = VirtualTime(), {}
     real = Recorder.run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.io.carmen import read_log
-from uwblite.io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan
+from uwblite.io.carmen_live import LiveReader
 
 READINGS = " ".join(f"{1.0 + 0.01 * k:.3f}" for k in range(9)) + " 5.600"
 TEXT = (
@@ -26,15 +26,15 @@ def test_pieces_of_any_size_give_what_the_whole_log_gives(tmp_path, size):
     found, reader = measured([TEXT[k : k + size] for k in range(0, len(TEXT), size)])
     (tmp_path / "run.log").write_bytes(TEXT)
     log = read_log(tmp_path / "run.log", max_broken_share=0.5)
-    odometry = [m for m in found if isinstance(m, LiveOdometry)]
-    np.testing.assert_array_equal([m.pose for m in odometry], log.odometry.poses)
+    odometry = [m for m in found if m.sensor == "odometry"]
+    np.testing.assert_array_equal([m.value for m in odometry], log.odometry.poses)
     np.testing.assert_array_equal([m.stamp for m in odometry], log.odometry.stamps)
-    ranges = [(m.stamp, m.anchor_id, m.range, m.tag) for m in found if isinstance(m, LiveRange)]
+    ranges = [(m.stamp, m.anchor_id, m.value, m.tag) for m in found if m.sensor == "uwb"]
     assert ranges == [(1.1, "A", 2.5, 0), (1.3, "B", 3.5, 1)]
-    assert [(m.stamp, m.heading) for m in found if isinstance(m, LiveGyro)] == [(1.18, 0.75)]
-    (scan,) = (m for m in found if isinstance(m, LiveScan))
-    np.testing.assert_array_equal(scan.scans.ranges, log.scans.ranges)
-    assert (scan.scans.angle_min, scan.scans.time_increment) == (log.scans.angle_min, log.scans.time_increment)
+    assert [(m.stamp, m.value) for m in found if m.sensor == "gyro"] == [(1.18, 0.75)]
+    (scan,) = (m for m in found if m.sensor == "lidar")
+    np.testing.assert_array_equal(scan.value.ranges, log.scans.ranges)
+    assert (scan.value.angle_min, scan.value.time_increment) == (log.scans.angle_min, log.scans.time_increment)
     np.testing.assert_allclose(reader.mounting.T_base_laser, [0.1, 0, 0], atol=1e-9)
     assert reader.mounting.tag_position[0] == 0.2
     assert reader.broken == 1

@@ -7,8 +7,8 @@ import pytest
 from uwblite import se2
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_stamps import false_stamps
-from uwblite.screening.clocks import stand_still
 from uwblite.screening.screen import screen
+from uwblite.sensor_log import stand_still
 
 GARBAGE = ("0", "-5.7752", "8.5429e-72", "9.98035", "1.30388e-76")
 

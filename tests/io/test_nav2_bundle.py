@@ -7,7 +7,7 @@ from helpers.results import EVIL, small_folder
 from uwblite.errors import ConfigError
 from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from uwblite.io.map_server import read_map
-from uwblite.io.nav2_bundle import FILES, write_nav2_bundle
+from uwblite.io.ros_results import FILES, write_nav2_bundle
 from uwblite.io.stored_result import read_result
 
 yaml = pytest.importorskip("yaml")

@@ -6,7 +6,7 @@ import pytest
 from uwblite import se2
 from uwblite.errors import ConfigError
 from uwblite.io.carmen import read_log
-from uwblite.io.result_bag import write_result_bag
+from uwblite.io.ros_results import write_result_bag
 from uwblite.io.rosbag import read_bag
 from uwblite.io.stored_result import read_result
 

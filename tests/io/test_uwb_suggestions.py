@@ -5,10 +5,9 @@ from helpers.bags import odometry, stamped, write_bag_of
 from helpers.results import small_folder
 
 from uwblite.errors import ConfigError
-from uwblite.io.bag_topics import BagTopics, plan_topics
+from uwblite.io.bag_topics import BagTopics, as_toml, plan_topics, suggested
 from uwblite.io.rosbag import plan_bag, read_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
-from uwblite.io.uwb_suggestions import as_toml, suggested
 
 pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
 

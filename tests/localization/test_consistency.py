@@ -9,7 +9,7 @@ from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH, SLOW_SIGMA, WHEEL_SIGMA
 from uwblite.localization.range_update import RangeFacts, ranged
-from uwblite.radio.tag_pattern import HARMONICS, PATTERN_SIGMA, pattern_waves
+from uwblite.radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
 
 PLACES = np.array(list(ANCHORS.values()))
 START = np.diag(np.square([0.3, 0.3, 0.1]))

@@ -45,7 +45,7 @@ def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypat
     candidates = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), spread, False)
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
     monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[3]), 13.7))
-    found = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
+    found, _ = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
     assert found.net.tolist() == [13.7, np.inf]
     np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
     assert found.found.all()

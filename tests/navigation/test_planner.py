@@ -93,11 +93,11 @@ def test_laws_of_a_path(seed):
 @pytest.mark.parametrize("block", [(8, 64), (16, 64)])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeypatch, seed, block):
-    """Regions are made in a map of 150 x 200 cells, and pieces of 5,000 nodes: connected exactly, and hardly dearer."""
-    grid = random_grid(seed, rows=150, cols=200, boxes=200)
+    """Regions are made in a map of 100 x 140 cells, and pieces of 2,500 nodes: connected exactly, and hardly dearer."""
+    grid = random_grid(seed, rows=100, cols=140, boxes=95)
     grid.log_odds[20:30, 20:26] = 0.0
     whole = make_planner(grid, RADIUS, unknown="price")
-    monkeypatch.setattr(steps, "_AT_ONCE", 5000)
+    monkeypatch.setattr(steps, "_AT_ONCE", 2500)
     for module in (steps, regions):
         monkeypatch.setattr(module, "BLOCK", block[0])
     parts = make_planner(grid, RADIUS, unknown="price")
@@ -106,7 +106,7 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     assert np.array_equal(nodes, parts.steps.nodes())
     label = connected_components(whole.steps.graph(nodes))[1]
     dearer = []
-    for first, last in np.random.default_rng(seed).choice(len(nodes), (30, 2)).tolist():
+    for first, last in np.random.default_rng(seed).choice(len(nodes), (20, 2)).tolist():
         found = parts.steps.path(int(nodes[first]), int(nodes[last]))
         assert (found is not None) == (label[first] == label[last])
         reached = np.concatenate(list(parts.steps.reachable(int(nodes[first]))))

@@ -7,7 +7,7 @@ from helpers.localization_room import ANCHORS, ODD, known
 
 from uwblite import se2
 from uwblite.localization import Localizer
-from uwblite.odometry.gyro_turns import GyroTurns
+from uwblite.odometry.gyro import GyroTurns
 
 BIAS = 0.01
 

@@ -1,6 +1,8 @@
 """The map is at least as probable as its parts: a torn path is mended, one that only the radio denies is not."""
 
+import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,8 +31,7 @@ from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog
 
 ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
-SLIP = 60.0
-
+SLIP = 40.0
 
 
 def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
@@ -38,11 +39,19 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
 
     The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift.
     """
+    estimate, task, true = walked_once(shift, moved)
+    task = replace(task, stages=Stages(None, None))
+    task.stages.note("path-displaced", recording=1, stretch=(0.0, 9.0), start=0.0, anchors=["A"], apart=2.0, turned=0.0)
+    return estimate, task, true
+
+
+@cache
+def walked_once(shift, moved):
     rng = np.random.default_rng(3)
-    stamps, truth = wander(rng, 60.0, half_width=4.0)
+    stamps, truth = wander(rng, 40.0, half_width=4.0)
     motion = se2.between(truth[:-1], truth[1:])
     motion[(stamps[:-1] >= SLIP) & (stamps[:-1] < SLIP + 1.0)] *= [0.0, 0.0, 1.0]
-    radio = ranges(rng, stamps, truth, ANCHORS, rate=2.0, sigma=0.05)
+    radio = ranges(rng, stamps, truth, ANCHORS, rate=0.75, sigma=0.05)
     tag = se2.interpolate_trajectory(stamps, truth, radio.stamps)[:, :2]
     place = ANCHORS[radio.anchor]
     late = (radio.stamps > SLIP) & np.isin(radio.anchor, moved)
@@ -59,10 +68,7 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
     yes = np.ones(4, dtype=bool)
     estimate = replace(estimate, graph=graph, bootstrap=BootstrapResult(graph, yes, ((),) * 4, ~yes))
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0))
-    estimate = refine_jointly(estimate, task)
-    task.stages.done.clear()
-    task.stages.note("path-displaced", recording=1, stretch=(0.0, 9.0), start=0.0, anchors=["A"], apart=2.0, turned=0.0)
-    return estimate, task, true
+    return refine_jointly(estimate, task), task, true
 
 
 def torn(estimate, task, by):
@@ -85,6 +91,8 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     sound, task, true = walked()
     estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
     assert aligned_error(estimate.graph.poses[:, :2], true[:, :2]) > 1.0
+    assert range_evidence(estimate, task) < range_evidence(sound, task)
+    task.stages.note("clock-offset", offset=0.1)
     mended = replace_broken_stretches(estimate, task)
     assert aligned_error(mended.graph.poses[:, :2], true[:, :2]) < 0.05
     # Their heights and constant errors are unknown.
@@ -94,15 +102,9 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     ((begin, end),) = finding.stretches
     assert SLIP - 2.0 < begin < end < SLIP + 4.0
     assert finding.figures["off"] == pytest.approx(3.0, abs=0.5)
-    assert "`end=5" in finding.cure or "`end=6" in finding.cure
+    assert int(re.search("`end=([0-9]+)`", finding.cure)[1]) == pytest.approx(SLIP, abs=2.0)
     assert "`use_lidar=false`" in finding.cure
-
-
-def test_what_was_said_of_anchors_along_a_torn_path_names_its_cause():
-    sound, task, _ = walked()
-    estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
-    task.stages.note("clock-offset", offset=0.1)
-    replace_broken_stretches(estimate, task)
+    # What was said of anchors along the torn path has a cause; what was said of clocks has another.
     by_kind = {finding.kind: finding.explained_by for finding in explained(told(task.stages.facts))}
     assert by_kind == {"path-displaced": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
 
@@ -138,8 +140,6 @@ def test_nothing_is_compared_where_one_anchor_moved_or_none():
     assert replace_broken_stretches(estimate, task) is estimate
     task.stages.note("moved-anchor", anchor="A", distance=1.0)
     assert replace_broken_stretches(estimate, task) is estimate
-    task.stages.note("moved-anchor", anchor="B", distance=1.0)
-    assert replace_broken_stretches(estimate, task) is not estimate
 
 
 @pytest.mark.parametrize("part", ["scans", "ranges", "joint"])
@@ -157,10 +157,8 @@ def test_the_stretch_is_the_slip_around_the_broken_step():
     assert SLIP - 1.0 < stamps[first] < stamps[k] <= stamps[last] < SLIP + 2.0
 
 
-def test_ranges_are_less_probable_along_a_torn_path_and_rays_beside_their_walls():
+def test_rays_are_less_probable_beside_their_walls():
     sound, task, _ = walked()
-    displaced = torn(sound, task, np.array([3.0, 0.0, 0.0]))
-    assert range_evidence(displaced, task) < range_evidence(sound, task)
     clouds, poses = sound.lidar.clouds, sound.graph.poses
     i = np.arange(0, 40, 4)
     at = se2.between(poses[i], poses[i + 1])

@@ -5,13 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import loop
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
-from uwblite.graph.pose_edges import ScanEdges
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
@@ -85,26 +83,6 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
     assert found.fixed_poses.tolist() == [True, False, False]
     assert found.calibration.values.tolist() == [1.0, 0.0, 1.0, 1.0]
     assert (found.anchors == 2.0).all()
-
-
-@pytest.mark.parametrize("lidar", [False, True])
-def test_correlated_range_errors_count_for_all_or_for_anchors_at_given_poses_where_there_is_a_lidar(monkeypatch, lidar):
-    of_all, of_anchors, marker = [], [], np.full((1, 2, 2), 7.0)
-    monkeypatch.setattr(final_stages, "with_correlated_errors", lambda *a: of_all.append(a) or a[0].covariances)
-    monkeypatch.setattr(final_stages, "anchors_with_correlated_errors", lambda *a: of_anchors.append(a) or marker)
-    graph, config = loop()[0], MappingConfig()
-    i = np.arange(len(graph.poses) - 1) if lidar else np.zeros(1, dtype=int)
-    still = np.zeros((len(i), 3))
-    scans = ScanEdges(i, i + 1, still, np.tile(np.eye(3), (len(i), 1, 1)), still, still, np.full(4, -1))
-    ranges = graph.edges[2]
-    estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
-    none = SimpleNamespace(have_scans=False)
-    covariance = final_stages.covariances_of(estimate, SimpleNamespace(config=config, recordings=none))
-    found = [(a[0].covariances is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all]
-    assert found == [(True, True, True)] * (not lidar)
-    assert [(a[1] is ranges, a[3] is config.ranges) for a in of_anchors] == [(True, True)] * lidar
-    assert all(a[0].fixed_poses.all() and not any(isinstance(e, ScanEdges) for e in a[0].edges) for a in of_anchors)
-    assert (covariance.anchors is marker) == lidar
 
 
 def test_the_time_from_keyframes_to_scans_is_that_of_a_random_walk(room):

@@ -1,7 +1,6 @@
 """Ranges: when their noise is re-estimated and the poses give way, and how the first optimisation goes."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from uwblite.arrays import spread
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
-from uwblite.pipeline import estimate as estimate_module
 from uwblite.pipeline import radio_stages
 from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.lidar_stages import refine_jointly
@@ -26,36 +24,14 @@ from uwblite.pipeline.recordings import gather
 from uwblite.sensor_log import SensorLog, SensorMounting
 
 
-def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(monkeypatch):
-    """The priors are those of the optimum of the last weights; without ranges nothing is done."""
-    made, graph = [], loop()[0]
-    estimate = Estimate(graph, graph.edges[0], None, ())
-    assert select_range_priors(estimate, None) is estimate
-    monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config, steady: made.append(f"noise {steady}") or e)
-    monkeypatch.setattr(
-        estimate_module, "solve", lambda g, solver, by: made.append(f"solve {solver.max_iterations}") or (g, None)
-    )
-    monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *rest: made.append("priors") or graph)
-    gone = iter([False, True])
-    monkeypatch.setattr(radio_stages, "_let_go", lambda held, weak: next(gone))
-    config = MappingConfig()
-    task = Task(None, replace(config, solver=replace(config.solver, max_iterations=7)), Constraints(), None)
-    select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
-    assert made == ["noise True", "solve 7"] * 2 + ["priors"]
-    # Where nothing but the ranges holds the poses, these weigh by their own errors alone.
-    made.clear()
-    select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
-    assert made == ["noise True", "solve 7"] * 2 + ["noise False", "solve 7"] * 2 + ["priors"]
-    # Where scans were matched, but next to none, that is known.
-    made.clear()
-    still = np.zeros((1, 3))
+def test_next_to_no_matched_scans_hold_no_path_and_are_not_refined():
+    graph, still = loop()[0], np.zeros((1, 3))
     step = ScanEdges(np.array([0]), np.array([1]), still, np.eye(3)[None], still, still, np.full(4, -1))
-    few = replace(estimate, ranges=graph.edges[2], steps=step)
+    few = Estimate(graph, graph.edges[0], graph.edges[2], (), steps=step)
     assert few.held_by_scans.tolist() == [True, True] + [False] * (len(graph.poses) - 2)
     assert (few.rests_on_ranges, replace(few, ranges=None).rests_on_ranges) == (True, False)
-    select_range_priors(few, task)
-    assert made == ["priors"]
-    assert refine_jointly(few, task) is few
+    assert refine_jointly(few, None) is few
+    assert select_range_priors(replace(few, ranges=None), None).graph is graph
 
 
 @pytest.mark.parametrize(("growth", "gone"), [
@@ -101,41 +77,6 @@ def test_ranges_keep_a_path_that_scans_hardly_see():
     error = pdist(found.graph.poses[::5, :2]) - pdist(truth[::5, :2])
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert np.all((found.ranges.sigma > 0.07) & (found.ranges.sigma < 0.15))
-
-
-def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last(monkeypatch):
-    made, graph = [], loop()[0]
-    bootstrap = SimpleNamespace(placed=np.array([True, False, True]))
-    estimate = Estimate(graph, graph.edges[0], graph.edges[2], ("A", "B", "C"), bootstrap)
-    monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config: made.append("noise") or e)
-    monkeypatch.setattr(estimate_module, "solve", lambda *given: made.append("solve") or (graph, "result"))
-    monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *given: made.append("priors") or graph)
-    monkeypatch.setattr(radio_stages, "with_free", lambda graph, *kinds: made.append("free") or graph)
-    monkeypatch.setattr(radio_stages, "solver_figures", lambda result: {"chi2": 1.0})
-    stages = SimpleNamespace(report=lambda *given: made.append(given), end=lambda *given, **more: made.append((given, more)))
-    seen = SimpleNamespace(have_scans=True)
-    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
-    name = "first optimisation"
-    assert made == [
-        "noise", "solve", (name, 1, 3), "noise", "solve", (name, 2, 3), "noise", "priors", "free", "solve", (name, 3, 3),
-        ((name,), {"placed": 2, "chi2": 1.0}),
-    ]  # fmt: skip
-    made.clear()
-    # Without a lidar, once more where another optimum was better.
-    seen.have_scans = False
-    monkeypatch.setattr(radio_stages.line_sides, "with_likeliest_side", lambda e, task: made.append("other") or replace(e))
-    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
-    assert made[-7:-1] == [(name, 3, 3), "other", "noise", "priors", "free", "solve"]
-    # Recordings that were joined have been optimised alone; what a lidar refines is not done again.
-    joined = replace(estimate, alone=(estimate, estimate))
-    end = ((name,), {"placed": 2, "chi2": 1.0})
-    once_more = ["noise", "priors", "free", "solve", (name, 3, 3)]
-    for seen.have_scans, done in ((False, ["free", "solve", *once_more, end]), (True, ["free", "solve", end])):
-        made.clear()
-        radio_stages._optimised(joined, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
-        assert made == done
-    without = replace(estimate, ranges=None)
-    assert radio_stages._optimised(without, None) is without
 
 
 PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])

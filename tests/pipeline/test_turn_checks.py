@@ -10,7 +10,7 @@ from helpers.laser_walks import chained
 from helpers.told import warned
 
 from uwblite import se2
-from uwblite.assessment.turn_scale_tests import check_turn_scales
+from uwblite.assessment.drift_tests import check_turn_scales
 from uwblite.graph.calibration import (
     OMNI,
     CalibrationConfig,

@@ -9,7 +9,7 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.radio.alike_heights import _common, with_alike_heights
+from uwblite.radio.prior_selection import _common, with_alike_heights
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig

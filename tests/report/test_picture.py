@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
-from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
-from uwblite.report.canvas import Canvas
+from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATH, PATHS, PROPOSED, START, WIDTH, Canvas, text_mask
 from uwblite.report.error_map import draw_errors
-from uwblite.report.palette import ACCEPTED, ANCHOR, PATH, PATHS, PROPOSED, START
 from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
 from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.results import EVIL, small_folder
 
-from uwblite.io.log_tail import LogTail
+from uwblite.io.carmen_live import LogTail
 from uwblite.io.stored_result import read_result
 from uwblite.server.live import LivePage, watch_status
 

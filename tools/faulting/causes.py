@@ -6,7 +6,7 @@ from pathlib import Path
 
 WHEELS = (
     "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-steps", "odometry-unit", "drift",
-    "halves-disagree", "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
+    "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
     "unusual-calibration", "scales", "laser-turned-over", "path-displaced",
 )  # fmt: skip
 LIDAR = (

@@ -19,12 +19,12 @@ from uwblite.errors import UwbliteError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.carmen import read_log
+from uwblite.io.carmen_live import LogTail
 from uwblite.io.constraints_file import parse_constraints, read_anchors
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
 from uwblite.io.csv_table import read_csv
 from uwblite.io.g2o import read_g2o
 from uwblite.io.librsf import read_librsf
-from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg

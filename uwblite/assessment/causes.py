@@ -11,70 +11,73 @@ from types import MappingProxyType
 
 from ..findings import SEVERITIES, Finding
 
-_TIMES = frozenset({"silences", "equal-stamps", "laser-delay", "slow-odometry", "odometry-gap", "clock-offset", "no-turns"})
-"""What stamps that are no times look like."""
-_PLACES = frozenset({
-    "anchor-distrusted", "anchor-mirror-ambiguous", "anchor-unplaced", "no-anchor", "moved-anchor", "anchors-moved-together",
-    "sustained-outliers", "ranges-disagree", "short-ranges",
-})  # fmt: skip
-"""What anchors seem to do along a path that is wrong, or by ranges that are no distances."""
-_BY_RANGES = _PLACES | {
-    "range-scatter", "odometry-unit", "odometry-slips", "drift", "halves-disagree", "other-side", "anchor-heights", "mirrored",
-    "unusual-calibration", "uncertain", "poor-fit", "path-displaced",
-}
-"""What a map by ranges and wheels alone shows of a fault of either."""
-_BY_SCANS = frozenset({
-    "free-space-violation", "no-closure", "open-loops", "contradicting-closures", "loose-links", "odometry-steps",
-    "turn-scale", "scales", "uncertain", "poor-fit", "untied-parts", "turns-disagree", "turn-factor",
-    "unusual-calibration", "mirrored",
-})  # fmt: skip
-"""What a map shows of a fault of lidar or wheels."""
-_ALL = _BY_RANGES | _BY_SCANS | {"wheels-against-lidar", "range-scatter", "carried", "wheels-stand-still"}
 
-EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType({
-    "refused": frozenset({"odometry-alone"}),
-    "clock-set-back": _TIMES | _ALL,
-    "scans-outside-odometry": _TIMES | {"no-lidar"},
-    "ranges-outside-odometry": _TIMES | {"no-ranges"},
-    "made-up-stamps": _TIMES,
-    "stamps-of-receipt": _TIMES,
-    "stamps-in-bursts": _TIMES,
-    "hardly-moving": _PLACES | {"uncertain", "straight-path", "no-turns", "moves-across-heading"},
-    "scans-do-not-match": _BY_SCANS | {"wheels-against-lidar", "range-scatter", "odometry-alone"},
-    "laser-turned-over": _BY_SCANS | {"wheels-against-lidar", "range-scatter", "anchors-moved-together"},
-    "carried": _BY_SCANS | _BY_RANGES,
-    "wheels-stand-still": _BY_RANGES | _BY_SCANS,
-    "marked-ranges": _PLACES | {"uncertain", "odometry-alone", "untied-parts", "few-in-reach", "few-ranges"},
-    "shared-name": _PLACES | {"spikes"},
-    "repeated-ranges": frozenset({"few-ranges", "anchor-unplaced", "no-anchor", "odometry-alone", "uncertain"}),
-    "repeated-scans": frozenset({"odometry-alone", "untied-parts", "silences"}),
-    "worse-than-parts": _PLACES | {"path-displaced", "odometry-steps", "free-space-violation"},
-    "wheels-against-lidar": _BY_SCANS | {"range-scatter", "anchors-moved-together", "moved-anchor"},
-    "halves-disagree": _BY_RANGES - {"halves-disagree"},
-    "turn-factor": frozenset({"unusual-calibration"}),
-    "mirrored": frozenset({"unusual-calibration", "odometry-unit"}),
-    "loose-links": frozenset({
-        "free-space-violation", "no-closure", "untied-parts", "anchors-moved-together", "path-displaced",
-    }),
-    "free-space-violation": _PLACES | {"range-scatter", "path-displaced"},
-    "path-displaced": _PLACES,
-    "range-scatter": _BY_RANGES - {"range-scatter", "path-displaced"},
-    "drift": _PLACES | {"odometry-slips", "odometry-unit", "unusual-calibration"},
-    "odometry-slips": _PLACES | {"unusual-calibration", "odometry-unit"},
-    "anchors-moved-together": frozenset({
-        "moved-anchor", "anchor-distrusted", "ranges-disagree", "short-ranges", "sustained-outliers",
-    }),
-    "anchor-distrusted": frozenset({"sustained-outliers", "short-ranges", "spikes"}),
-    "straight-path": frozenset({"anchor-mirror-ambiguous"}),
-    "few-ranges": frozenset({"anchor-unplaced"}),
-})  # fmt: skip
+def _of(*kinds: str | frozenset[str]) -> frozenset[str]:
+    """Return kinds of findings that are listed in words or in sets."""
+    return frozenset().union(*(kind.split() if isinstance(kind, str) else kind for kind in kinds))
+
+
+_TIMES = _of("silences equal-stamps laser-delay slow-odometry odometry-gap clock-offset no-turns")
+"""What stamps that are no times look like."""
+_PLACES = _of(
+    "anchor-distrusted anchor-mirror-ambiguous anchor-unplaced no-anchor moved-anchor anchors-moved-together",
+    "sustained-outliers ranges-disagree short-ranges",
+)
+"""What anchors seem to do along a path that is wrong, or by ranges that are no distances."""
+_BY_RANGES = _of(
+    _PLACES,
+    "range-scatter odometry-unit odometry-slips drift other-side anchor-heights mirrored unusual-calibration uncertain",
+    "poor-fit path-displaced",
+)
+"""What a map by ranges and wheels alone shows of a fault of either."""
+_BY_SCANS = _of(
+    "free-space-violation no-closure open-loops contradicting-closures loose-links odometry-steps turn-scale scales uncertain",
+    "poor-fit untied-parts turns-disagree turn-factor unusual-calibration mirrored",
+)
+"""What a map shows of a fault of lidar or wheels."""
+_ALL = _of(_BY_RANGES, _BY_SCANS, "wheels-against-lidar carried wheels-stand-still")
+
+EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "refused": _of("odometry-alone"),
+        "clock-set-back": _TIMES | _ALL,
+        "scans-outside-odometry": _of(_TIMES, "no-lidar"),
+        "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
+        "made-up-stamps": _TIMES,
+        "stamps-of-receipt": _TIMES,
+        "stamps-in-bursts": _TIMES,
+        "hardly-moving": _of(_PLACES, "uncertain straight-path no-turns moves-across-heading"),
+        "scans-do-not-match": _of(_BY_SCANS, "wheels-against-lidar range-scatter odometry-alone"),
+        "laser-turned-over": _of(_BY_SCANS, "wheels-against-lidar range-scatter anchors-moved-together"),
+        "carried": _BY_SCANS | _BY_RANGES,
+        "wheels-stand-still": _BY_RANGES | _BY_SCANS,
+        "marked-ranges": _of(_PLACES, "uncertain odometry-alone untied-parts few-in-reach few-ranges"),
+        "shared-name": _of(_PLACES, "spikes"),
+        "repeated-ranges": _of("few-ranges anchor-unplaced no-anchor odometry-alone uncertain"),
+        "repeated-scans": _of("odometry-alone untied-parts silences"),
+        "worse-than-parts": _of(_PLACES, "path-displaced odometry-steps free-space-violation"),
+        "wheels-against-lidar": _of(_BY_SCANS, "range-scatter anchors-moved-together moved-anchor"),
+        "turn-factor": _of("unusual-calibration"),
+        "mirrored": _of("unusual-calibration odometry-unit"),
+        "loose-links": _of("free-space-violation no-closure untied-parts anchors-moved-together path-displaced"),
+        "free-space-violation": _of(_PLACES, "range-scatter path-displaced"),
+        "path-displaced": _PLACES,
+        "range-scatter": _BY_RANGES - _of("range-scatter path-displaced"),
+        "drift": _of(_PLACES, "odometry-slips odometry-unit unusual-calibration"),
+        "odometry-slips": _of(_PLACES, "unusual-calibration odometry-unit"),
+        "anchors-moved-together": _of("moved-anchor anchor-distrusted ranges-disagree short-ranges sustained-outliers"),
+        "anchor-distrusted": _of("sustained-outliers short-ranges spikes"),
+        "straight-path": _of("anchor-mirror-ambiguous"),
+        "few-ranges": _of("anchor-unplaced"),
+    }
+)
 """By the kind of a cause, the kinds that it explains; a cause stands before those causes that it explains."""
-_SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType({
-    "radio": _TIMES | _BY_RANGES | {
-        "carried", "spikes", "few-in-reach", "few-ranges", "no-ranges", "untied-parts", "odometry-alone",
-    },
-    "lidar": _TIMES | _BY_SCANS | _PLACES | {"wheels-against-lidar", "carried", "no-lidar", "range-scatter", "path-displaced"},
-})  # fmt: skip
+_SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "radio": _of(_TIMES, _BY_RANGES, "carried spikes few-in-reach few-ranges no-ranges untied-parts odometry-alone"),
+        "lidar": _of(_TIMES, _BY_SCANS, _PLACES, "wheels-against-lidar carried no-lidar range-scatter path-displaced"),
+    }
+)
 """What a fault of one sensor alone can explain; one of the odometry may explain all."""
 _RANK = {kind: number for number, kind in enumerate(EXPLAINS)}
 

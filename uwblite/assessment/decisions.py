@@ -47,7 +47,12 @@ def anchor_heights(height: float, taken: bool, apart: float) -> Finding:
 
 
 def moved_anchor(
-    anchor: str, distance: float, recording: int = 0, new_id: str = "", between: Sequence[float] = (), way: int = 0,
+    anchor: str,
+    distance: float,
+    recording: int = 0,
+    new_id: str = "",
+    between: Sequence[float] = (),
+    way: int = 0,
     several: bool = False,
 ) -> Finding:
     """Warn of an anchor that stands elsewhere from some time on, in another recording, or than in an earlier map."""
@@ -182,7 +187,19 @@ _COARSEST = 10.0
 """Ratio of the cell size to the requested one, up to which a map counts as large; beyond it, poses or readings are wrong."""
 
 RULES = by_kind(
-    odometry_unit, anchor_heights, moved_anchor, path_displaced, worse_than_parts, new_anchor, absent_anchor, landmark_distance,
-    clock_offset, free_space_violation, open_loops, turn_scale, scans_astray, coarse_grid,
-)  # fmt: skip
+    odometry_unit,
+    anchor_heights,
+    moved_anchor,
+    path_displaced,
+    worse_than_parts,
+    new_anchor,
+    absent_anchor,
+    landmark_distance,
+    clock_offset,
+    free_space_violation,
+    open_loops,
+    turn_scale,
+    scans_astray,
+    coarse_grid,
+)
 """By the kind of fact."""

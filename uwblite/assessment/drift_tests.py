@@ -15,10 +15,12 @@ from ..arrays import Floats
 from ..findings import Finding, doubt
 from ..graph.added_unknown import added_unknown, added_unknown_and_moves
 from ..graph.graph import Edges, Graph, edge_weights
-from ..graph.pose_edges import OdometryEdges
+from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.joint_refinement import with_fewer_pairs
+from ..odometry.turn_scale import TurnScale, turn_scales
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
+from .decisions import shown
 from .moments import between_keyframes, seconds
 
 _SIGMAS = 2.5
@@ -132,3 +134,36 @@ def _check_turns(graph: Graph, wheels: OdometryEdges, rec: Recordings) -> Iterat
 def _change(graph: Graph, edges: Edges, changed: Edges) -> Floats:
     """Return the change of the residuals (e, d) by a unit, of edges changed by a step."""
     return (changed.residuals(graph) - edges.residuals(graph)) / _STEP
+
+
+def check_turn_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
+    """Doubt a map whose scale of turns is not that of the lidar's own steps, or differs between parts of the recording."""
+    for edges in estimate.graph.edges:
+        if isinstance(edges, ScanEdges):
+            for index, found in turn_scales(estimate.odometry, edges, estimate.graph).items():
+                yield from _judge(found, float(estimate.graph.calibration.values[index]), task)
+
+
+def _judge(found: TurnScale, used: float, task: Task) -> Iterator[Finding]:
+    """Return the text about what is wrong with the scale that a map uses."""
+    if found.varies:
+        parts = ", ".join(f"{1.0 + value:.2f}" for value in found.stretches)
+        yield doubt(
+            "turn-scale",
+            f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no calibration "
+            "changes so; the map's heading is wrong, or the odometry failed",
+            stretches=found.stretches.tolist(),
+        )
+    elif abs(used - found.value) > _WRONG and found.contradicts(used):
+        yield doubt(
+            "turn-scale",
+            f"the map multiplies the odometry's turns by {1.0 + used:.2f}, but from step to step the lidar turns "
+            f"{shown(found.value, found.sigma)} times as much: a turn of the map or a loop closure is wrong",
+            by_steps=found.value,
+            sigma=found.sigma,
+            by_all=used,
+        )
+
+
+_WRONG = 0.1
+"""Difference of the scale of turns that noise does not explain: a tenth of all turns missing or too much."""

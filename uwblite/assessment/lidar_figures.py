@@ -8,7 +8,7 @@ import numpy as np
 from ..findings import NOTE, WARNING, Finding
 from ..lidar.laser_mounting import Turning, compare
 from ..sensor_log import LaserScans, SensorLog
-from .rhythm import check_equal_stamps, check_silences, rhythm
+from .odometry_figures import check_equal_stamps, check_silences, rhythm
 
 _SAMPLE = 400
 """Scans that are enough for shares of beams."""

@@ -17,17 +17,13 @@ from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
 from .causes import explained
-from .certainty import check_certainty
+from .certainty import check_certainty, check_other_side
 from .decisions import RULES
-from .drift_tests import check_drifts
-from .half_tests import check_halves
-from .other_side import check_other_side
+from .drift_tests import check_drifts, check_turn_scales
 from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
-from .turn_scale_tests import check_turn_scales
-from .untied_parts import check_untied_parts
-from .untied_recordings import check_untied_recordings
+from .untied_parts import check_untied_parts, check_untied_recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate gets a warning."""
@@ -44,8 +40,14 @@ _POOR_FIT = 4.0
 
 
 def judge(
-    estimate: Estimate, anchors: Sequence[AnchorEstimate], calibrated: Sequence[CalibrationEstimate],
-    usual: Mapping[UnknownKey, Unknown], table: dict[str, Floats], grid: OccupancyGrid | None, sigma: float, task: Task,
+    estimate: Estimate,
+    anchors: Sequence[AnchorEstimate],
+    calibrated: Sequence[CalibrationEstimate],
+    usual: Mapping[UnknownKey, Unknown],
+    table: dict[str, Floats],
+    grid: OccupancyGrid | None,
+    sigma: float,
+    task: Task,
 ) -> None:
     """Add the findings that the recordings, the stages and the finished estimate give rise to, causes before consequences.
 
@@ -69,7 +71,6 @@ def judge(
         lambda: check_residuals(estimate, residuals, grid, task),
         lambda: check_unit(anchors, task),
         lambda: check_short_ranges(anchors, estimate, sigma, task),
-        lambda: check_halves(estimate, task),
         lambda: check_drifts(estimate, task),
         lambda: check_untied_parts(estimate, task),
         lambda: check_untied_recordings(estimate, task),
@@ -158,11 +159,16 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
             yield doubt(
                 "anchors-moved-together",
                 f"{len(changed)} of {len(both | changed)} anchors seem to have moved at about t = {when:.0f} s: "
-                + ("an error of lidar, radio or clocks is likelier" if lidar else
-                   "a change of wheels, tag or radio is likelier, and only the odometry connects the two parts of the map")
+                + (
+                    "an error of lidar, radio or clocks is likelier"
+                    if lidar
+                    else "a change of wheels, tag or radio is likelier, and only the odometry connects the two parts of the map"
+                )
                 + "; map both parts separately and compare",
-                at=when, moved=len(changed), measured=len(both),
-            )  # fmt: skip
+                at=when,
+                moved=len(changed),
+                measured=len(both),
+            )
             return
 
 
@@ -252,8 +258,11 @@ def check_calibration(
             + unit_of
             + ("; the wheels missed some of the travelled distance: the map may be too short" if short else "")
             + ("; the odometry's turns have nothing in common with those of the map" if unrelated else ""),
-            name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
-        )  # fmt: skip
+            name=value.name,
+            value=value.value,
+            sigma=value.sigma,
+            usual=sigma,
+        )
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -9,8 +9,7 @@ from ..arrays import Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, SensorLog, UwbRanges, plausible
-from .odometry_figures import STRAIGHT, straightness
-from .rhythm import check_equal_stamps, check_silences, rhythm
+from .odometry_figures import STRAIGHT, check_equal_stamps, check_silences, rhythm, straightness
 
 FEW = 10
 """Ranges from which an anchor cannot be placed."""
@@ -135,17 +134,18 @@ def _coverage(log: SensorLog, ranges: UwbRanges) -> dict[str, float]:
     return {f"at least {n}": round(min(float(np.sum(count >= n)) / float(windows), 1.0), 3) for n in (1, 2, 3)}
 
 
-def calibration_figures(
-    anchors: tuple[AnchorEstimate, ...], calibration: tuple[CalibrationEstimate, ...]
-) -> dict[str, Any]:
+def calibration_figures(anchors: tuple[AnchorEstimate, ...], calibration: tuple[CalibrationEstimate, ...]) -> dict[str, Any]:
     """Return what a map tells of wheels, clocks and the bias of each anchor."""
     figures: dict[str, Any] = {
         value.name: {
-            "value": round(value.value, 5), "sigma": round(value.sigma, 5), "unit": value.unit, "meaning": value.meaning,
+            "value": round(value.value, 5),
+            "sigma": round(value.sigma, 5),
+            "unit": value.unit,
+            "meaning": value.meaning,
         }
         for value in calibration
         if value.state == "estimated"
-    }  # fmt: skip
+    }
     figures["bias guess m"] = {
         a.id: {"bias": round(a.bias, 3), "sigma": round(a.bias_sigma, 3)} for a in anchors if a.status == "ok"
     }

@@ -50,8 +50,9 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
                     "sustained-outliers",
                     f"{where}anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
                     "its line of sight was blocked, or it was moved; these ranges are down-weighted",
-                    anchor=name, stretches=stretches,
-                )  # fmt: skip
+                    anchor=name,
+                    stretches=stretches,
+                )
         if wrong and 2 * wrong >= heard and not recording.has_scans:
             text = (
                 f"{where}{wrong} of {heard} anchors disagree with the map for long, and only ranges and odometry constrain the "
@@ -76,9 +77,7 @@ def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Findin
         yield doubt("odometry-unit", text)
 
 
-def check_wheels_against_lidar(
-    table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task
-) -> Iterator[Finding]:
+def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
     """Doubt a map whose wheels and lidar contradict each other; a warning where the ranges decide for the lidar.
 
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in

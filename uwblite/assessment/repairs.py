@@ -286,9 +286,31 @@ def shared_name(anchor: str, jumps: int, total: int) -> Finding:
 
 
 RULES = by_kind(
-    made_up_stamps, stamps_of_receipt, clock_set_back, clock_jump, outside_odometry, stamps_in_bursts, repeated_odometry,
-    odometry_glitches, odometry_breaks, odometry_gap, carried, wheels_stand_still, hardly_moving, gyro, heading_against_path,
-    laser_turned_over, laser_turned_away, late_scans, scans_do_not_match, wheels_against_lidar, repeated_scans,
-    repeated_readings, own_body, repeated_ranges, marked_ranges, shared_name,
-)  # fmt: skip
+    made_up_stamps,
+    stamps_of_receipt,
+    clock_set_back,
+    clock_jump,
+    outside_odometry,
+    stamps_in_bursts,
+    repeated_odometry,
+    odometry_glitches,
+    odometry_breaks,
+    odometry_gap,
+    carried,
+    wheels_stand_still,
+    hardly_moving,
+    gyro,
+    heading_against_path,
+    laser_turned_over,
+    laser_turned_away,
+    late_scans,
+    scans_do_not_match,
+    wheels_against_lidar,
+    repeated_scans,
+    repeated_readings,
+    own_body,
+    repeated_ranges,
+    marked_ranges,
+    shared_name,
+)
 """By the kind of fact."""

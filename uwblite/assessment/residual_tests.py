@@ -177,7 +177,7 @@ def check_untied_breaks(estimate: Estimate, task: Task) -> Iterator[Finding]:
             "before and after, nor do ranges that agree: they may be misplaced to each other; drive through the first part "
             "once more",
             at=at,
-        )  # fmt: skip
+        )
 
 
 def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> Ints:

@@ -106,11 +106,17 @@ def _range_table(
     """Return the table of all ranges; see MapResult.range_table."""
     x, y = ranges.tag_positions(graph.poses).T
     return {
-        "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
-        "residual": residuals + ranges.ranges - ranges.corrected, "weight": weights, "agrees": agrees.astype(np.float64),
-        "x": x, "y": y, "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
+        "stamp": ranges.stamps,
+        "anchor": ranges.anchor.astype(np.float64),
+        "range": ranges.ranges,
+        "residual": residuals + ranges.ranges - ranges.corrected,
+        "weight": weights,
+        "agrees": agrees.astype(np.float64),
+        "x": x,
+        "y": y,
+        "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
         "recording": recordings.of_keyframe[ranges.pose].astype(np.float64),
-    }  # fmt: skip
+    }
 
 
 def _anchor(
@@ -141,7 +147,17 @@ def _anchor(
     if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
-        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason, alternative,
+        name,
+        graph.anchors[k],
+        covariance.anchors[k],
+        count,
+        used,
+        bias,
+        bias_sigma,
+        scatter,
+        status,
+        reason,
+        alternative,
         short=short,
     )
 
@@ -154,9 +170,10 @@ def _without_strange_biases(anchors: tuple[AnchorEstimate, ...]) -> tuple[Anchor
     off = biases - np.nanmedian(biases)
     return tuple(
         replace(a, status="distrusted", reason=f"its ranges fit only with a constant error {by:+.1f} m from the others'")
-        if a.status == "ok" and abs(by) > max(_OTHER_BIAS, 3.0 * a.bias_sigma) else a
+        if a.status == "ok" and abs(by) > max(_OTHER_BIAS, 3.0 * a.bias_sigma)
+        else a
         for a, by in zip(anchors, off.tolist(), strict=True)
-    )  # fmt: skip
+    )
 
 
 def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
@@ -243,7 +260,7 @@ def _without_leaps(
     return tuple(
         replace(a, status="distrusted", reason=leaps[k]) if k in leaps and a.status == "ok" else a
         for k, a in enumerate(anchors)
-    )  # fmt: skip
+    )
 
 
 _LEAP, _CARRYING = 6.0, 1.0

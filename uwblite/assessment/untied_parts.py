@@ -17,6 +17,7 @@ from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording
+from ..sensor_log.anchor_names import radio_name
 
 _SILENT, _DRIVEN = 10.0, 3.0
 """Time without any scan, s, and distance meanwhile, m, after which an odometry that failed may have any error."""
@@ -49,8 +50,9 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
                 f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors "
                 "connect the parts before and after: each may be right, but their relative pose rests on the odometry alone; "
                 "drive through the first part once more, or map the parts separately",
-                start=before, end=after,
-            )  # fmt: skip
+                start=before,
+                end=after,
+            )
 
 
 def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> Iterator[Finding]:
@@ -78,8 +80,10 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
                     f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
                     f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "
                     "why no sensor measured there",
-                    at=float(frames.stamps[at]), way=float(lengths.sum()), error=off,
-                )  # fmt: skip
+                    at=float(frames.stamps[at]),
+                    way=float(lengths.sum()),
+                    error=off,
+                )
                 ends_at = sorted((float(frames.stamps[at]), float(frames.stamps[0 if word == "until" else -1])))
                 edge = "start" if word == "until" else "end"
                 cure = f"`{edge}={seconds:.0f}` leaves that part out"
@@ -165,3 +169,41 @@ def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> boo
     parts = ranges.pose < first, ranges.pose >= last
     counts = [np.bincount(ranges.anchor[part], minlength=len(graph.anchors)) for part in parts]
     return int(np.sum(np.minimum(*counts) >= _MEASURED)) >= _ANCHORS
+
+
+def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]:
+    """Doubt a recording that has hardly more anchors where the others have them than elsewhere, and no closure with these.
+
+    Where anchors disagree, which of them were moved is a majority's word, and two that agree by chance are no majority: the
+    recording may as well be of another place with anchors of the same names.
+    """
+    recordings, ranges, names = task.recordings, estimate.ranges, estimate.anchor_ids
+    if len(recordings.each) == 1 or ranges is None:
+        return
+    alive = ranges.rows(np.flatnonzero(ranges.alive))
+    counts = np.zeros((len(recordings.each), len(names)), dtype=np.intp)
+    np.add.at(counts, (recordings.of_keyframe[alive.pose], alive.anchor), 1)
+    heard = (counts >= _HEARD) & estimate.placed
+    radio = np.array([radio_name(name) for name in names])
+    ends = recordings.of_keyframe[np.stack([estimate.closures.edges.i, estimate.closures.edges.j])]
+    # Of two that contradict each other, the second is named.
+    for recording in recordings.each[1 if len(recordings.each) == 2 else 0 :]:
+        n, others = recording.number, np.delete(heard, recording.number, axis=0).any(axis=0)
+        same = heard[n] & others
+        moved = np.setdiff1d(np.intersect1d(radio[heard[n]], radio[others]), radio[same])
+        tied = np.any((ends == n).any(axis=0) & (ends[0] != ends[1]))
+        if len(moved) and int(same.sum()) - len(moved) < _MAJORITY and not tied:
+            yield doubt(
+                "untied-parts",
+                f"{recording.name} has {int(same.sum())} anchors where the others have them and {len(moved)} elsewhere "
+                f"({', '.join(moved.tolist())}), and no loop closure with them: it may lie elsewhere, or be of another place; "
+                "record where both were, or map it alone",
+                recording=n + 1,
+                moved=moved.tolist(),
+            )
+
+
+_HEARD = 3
+"""Ranges of a recording to an anchor from which on it says where that is."""
+_MAJORITY = 2
+"""More anchors that agree than do not, for those that agree to be the ones that were not moved."""

@@ -1,8 +1,8 @@
-"""The command line: one module per verb, loaded when its verb is asked for.
+"""The command line: log_verbs.py and map_verbs.py declare the verbs, and the module of that name does the work of each.
 
-A verb module offers ``HELP`` (one line), ``EPILOG`` (examples), ``add_arguments(parser)`` and ``run(args) -> int``. Its
-top level imports nothing heavy: numpy, scipy and serial are imported inside ``run``, so that ``--help`` and usage
-errors answer at once on a small computer. This package alone prints, and this file alone turns errors into exit codes.
+What answers `--help` and usage errors imports nothing heavy, for they must come at once on a small computer: the module of a
+verb, with numpy, scipy and serial, is loaded when its options have been read. This package alone prints, and this file alone
+turns errors into exit codes.
 """
 
 import argparse
@@ -11,6 +11,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, NoReturn
@@ -18,14 +19,29 @@ from typing import Any, NoReturn
 from .. import __version__
 from ..errors import UsageError, UwbliteError
 from ..report.printable import printable
+from . import console, memory
+from . import log_verbs as logs
+from . import map_verbs as maps
+from .interruption import interruptible
+from .options import Verb
 
-VERBS = (
-    "map", "batch", "view", "localize", "plan", "check", "record", "watch", "devices", "plan-anchors", "convert", "evaluate",
-    "optimize", "config",
-)  # fmt: skip
-"""In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
-_WITHOUT_MATRICES = ("view", "record", "watch", "devices", "config")
-"""Verbs that leave maps to other processes, or make none."""
+VERBS = {
+    "map": maps.MAP,
+    "batch": maps.BATCH,
+    "view": maps.VIEW,
+    "localize": maps.LOCALIZE,
+    "plan": maps.PLAN,
+    "check": logs.CHECK,
+    "record": logs.RECORD,
+    "watch": logs.WATCH,
+    "devices": logs.DEVICES,
+    "plan-anchors": maps.PLAN_ANCHORS,
+    "convert": logs.CONVERT,
+    "evaluate": maps.EVALUATE,
+    "optimize": logs.OPTIMIZE,
+    "config": logs.CONFIG,
+}
+"""In the order in which a user meets them; `uwblite VERB` is `run` of the module of that name, with _ for -."""
 
 _DESCRIPTION = """\
 Maps from wheel odometry, ultra-wideband ranges to unknown anchors and a short-range 2D lidar.
@@ -59,18 +75,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     _open_streams()
     words = list(sys.argv[1:] if argv is None else argv)
-    verb = next((word for word in words if not word.startswith("-")), None)
-    if verb is None:
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is None:
         return _without_verb(words)
-    if verb not in VERBS:
-        return _usage_error(f"unknown command {verb!r}{_did_you_mean(verb)}")
-    words.remove(verb)
-    module = module_of(verb)
+    if name not in VERBS:
+        near = get_close_matches(name, VERBS, n=1)
+        return _usage_error(f"unknown command {name!r}{f'; did you mean {near[0]!r}?' if near else ''}")
+    words.remove(name)
     try:
-        args = _verb_parser(verb, module).parse_args(words)
+        args = _parser_of(name, VERBS[name]).parse_args(words)
     except SystemExit as leave:
         return _flushed(int(leave.code or 0))
-    return _run(module, args)
+    return _run(name, args)
 
 
 def _open_streams() -> None:
@@ -88,14 +104,7 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
-def module_of(verb: str) -> Any:
-    """Return the module of a verb."""
-    return import_module(f".{verb.replace('-', '_')}", __name__)
-
-
 def _without_verb(words: list[str]) -> int:
-    from . import console
-
     if "--version" in words:
         console.say(f"uwblite {__version__}")
         return _flushed(0)
@@ -108,7 +117,7 @@ def _without_verb(words: list[str]) -> int:
 
 def _overview() -> argparse.ArgumentParser:
     width = max(len(verb) for verb in VERBS)
-    lines = [f"  {verb:<{width}}  {module_of(verb).HELP}" for verb in VERBS]
+    lines = [f"  {name:<{width}}  {verb.help}" for name, verb in VERBS.items()]
     return argparse.ArgumentParser(
         prog="uwblite",
         usage="uwblite VERB [options]   (uwblite --version, uwblite --help)",
@@ -123,8 +132,6 @@ class _VerbParser(argparse.ArgumentParser):
     """A parser whose errors are short: what is wrong, what may have been meant, where the options stand."""
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        from . import console
-
         console.write(file or sys.stderr, message)
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
@@ -144,16 +151,16 @@ class _VerbParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {printable(message)}\n`{self.prog} --help` shows the options, examples first\n")
 
 
-def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
+def _parser_of(name: str, verb: Verb) -> argparse.ArgumentParser:
     parser = _VerbParser(
-        prog=f"uwblite {verb}",
-        description=f"{module.HELP}\n\n{module.EPILOG.strip()}",
+        prog=f"uwblite {name}",
+        description=f"{verb.help}\n\n{verb.epilog.strip()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     # argparse takes "-0.05,0,0.6" for an option unless it is set that numbers may be joined by commas.
     parser._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")
-    module.add_arguments(parser)
+    verb.add_arguments(parser)
     common = parser.add_argument_group("common options")
     common.add_argument("-q", "--quiet", action="store_true", help="no progress and no notes on stderr")
     common.add_argument("-v", "--verbose", action="count", default=0, help="say more on stderr; -vv for debugging")
@@ -162,14 +169,11 @@ def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
     return parser
 
 
-def _run(module: Any, args: argparse.Namespace) -> int:
-    from . import console
-    from .interruption import interruptible
-
+def _run(name: str, args: argparse.Namespace) -> int:
     console.set_up(quiet=args.quiet, verbose=args.verbose)
     try:
         with interruptible() as interrupted:
-            code = _carry_out(module, args, interrupted)
+            code = _carry_out(name, args, interrupted)
     except KeyboardInterrupt:
         # Between two lines, before the verb begins or after it has ended.
         code = console.fail("interrupted", 130)
@@ -178,23 +182,18 @@ def _run(module: Any, args: argparse.Namespace) -> int:
 
 def _flushed(code: int) -> int:
     """Return an exit code once all output is out; 1 where stdout could not take it."""
-    from . import console
-
     return code if console.flush() else 1
 
 
-def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) -> int:
+def _carry_out(name: str, args: argparse.Namespace, interrupted: list[int]) -> int:
     """Run a verb and turn its errors into exit codes."""
-    from . import console, memory
-
     try:
         with warnings.catch_warnings():
             if not args.debug:
                 # numpy's remarks on overflows say nothing to a user; what comes of them is in a message of ours.
                 warnings.simplefilter("ignore", RuntimeWarning)
-            if module.__name__.rpartition(".")[2] not in _WITHOUT_MATRICES:
-                memory.load_libraries()
-            return int(module.run(args))
+            with memory.within_limits() if VERBS[name].matrices else nullcontext():
+                return int(import_module(f".{name.replace('-', '_')}", __name__).run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
     except Exception as error:
@@ -206,15 +205,12 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
 
 def failure(error: BaseException) -> tuple[int, str]:
     """Return the exit code that an error means, and what is said of it."""
-    from . import console, memory
-
     if isinstance(error, UwbliteError):
         return 2 if isinstance(error, UsageError) else 1, str(error)
     # A library that does not fit is an ImportError; one that is absent is a ModuleNotFoundError.
     unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
     if isinstance(error, MemoryError) or unfit:
-        limited = f"; the shell allows {size / 1e6:.0f} MB (ulimit -v)" if (size := memory.address_space()) else ""
-        return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY}{limited}"
+        return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY + memory.allowed()}"
     if isinstance(error, OSError):
         return 1, console.os_error_text(error)
     if isinstance(error, ImportError):
@@ -223,12 +219,5 @@ def failure(error: BaseException) -> tuple[int, str]:
 
 
 def _usage_error(text: str) -> int:
-    from . import console
-
     console.write(sys.stderr, f"uwblite: error: {printable(text)}\nuwblite --help lists the commands\n")
     return _flushed(2)
-
-
-def _did_you_mean(verb: str) -> str:
-    near = get_close_matches(verb, VERBS, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""

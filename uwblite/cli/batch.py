@@ -1,45 +1,26 @@
 """`uwblite batch`: many recordings, each mapped on its own, and a table of what became of them."""
 
 import argparse
+import hashlib
+import json
 import os
+import time
+import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from concurrent.futures import BrokenExecutor, Executor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from .map import add_map_arguments
-from .options import place
-from .workers import add_worker_arguments, cluster, processes, versions
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
-    from ..report.batch import BatchRow
-
-HELP = "map many recordings, each on its own: a folder for each, and a table"
-EPILOG = """\
-examples:
-  uwblite batch *.log --out maps/                        maps/NAME/ for each recording, maps/batch.html, maps/batch.csv
-  uwblite batch *.log --out maps/ --jobs 4               four recordings at a time
-  uwblite batch *.log --out maps/ --scheduler tcp://head:8786    on the workers of a dask.distributed scheduler
-  uwblite batch *.log --out maps/ --anchors-from site/anchors.csv    all of them in one frame
-
-What is finished is kept: the same command again, after a crash or with further recordings, maps only what is missing.
-A recording that fails does not stop the others. Workers of a scheduler read and write the files themselves, so they must
-see them under the same names.
-
-exit code 1: a recording failed; 3: a result should not be trusted; the table names them
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("logs", metavar="LOG", nargs="+", help="CARMEN log, plain or .gz, ROS bag or CSV folder")
-    text = "folder for the results, a folder for each, and the table"
-    parser.add_argument("--out", type=place, metavar="DIR", required=True, help=text)
-    text = "replace results that were made of other recordings or with other settings"
-    parser.add_argument("--force", action="store_true", help=text)
-    parser.add_argument("--json", action="store_true", help="print the table as one JSON object instead of text")
-    add_worker_arguments(parser, "recordings that are mapped at a time, each in a process (1)")
-    add_map_arguments(parser)
+from ..errors import ConfigError
+from ..io.files import sha256_of, write_text
+from ..io.folders import refuse_foreign, sole_writer, unmarked
+from ..io.results import check_target
+from ..report.batch import BatchRow, row_of, table_csv, table_html
+from . import console, failure
+from .inputs import bag_choices, name_recordings_once
+from .making import config_text, given_files, known, make, read_logs, repeat_command, settings
+from .workers import cluster, processes, versions
 
 
 class Outcome(NamedTuple):
@@ -53,13 +34,6 @@ class Outcome(NamedTuple):
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from pathlib import Path
-
-    from ..io.folders import refuse_foreign, sole_writer, unmarked
-    from ..report.batch import table_csv
-    from . import console
-    from .options import name_recordings_once
-
     name_recordings_once(args)
     tasks = tasks_of(args)
     refuse_foreign(unmarked(Path(args.out), ("batch.csv", "batch.html"), "batch.csv", table_csv([])))
@@ -67,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         os.makedirs(args.out, exist_ok=True)
         rows = _rows(args, tasks)
     if args.json:
-        console.say_json({"out": args.out, "recordings": [_fields(row) for row in rows], "exit_code": _exit_code(rows)})
+        console.say_json({"out": args.out, "recordings": [asdict(row) for row in rows], "exit_code": _exit_code(rows)})
     else:
         console.say(f"the table: {os.path.join(args.out, 'batch.html')} and {os.path.join(args.out, 'batch.csv')}")
     return _exit_code(rows)
@@ -80,9 +54,6 @@ def tasks_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     ------
     UsageError, ConfigError : settings or files that no map could be made with, or two folders of the same name.
     """
-    from .making import known, settings
-    from .options import bag_choices
-
     settings(args), known(args), bag_choices(args)
     absolute = {name: os.path.abspath(value) for name in _FILES if (value := getattr(args, name))}
     return [
@@ -101,10 +72,9 @@ def folder_names(logs: Sequence[str]) -> list[str]:
     ------
     ConfigError : two recordings are alike in both.
     """
-    from ..errors import ConfigError
-
-    short = [_stem(log) for log in logs]
-    parents = [os.path.basename(os.path.dirname(os.path.abspath(log))) for log in logs]
+    paths = [os.path.abspath(log).removesuffix(".gz") for log in logs]
+    short = [os.path.splitext(os.path.basename(path))[0] or os.path.basename(path) for path in paths]
+    parents = [os.path.basename(os.path.dirname(path)) for path in paths]
     names = [f"{parent}_{name}" if short.count(name) > 1 else name for name, parent in zip(short, parents, strict=True)]
     for k, name in enumerate(names):
         if name in names[:k]:
@@ -112,16 +82,8 @@ def folder_names(logs: Sequence[str]) -> list[str]:
     return names
 
 
-def _stem(log: str) -> str:
-    """Return the name of a recording without .gz and what names its format."""
-    name = os.path.basename(os.path.abspath(log)).removesuffix(".gz")
-    return os.path.splitext(name)[0] or name
-
-
-def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "list[BatchRow]":
+def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> list[BatchRow]:
     """Map what is not there yet; write the table after every recording."""
-    from . import console
-
     finished = {k for k, task in enumerate(tasks) if is_finished(task)}
     rows = {k: _row(args.logs[k], tasks[k], Outcome(0)) for k in sorted(finished)}
     if finished:
@@ -139,33 +101,20 @@ def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "lis
 
 def is_finished(task: argparse.Namespace) -> bool:
     """Return whether a folder holds the map of this recording, made with these settings by this version."""
-    from ..io.files import sha256_of
-    from .making import given_files, repeat_command, settings
-
     report = _report(task.out)
     if not report or not os.path.exists(task.logs[0]):
         return False
     config = settings(task)
     return (
         report.get("command") == repeat_command(task, config)
-        and report.get("config_sha256") == _hash_of_settings(config)
+        and report.get("config_sha256") == hashlib.sha256(config_text(config).encode()).hexdigest()
         and report.get("given") == given_files(task)
         and report.get("versions") == versions()
         and [entry.get("sha256") for entry in report.get("inputs", ())] == [sha256_of(task.logs[0])]
     )
 
 
-def _hash_of_settings(config: Any) -> str:
-    import hashlib
-
-    from .making import config_text
-
-    return hashlib.sha256(config_text(config).encode()).hexdigest()
-
-
 def _report(folder: str) -> dict[str, Any]:
-    import json
-
     try:
         with open(os.path.join(folder, "report.json"), encoding="utf-8") as stream:
             report = json.load(stream)
@@ -176,14 +125,6 @@ def _report(folder: str) -> dict[str, Any]:
 
 def map_one(task: argparse.Namespace) -> Outcome:
     """Map one recording; what goes wrong is the outcome, for it shall not stop the others."""
-    import time
-    import warnings
-
-    from ..io.folders import sole_writer
-    from ..io.results import check_target
-    from . import failure
-    from .making import make, read_logs
-
     notes: list[str] = []
     try:
         with warnings.catch_warnings(), sole_writer(task.out):
@@ -219,12 +160,8 @@ def _outcomes(tasks: dict[int, argparse.Namespace], args: argparse.Namespace) ->
                 yield k, outcome or Outcome(1, "its process was killed; too little memory? see the system's log")
 
 
-def _as_they_come(tasks: dict[int, argparse.Namespace], executor: "Executor") -> Iterator[tuple[int, Outcome | None]]:
+def _as_they_come(tasks: dict[int, argparse.Namespace], executor: Executor) -> Iterator[tuple[int, Outcome | None]]:
     """Yield number and outcome of every task; None where the pool broke."""
-    from concurrent.futures import BrokenExecutor, as_completed
-
-    from . import failure
-
     futures = {executor.submit(map_one, task): k for k, task in tasks.items()}
     for future in as_completed(futures):
         error = future.exception()
@@ -236,16 +173,14 @@ def _as_they_come(tasks: dict[int, argparse.Namespace], executor: "Executor") ->
             yield futures[future], future.result()
 
 
-def _row(recording: str, task: argparse.Namespace, outcome: Outcome) -> "BatchRow":
-    from ..report.batch import BatchRow, row_of
-
+def _row(recording: str, task: argparse.Namespace, outcome: Outcome) -> BatchRow:
     folder = os.path.basename(task.out)
     if outcome.error:
         return BatchRow(recording, folder, "failed", outcome.error.replace(task.logs[0], recording))
     return row_of(recording, folder, _report(task.out))
 
 
-def _line(row: "BatchRow") -> str:
+def _line(row: BatchRow) -> str:
     text = f"{row.recording}: {row.outcome}"
     if row.outcome == "failed":
         return f"{text}: {row.reason}"
@@ -254,23 +189,12 @@ def _line(row: "BatchRow") -> str:
     return f"{text}{f' ({row.reason})' if row.reason else ''}{size}, {figures}"
 
 
-def _write_table(out: str, rows: "dict[int, BatchRow]") -> None:
-    from pathlib import Path
-
-    from ..io.files import write_text
-    from ..report.batch import table_csv, table_html
-
+def _write_table(out: str, rows: dict[int, BatchRow]) -> None:
     ordered = [rows[k] for k in sorted(rows)]
     write_text(Path(out) / "batch.csv", table_csv(ordered))
     write_text(Path(out) / "batch.html", table_html(ordered, os.path.basename(os.path.abspath(out))))
 
 
-def _fields(row: "BatchRow") -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(row)
-
-
-def _exit_code(rows: "Sequence[BatchRow]") -> int:
+def _exit_code(rows: Sequence[BatchRow]) -> int:
     outcomes = {row.outcome for row in rows}
     return 1 if "failed" in outcomes else 3 if "doubted" in outcomes else 0

@@ -1,84 +1,54 @@
 """`uwblite check`: is a recording fit to be mapped, and what is to be done about it."""
 
 import argparse
+import dataclasses
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..assessment.recording import Diagnosis, diagnose
+from ..errors import DataError, UwbliteError
+from ..findings import folded
 from ..report.printable import duration
-from .options import add_bag_arguments, add_mounting_arguments
+from ..screening.screen import screen
+from ..sensor_log import SensorLog
+from . import console
+from .cost import SECONDS_AT_LEAST, expected_cost, model_seconds
+from .inputs import recording
 from .wording import calibration_text, signed
-
-if TYPE_CHECKING:
-    from ..assessment.recording import Diagnosis
-    from ..sensor_log import SensorLog
-
-HELP = "say what is wrong with a recording and what to do about it, before mapping it"
-EPILOG = """\
-examples:
-  uwblite check run.log                    findings, worst first; exit code 3 where one spoils the map
-  uwblite check run.log --map              also what only a map can tell; takes as long as one
-  uwblite check run.log.gz --json          the same for a script
-  uwblite check run.log --laser-flipped    does the laser agree with the wheels that way?
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    text = "map it as well: scales, biases, clock offsets and the doubts of that map; takes as long as a map"
-    parser.add_argument("--map", action="store_true", help=text)
-    add_mounting_arguments(parser)
-    add_bag_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..assessment.recording import diagnose
-    from . import console
-    from .cost import model_seconds
-    from .formats import read_recording
-    from .options import apply_mounting, bag_choices
-
-    log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
+    log = recording(args, args.log)
     began = time.perf_counter()
-    repaired = screened(log)
+    try:
+        repaired = screen(log)
+    except DataError:  # a map refuses it
+        repaired = None
     if args.map:
         diagnosis, seconds = examined(log, repaired, began)
     else:
         diagnosis, seconds = diagnose(log, repaired=repaired), model_seconds(log)
-    cost = expected_cost(repaired or log, seconds)
-    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost, mapped=args.map))
+    needs = {} if repaired is None else {**expected_cost(repaired), "seconds": round(seconds, 1)}
+    console.report(
+        args.json, summary_json(args.log, diagnosis, needs), report_lines(args.log, diagnosis, needs, mapped=args.map)
+    )
     return 3 if diagnosis.doubts else 0
 
 
-def screened(log: "SensorLog") -> "SensorLog | None":
-    """Return the recording as a map repairs it; None where a map refuses it."""
-    from ..errors import DataError
-    from ..screening.screen import screen
-
-    try:
-        return screen(log)
-    except DataError:
-        return None
-
-
-def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "tuple[Diagnosis, float]":
+def examined(log: SensorLog, repaired: SensorLog | None, began: float) -> tuple[Diagnosis, float]:
     """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this doubts.
 
     Parameters
     ----------
-    repaired : the recording screened, see `screened`. began : time at which that began, s.
+    repaired : the recording screened, None where a map refuses it. began : time at which that began, s.
 
     Returns
     -------
     The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
     """
-    from ..assessment.recording import diagnose
-    from ..errors import UwbliteError
     from ..mapping import MappingConfig, build_map
     from ..pipeline.scan_selection import thinned
-    from .cost import SECONDS_AT_LEAST
 
     config = MappingConfig()
     try:
@@ -89,22 +59,8 @@ def examined(log: "SensorLog", repaired: "SensorLog | None", began: float) -> "t
     return diagnose(log, result=made, repaired=repaired), seconds
 
 
-def expected_cost(log: "SensorLog", seconds: float) -> dict[str, float]:
-    """Return what `uwblite map` is expected to need of the recording as it repairs it; empty where it refuses the recording."""
-    from ..errors import DataError
-    from ..screening.screen import screen
-    from . import cost
-
-    try:
-        return {**cost.expected_cost(screen(log)), "seconds": round(seconds, 1)}
-    except DataError:
-        return {}
-
-
-def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> dict[str, Any]:
+def summary_json(name: str, diagnosis: Diagnosis, cost: dict[str, float]) -> dict[str, Any]:
     """Return the findings and figures for programs."""
-    import dataclasses
-
     return {
         "log": name,
         "findings": [dataclasses.asdict(f) for f in diagnosis.findings],
@@ -114,10 +70,8 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> d
     }
 
 
-def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, mapped: bool = True) -> list[str]:
+def report_lines(name: str, diagnosis: Diagnosis, cost: dict[str, float], *, mapped: bool = True) -> list[str]:
     """Return the findings and figures as lines of text; what a finding explains stands below it."""
-    from ..findings import folded
-
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
     for finding, explains in folded(diagnosis.findings):
         sensor = f"{finding.sensor}: " if finding.sensor else ""
@@ -126,7 +80,9 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, m
         lines += [f"         explains {other.severity}: {other.text}" for other in explains]
     if not diagnosis.findings:
         lines.append("nothing to complain about")
-    lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
+    lines += ["", *_anchor_lines(diagnosis.figures)]
+    values = diagnosis.figures.get("radio calibration", {}).items()
+    lines += [calibration_text(name, **value) for name, value in values if "value" in value and ":" not in name]
     if cost:
         grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
         lines.append(f"expected cost: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
@@ -134,9 +90,7 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], *, m
         lines.append(_ONLY_A_MAP)
     doubts = len(diagnosis.doubts)
     lines.append(
-        f"fix the {doubts} doubt{'s' if doubts > 1 else ''} first"
-        if doubts
-        else f"next: uwblite map {name} --out map/"
+        f"fix the {doubts} doubt{'s' if doubts > 1 else ''} first" if doubts else f"next: uwblite map {name} --out map/"
     )
     return lines
 
@@ -180,8 +134,3 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
     if coverage := figures.get("uwb", {}).get("coverage"):
         lines.append("anchors in reach: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
     return lines
-
-
-def _calibration_lines(figures: dict[str, Any]) -> list[str]:
-    values = {k: v for k, v in figures.get("radio calibration", {}).items() if "value" in v and ":" not in k}
-    return [calibration_text(name, **value) for name, value in values.items()]

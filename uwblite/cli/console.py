@@ -4,6 +4,8 @@ A reader that leaves early (``uwblite map ... | head -1``) does not stop the wor
 does a full disk behind stdout, which is reported at the end. No line has what a terminal would obey, whatever a file's name.
 """
 
+import errno
+import json
 import logging
 import os
 import sys
@@ -68,6 +70,12 @@ def note(text: str) -> None:
         write(sys.stderr, printable(with_options(text)) + "\n")
 
 
+def note_of(name: str, warnings: Iterable[str]) -> None:
+    """Write what is odd about a file, a line each, to stderr."""
+    for warning in warnings:
+        note(f"uwblite: {name}: {warning}")
+
+
 def fail(text: str, code: int, *, trace: bool = False) -> int:
     """Write one line about what went wrong to stderr and return the exit code."""
     _clear_bar()
@@ -89,7 +97,7 @@ def os_error_text(error: OSError) -> str:
         "EACCES": "; check who owns it, or choose another place",
         "EROFS": "; choose a place that can be written to",
         "ENOENT": "; check the spelling",
-    }.get(_name_of(error.errno), "")
+    }.get(errno.errorcode.get(error.errno or 0, ""), "")
     return f"{where}{reason}{hint}"
 
 
@@ -99,12 +107,6 @@ def _folder_is_gone() -> bool:
     except OSError:
         return True
     return False
-
-
-def _name_of(number: int | None) -> str:
-    import errno
-
-    return errno.errorcode.get(number or 0, "")
 
 
 def flush() -> bool:
@@ -178,10 +180,8 @@ class Progress:
         if now - self.shown < 0.1 and done < total:
             return
         self.shown = now
-        if share is None:
-            self._draw(progress_line(stage, done, total, now - self.began))
-        else:
-            self._draw(overall_line(stage, share, now - self.first))
+        part, since = (done / total if total > 0 else None, self.began) if share is None else (share, self.first)
+        self._draw(progress_line(stage, part, now - since))
 
     def _draw(self, line: str) -> None:
         line = printable(line)[: self._columns() - 1]
@@ -209,27 +209,17 @@ class Progress:
             _CONSOLE.bar = None
 
 
-def progress_line(stage: str, done: int, total: int, elapsed: float) -> str:
-    """Return the text of a progress bar; elapsed is the time since the stage began, s."""
-    if total <= 0:
+def progress_line(stage: str, share: float | None, elapsed: float) -> str:
+    """Return the text of a progress bar; share 0..1 is done, None = not known, since the work began that long ago, s."""
+    if share is None:
         return f"{stage} ..."
-    share = min(max(done / total, 0.0), 1.0)
-    bar = "#" * int(20 * share)
-    left = f"  {duration(elapsed * (1.0 - share) / share)} left" if 0.0 < share < 1.0 and elapsed > 1.0 else ""
-    return f"{stage:<16} [{bar:<20}] {100 * share:3.0f} %{left}"
-
-
-def overall_line(stage: str, share: float, elapsed: float) -> str:
-    """Return the text of a progress bar over all stages; elapsed is the time since the first began, s."""
-    known = 0.05 < share < 1.0 and elapsed > 2.0
-    left = f"  about {duration(elapsed * (1.0 - share) / share)} left" if known else ""
+    share = min(max(share, 0.0), 1.0)
+    left = f"  about {duration(elapsed / share - elapsed)} left" if 0.05 < share < 1.0 and elapsed > 2.0 else ""
     return f"[{'#' * int(20 * share):<20}] {100 * share:3.0f} %  {stage}{left}"
 
 
 def say_json(value: Any) -> None:
     """Write one JSON object to stdout; numbers that are not finite become null."""
-    import json
-
     say_lines(json.dumps(plain(value), indent=2, allow_nan=False))
 
 

@@ -3,10 +3,15 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from ..grid.occupancy_grid import GridConfig
+from ..sensor_log import SensorLog
+
 if TYPE_CHECKING:
-    from ..arrays import Floats
-    from ..mapping import MappingConfig
-    from ..sensor_log import SensorLog
+    from ..pipeline.mapping_config import MappingConfig
 
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
@@ -27,10 +32,8 @@ _SCANS_LOOKED_AT = 500
 """At most, for the size of the map."""
 
 
-def work_seconds(log: "SensorLog") -> float:
+def work_seconds(log: SensorLog) -> float:
     """Return the time that the map of a recording takes on the computer of docs/lab/performance.md, s."""
-    import numpy as np
-
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     readings = 0 if log.scans is None else log.scans.ranges.size
@@ -39,17 +42,13 @@ def work_seconds(log: "SensorLog") -> float:
     return _SECONDS_PER_METRE * path + _SECONDS_PER_RANGE * ranges + _SECONDS_PER_READING * readings
 
 
-def model_seconds(log: "SensorLog") -> float:
+def model_seconds(log: SensorLog) -> float:
     """Return the wall time of a map on the computer of docs/lab/performance.md, s."""
     return SECONDS_AT_LEAST + work_seconds(log)
 
 
-def seen_size(log: "SensorLog") -> "Floats":
+def seen_size(log: SensorLog) -> Floats:
     """Return the size (2,) of what the scans saw and the robot drove through, by the odometry alone, m."""
-    import numpy as np
-
-    from .. import se2
-
     points = [log.odometry.poses[:, :2]]
     if log.scans is not None:
         scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS_LOOKED_AT) or 1))
@@ -62,16 +61,12 @@ def seen_size(log: "SensorLog") -> "Floats":
     return np.asarray(np.ptp(np.concatenate(points), axis=0))
 
 
-def expected_cost(log: "SensorLog", config: "MappingConfig | None" = None) -> dict[str, float]:
+def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict[str, float]:
     """Return the time and memory that the map of a screened recording is expected to need, and the size of the map.
 
     The time is that on the computer of docs/performance.md; a Raspberry Pi 4 takes several times as long.
     """
-    import numpy as np
-
-    from ..mapping import MappingConfig
-
-    grid = (config or MappingConfig()).grid
+    grid = GridConfig() if config is None else config.grid
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)

@@ -2,29 +2,17 @@
 
 import argparse
 import time
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
+from ..drivers.device_options import Options, Setup
+from ..drivers.devices import DEVICES, SENSORS, DeviceKind, kinds_on_usb
+from ..drivers.events import Action, Note, Reopen, Send, SetBaud, SetDtr
+from ..drivers.ports import plugged_in
+from ..drivers.session import Session
+from ..drivers.transport import Port, check_url, open_port
+from ..errors import DeviceError
 from .console import note, say, say_json
-
-if TYPE_CHECKING:
-    from ..drivers.devices import DeviceKind
-    from ..drivers.events import Action
-    from ..drivers.transport import Port
-
-HELP = "list tag, lidar and base that are plugged in, and say how to fix what is not right"
-EPILOG = """
-examples:
-  uwblite devices                              look at every port of a known kind
-  uwblite devices /dev/ttyUSB0 /dev/serial0    look at these ports, whatever they are
-  uwblite devices --pan-id 0xC0DE              and is the tag in this network?
-  uwblite devices --list                       only list ports; nothing is opened
-  uwblite devices --kinds                      what can be recorded, with names and options
-
-Looking at a port opens it, listens for a moment and asks who is there. Ports of an unknown kind are only opened when they
-are named. Nothing is changed: every finding names what to type. Exit code 0: all is well; 1: no device was found; 3: something
-needs mending.
-"""
 
 LISTEN, ASK = 0.6, 5.0
 """s to wait for a device that talks unasked, and for one that answers."""
@@ -42,135 +30,94 @@ class PortReport:
     findings: list[tuple[str, str]] = field(default_factory=list)
     """(level, what and how to mend it)."""
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("ports", metavar="PORT", nargs="*", help="ports to look at (default: those of a known kind)")
-    parser.add_argument("--list", action="store_true", help="list the ports and open none")
-    parser.add_argument("--kinds", action="store_true", help="list the devices that can be recorded, with their options")
-    parser.add_argument("--pan-id", metavar="ID", type=_pan_id, help="network id that the tag should have, e.g. 0xC0DE")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    @property
+    def sound(self) -> bool:
+        """Whether nothing needs mending."""
+        return all(level == "info" for level, _ in self.findings)
 
 
 def run(args: argparse.Namespace) -> int:
     """Look at the ports and report."""
-    from ..drivers.devices import kinds_on_usb
-    from ..drivers.ports import plugged_in
-    from ..drivers.transport import check_url
-    from ..errors import DeviceError
-
     if args.kinds:
-        return _list_kinds()
-    reports = []
-    if args.ports:
-        for path in args.ports:
-            check_url(path)
-        reports = [PortReport(path) if args.list else look(path, [], args.pan_id) for path in args.ports]
-    else:
-        for port in plugged_in():
-            kinds = kinds_on_usb(port.usb_id, port.description)
-            port_report = look(port.path, kinds, args.pan_id) if kinds and not args.list else PortReport(port.path)
-            port_report.details = {"usb": f"{port.usb_id} {port.description}".strip(), **port_report.details}
-            reports.append(port_report)
-            if not kinds:
-                port_report.findings.append(("info", f"kind not known; `uwblite devices {port.path}` looks at it"))
+        for kind in (kind for sensor in SENSORS for kind in DEVICES.values() if kind.sensor == sensor):
+            say(f"--{kind.sensor} {kind.name}:PORT".ljust(28) + kind.title)
+            if kind.options:
+                say(f"    options: {kind.options}")
+        return 0
+    for path in args.ports:
+        check_url(path)
+    reports = [PortReport(path) if args.list else look(path, [], args.pan_id) for path in args.ports]
+    for port in () if args.ports else plugged_in():
+        kinds = kinds_on_usb(port.usb_id, port.description)
+        seen = look(port.path, kinds, args.pan_id) if kinds and not args.list else PortReport(port.path)
+        seen.details = {"usb": f"{port.usb_id} {port.description}".strip(), **seen.details}
+        reports.append(seen)
+        if not kinds:
+            seen.findings.append(("info", f"kind not known; `uwblite devices {port.path}` looks at it"))
     if not reports:
-        raise DeviceError("no serial device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
+        raise DeviceError(f"no serial device is plugged in; {_PLUG_IN}")
     _compare_networks(reports)
     _report(reports, args.json)
-    if not args.ports and not any(":" in port_report.details["usb"].split(" ")[0] for port_report in reports):
-        note("no USB device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
-    if any(level != "info" for port_report in reports for level, _ in port_report.findings):
+    if not args.ports and not any(":" in seen.details["usb"].split(" ")[0] for seen in reports):
+        note(f"no USB device is plugged in; {_PLUG_IN}")
+    if not all(seen.sound for seen in reports):
         return 3
-    return 0 if args.list or any(port_report.found for port_report in reports) else 1
+    return 0 if args.list or any(seen.found for seen in reports) else 1
 
 
-def _list_kinds() -> int:
-    from ..drivers.devices import DEVICES, SENSORS
-
-    for sensor in SENSORS:
-        for kind in DEVICES.values():
-            if kind.sensor == sensor:
-                say(f"--{sensor} {kind.name}:PORT".ljust(28) + kind.title)
-                if kind.options:
-                    say(f"    options: {kind.options}")
-    return 0
+_PLUG_IN = "check cables and power, then `dmesg | tail` (see firmware_notes)"
 
 
 def _report(reports: list[PortReport], as_json: bool) -> None:
     if as_json:
-        rows = [
-            {
-                "port": port_report.path,
-                "kind": port_report.kind,
-                **port_report.details,
-                "findings": [{"level": level, "text": text} for level, text in port_report.findings],
-            }
-            for port_report in reports
-        ]
+        rows = []
+        for seen in reports:
+            findings = [{"level": level, "text": text} for level, text in seen.findings]
+            rows.append({"port": seen.path, "kind": seen.kind, **seen.details, "findings": findings})
         say_json({"devices": rows})
         return
-    for port_report in reports:
-        say(f"{port_report.path}: {port_report.kind}")
-        for name, value in port_report.details.items():
+    for seen in reports:
+        say(f"{seen.path}: {seen.kind}")
+        for name, value in (*seen.details.items(), *seen.findings):
             say(f"    {name}: {value}")
-        for level, text in port_report.findings:
-            say(f"    {level}: {text}")
-    if reports and all(port_report.found for port_report in reports) and not any(
-        level != "info" for port_report in reports for level, _ in port_report.findings
-    ):  # fmt: skip
+    if all(seen.found and seen.sound for seen in reports):
         note("all is well")
 
 
-def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport:
+def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
     """Open a port, find out who is there, and judge its settings.
 
     Parameters
     ----------
     kinds : of device that it may be; empty = any.
     pan_id : network id that a tag should have, None = any.
-
-    Returns
-    -------
-    PortReport
     """
-    from ..drivers.devices import DEVICES
-    from ..drivers.transport import open_port
-    from ..errors import DeviceError
-
-    port_report = PortReport(path)
+    seen = PortReport(path)
     tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:
-        port = open_port(path, tried[0].baud)
-    except DeviceError as error:
-        port_report.findings.append(("error", str(error)))
-        return port_report
-    try:
-        for kind in sorted(tried, key=lambda kind: not kind.talks):
-            port.set_baud(kind.baud)
-            if _ask(port, kind, port_report):
-                _judge_network(port_report, pan_id)
-                return port_report
+        with closing(open_port(path, tried[0].baud)) as port:
+            for kind in sorted(tried, key=lambda kind: not kind.talks):
+                port.set_baud(kind.baud)
+                if _ask(port, kind, seen):
+                    network = seen.details.get("network")
+                    if pan_id is not None and network not in (None, "0x0000", f"0x{pan_id:04X}"):
+                        text = f"the network id is {network}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
+                        seen.findings.append(("error", text))
+                    return seen
         known = ", ".join(kind.title for kind in tried)
         silent = f"nobody known answers: is the device powered, and is it one of these: {known}?"
-        port_report.findings.append(("error", kinds[0].silent if kinds else silent))
+        seen.findings.append(("error", kinds[0].silent if kinds else silent))
     except DeviceError as error:
-        port_report.findings.append(("error", str(error)))
-    finally:
-        port.close()
-    return port_report
+        seen.findings.append(("error", str(error)))
+    return seen
 
 
-def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
+def _ask(port: Port, kind: DeviceKind, seen: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
-    from ..drivers.device_options import Options, Setup
-    from ..drivers.events import Note, Reopen, Send, SetBaud, SetDtr
-    from ..drivers.session import Session
-
     driver = kind.make(Options(kind.name, {}), Setup(stream=False))
     session, notes = Session(driver), []
 
-    def do(actions: "list[Action]") -> bool:
+    def do(actions: list[Action]) -> bool:
         for action in actions:
             if isinstance(action, Send):
                 port.write(action.data)
@@ -191,38 +138,20 @@ def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
         going = going and do(session.tick(now))
         time.sleep(0.003)
     if not driver.ready:
-        port_report.findings += [(note.level, note.text) for note in notes if note.name == "lidar-scip1-only"]
+        seen.findings += [(note.level, note.text) for note in notes if note.name == "lidar-scip1-only"]
         return False
     do(session.stop())
     identity = driver.identity()
-    port_report.found, port_report.kind, port_report.details = True, identity.title, dict(identity.details)
+    seen.found, seen.kind, seen.details = True, identity.title, dict(identity.details)
     output = {note.name for note in identity.findings}
     shown = [*identity.findings, *(note for note in notes if note.name not in output)]
-    port_report.findings += [(note.level, note.text) for note in shown]
+    seen.findings += [(note.level, note.text) for note in shown]
     return True
-
-
-def _judge_network(port_report: PortReport, pan_id: int | None) -> None:
-    network = port_report.details.get("network")
-    if pan_id is not None and network not in (None, "0x0000", f"0x{pan_id:04X}"):
-        text = f"the network id is {network}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
-        port_report.findings.append(("error", text))
 
 
 def _compare_networks(reports: list[PortReport]) -> None:
     """Nodes on one computer that are in different networks never reach each other."""
-    networks = {port_report.details["network"] for port_report in reports if "network" in port_report.details}
-    if len(networks) > 1:
-        for port_report in reports:
-            if "network" in port_report.details:
-                port_report.findings.append(("warning", f"nodes differ in network id ({', '.join(sorted(networks))})"))
-
-
-def _pan_id(text: str) -> Any:
-    try:
-        value = int(text, 16)
-    except ValueError:
-        value = -1
-    if not 0 < value <= 0xFFFF:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a network id such as 0xC0DE")
-    return value
+    nodes = [seen for seen in reports if "network" in seen.details]
+    if len(networks := {seen.details["network"] for seen in nodes}) > 1:
+        for seen in nodes:
+            seen.findings.append(("warning", f"nodes differ in network id ({', '.join(sorted(networks))})"))

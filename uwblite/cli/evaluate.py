@@ -1,56 +1,42 @@
-"""`uwblite evaluate`: compare a result with the truth."""
+"""`uwblite evaluate`: a result against true poses, relations, anchors, columns and walls."""
 
 import argparse
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
-from .options import number, place
+import numpy as np
 
-HELP = "compare a map, its trajectory and anchors with the truth"
-EPILOG = """\
-examples:
-  uwblite evaluate map/ --truth truth.tum
-  uwblite evaluate map/ --truth truth.tum --anchors truth_anchors.csv --landmarks columns.csv
-  uwblite evaluate map/ --truth truth.tum --json
-  uwblite evaluate map/ --relations truth.relations.gz
-  uwblite evaluate both/ --truth monday.tum --truth tuesday.tum    a map of two recordings
-  uwblite evaluate both/ --truth tuesday.tum --recording 2         only the second of them
+from .. import se2
+from ..arrays import Floats
+from ..errors import ConfigError, FormatError, UsageError
+from ..evaluation.map import LandmarkErrors, WallErrors, landmark_errors, landmark_errors_along, wall_errors
+from ..evaluation.relations import FAR, RelationErrors, Relations, evaluate_relations
+from ..evaluation.trajectory import AnchorErrors, ErrorStatistics, TrajectoryErrors, evaluate_anchors, evaluate_trajectory
+from ..io.csv_table import read_csv
+from ..io.map_server import read_map
+from ..io.results import repair_result
+from ..io.stored_result import read_result
+from ..io.tum import read_relations, read_tum
+from ..lidar.columns import Landmarks, find_columns
+from . import console
 
-The trajectory is aligned with the truth by the best rigid motion, without scale; ATE and RPE are those of evo_ape -a and
-evo_rpe. Several truths, in one frame, are of the recordings in their order: each is judged alone and all together, under
-one motion. Columns are searched in the map; the distances between them are what is judged.
+_DEGREES = math.degrees(1.0)
+Shown = tuple[dict[str, Any], list[str]]
+"""Figures ready for JSON, and lines of text."""
+Timed = tuple[Floats, Floats, Floats, Floats]
+"""Stamps (n,) s and poses (n, 3) of a result, and the true ones."""
 
-files (lengths in metres):
-  --truth      stamp x y z qx qy qz qw        identity quaternions throughout = the heading is not known
-  --anchors    id,x,y
-  --landmarks  name,x,y,radius[,neighbours]   neighbours: names separated by blanks; only these distances are judged
-  --walls      x1,y1,x2,y2
-  --relations  stamp1 stamp2 x y z roll pitch yaw: the scan of stamp2 as seen from that of stamp1. Poses are asked at the
-               lidar's clock, as the map found it; relations without an answer are counted and reported
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
-    parser.add_argument("--truth", type=place, metavar="FILE.tum", action="append", help="true poses; one per recording")
-    parser.add_argument("--relations", type=place, metavar="FILE", help="true relative poses of scans (Kuemmerle et al. 2009)")
-    counted, length = number(above=0, whole=True), number(above=0)
-    parser.add_argument("--recording", metavar="N", type=counted, help="the recording that a single truth is of (1)")
-    parser.add_argument("--anchors", type=place, metavar="FILE.csv", help="true anchors")
-    parser.add_argument("--landmarks", type=place, metavar="FILE.csv", help="true columns")
-    parser.add_argument("--walls", type=place, metavar="FILE.csv", help="true walls")
-    parser.add_argument("--delta", type=length, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
-    parser.add_argument("--max-gap", type=length, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
-    parser.add_argument("--search-radius", type=length, default=1.0, metavar="M", help="m around a column's place (1)")
-    parser.add_argument("--tolerance", type=length, default=0.1, metavar="M", help="m from a wall that count as on it (0.1)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+DEFAULT_RADIUS = 0.3
+"""m, of a column whose radius is not given."""
+_PAUSE = 1e6
+"""s between two recordings that are compared as one: more than any gap that is bridged."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..errors import ConfigError, UsageError
-    from . import console
-    from .comparison import compare
-
     if not args.truth and not args.relations:
         raise UsageError("give --truth, --relations, or both")
     if not args.truth and (args.anchors or args.landmarks or args.walls):
@@ -59,3 +45,185 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
     console.report(args.json, *compare(args))
     return 0
+
+
+def compare(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """Return what is compared as a JSON-ready summary and as lines of text."""
+    folder = Path(args.dir)
+    repair_result(folder)
+    summary: dict[str, Any] = {}
+    lines: list[str] = []
+    for name, figures, text in _comparisons(args, folder):
+        if name:
+            summary[name] = figures
+        lines += text
+    return summary, lines
+
+
+def _comparisons(args: argparse.Namespace, folder: Path) -> Iterator[tuple[str, Any, list[str]]]:
+    """Yield each comparison's name ("" = text alone), figures and lines."""
+    first = args.recording or 1
+    if args.relations:
+        yield "relations", *_relations(folder, args.relations, first)
+    if not args.truth:
+        return
+    recordings = [_recording(folder, truth, number) for number, truth in enumerate(args.truth, first)]
+    together, several = _one_after_another(recordings), len(recordings) > 1
+    trajectory = evaluate_trajectory(*together, max_gap=args.max_gap, rpe_delta=args.delta)
+    yield "trajectory", *_shown_trajectory(trajectory, len(together[2]), "together" if several else "trajectory")
+    if several:
+        alone = [(evaluate_trajectory(*r, max_gap=args.max_gap, rpe_delta=args.delta), len(r[2])) for r in recordings]
+        shown = [_shown_trajectory(*own, f"recording {k} alone") for k, own in enumerate(alone, 1)]
+        yield "recordings", [figures for figures, _ in shown], [line for _, lines in shown for line in lines]
+    if args.anchors:
+        yield "anchors", *_shown_anchors(_anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map))
+    if args.landmarks or args.walls:
+        yield from _surfaces(args, folder, together, trajectory)
+
+
+def _surfaces(
+    args: argparse.Namespace, folder: Path, compared: Timed, trajectory: TrajectoryErrors
+) -> Iterator[tuple[str, Any, list[str]]]:
+    """Compare columns and walls with the map, and columns with where the trajectory draws them."""
+    path, (stamps, poses, true_stamps, true_poses) = folder / "map.yaml", compared
+    grid = read_map(path) if path.exists() else None
+    occupied = None if grid is None else se2.transform(trajectory.T_truth_map, grid.occupied_points())
+    truth, pairs = read_landmarks(args.landmarks) if args.landmarks else (None, None)
+    if truth is not None:
+        if grid is not None and occupied is not None:
+            found = find_columns(occupied, truth, search_radius=args.search_radius, cell=grid.geometry.resolution)
+            yield "landmarks", *_shown_landmarks(landmark_errors(found, truth, pairs), "columns in the map")
+        if trajectory.heading is not None:
+            estimate = se2.interpolate_trajectory(stamps, poses, true_stamps[trajectory.matched])
+            drawn = landmark_errors_along(truth, true_poses[trajectory.matched], estimate, pairs)
+            figures, lines = _shown_landmarks(drawn, "columns as the trajectory draws them")
+            yield "landmarks_along_trajectory", figures, lines[:1]
+    if args.walls and occupied is not None:
+        posts = np.empty((0, 3)) if truth is None else np.column_stack([truth.positions, truth.radii])
+        walls, seen_from = read_csv(args.walls).numbers("x1", "y1", "x2", "y2"), true_poses[trajectory.matched, :2]
+        yield "walls", *_shown_walls(wall_errors(occupied, walls, posts, seen_from, tolerance=args.tolerance))
+    if occupied is None:
+        yield "", None, ["no map.yaml in the folder: columns and walls are not judged"]
+
+
+def _relations(folder: Path, path: str, number: int) -> Shown:
+    """Compare a recording of a result with relations."""
+    result = read_result(folder)
+    if number > len(result.trajectories):
+        raise ConfigError(f"{folder} is a map of {len(result.trajectories)} recordings, not of {number}")
+    trajectory = _in_order(*result.trajectories[number - 1])
+    found = evaluate_relations(*trajectory, Relations(*read_relations(path)), result.laser_delay)
+    return _shown_relations(found, result.laser_delay)
+
+
+def _recording(folder: Path, truth: str, number: int) -> Timed:
+    """Return stamps and poses of a recording in a result, and the true ones."""
+    own = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
+    if number > 1 and folder.is_dir() and not own.exists():
+        raise ConfigError(f"{folder} has no {own.name}: it is a map of fewer recordings")
+    return (*_in_order(*read_tum(own)), *_in_order(*read_tum(truth)))
+
+
+def _one_after_another(recordings: Sequence[Timed]) -> Timed:
+    """Return all recordings as one; their stamps are moved apart, for they may be of the same hour or of clocks set again."""
+    if len(recordings) == 1:
+        return recordings[0]
+    moved: list[Timed] = []
+    free = 0.0
+    for stamps, poses, true_stamps, true_poses in recordings:
+        begin = free - min(stamps[0], true_stamps[0])
+        moved.append((stamps + begin, poses, true_stamps + begin, true_poses))
+        free = max(moved[-1][0][-1], moved[-1][2][-1]) + _PAUSE
+    return tuple(np.concatenate(column) for column in zip(*moved, strict=True))  # type: ignore[return-value]
+
+
+def _in_order(stamps: Floats, poses: Floats) -> tuple[Floats, Floats]:
+    """Return a trajectory with its stamps in order."""
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], poses[order]
+
+
+def _anchors(path: Path, truth: str, T_truth_map: Floats) -> AnchorErrors:
+    estimate, true = read_csv(path), read_csv(truth)
+    places, true_places = estimate.numbers("x", "y", default=float("nan")), true.numbers("x", "y")
+    return evaluate_anchors(estimate.texts("id"), places, true.texts("id"), true_places, T_truth_map)
+
+
+def read_landmarks(path: str) -> tuple[Landmarks, tuple[tuple[str, str], ...] | None]:
+    """Return the columns of a table, and the pairs whose distances count (None = all)."""
+    table = read_csv(path)
+    names, places = table.texts("name"), table.numbers("x", "y")
+    radii = table.numbers("radius", default=DEFAULT_RADIUS)[:, 0]
+    if not (np.isfinite(places).all() and (radii > 0).all()):
+        raise FormatError("places must be numbers, and radii positive", path)
+    neighbours = [text.split() for text in table.texts("neighbours", default="")]
+    pairs = tuple((a, b) for a, others in zip(names, neighbours, strict=True) for b in others)
+    return Landmarks(names, places, radii), pairs or None
+
+
+def _shown_trajectory(t: TrajectoryErrors, true_count: int, title: str) -> Shown:
+    named = {"ate": t.ate, "heading": t.heading, "rpe_position": t.rpe_position, "rpe_heading": t.rpe_heading}
+    summary = {
+        "true_poses": true_count, "compared": len(t.matched), "rpe_delta": t.rpe_delta, "T_truth_map": t.T_truth_map.tolist(),
+        **{name: None if errors is None else _plain(errors) for name, errors in named.items()},
+    }  # fmt: skip
+    lines = [f"{title:<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}", _row("  position (ATE)", t.ate, "m")]
+    if t.heading is not None:
+        lines.append(_row("  heading", t.heading, "deg", _DEGREES))
+    if t.rpe_position is not None and t.rpe_heading is not None:
+        per = f"per {t.rpe_delta:g} m"
+        lines.append(_row("  relative (RPE)", t.rpe_position, f"m {per}"))
+        lines.append(_row("  relative heading", t.rpe_heading, f"deg {per}", _DEGREES))
+    if t.heading is None:
+        lines.append("  the truth has no heading: positions only")
+    return summary, [*lines, f"  {len(t.matched)} of {true_count} true poses compared"]
+
+
+def _row(name: str, s: ErrorStatistics, unit: str, scale: float = 1.0) -> str:
+    return f"{name:<24}" + "".join(f"{scale * v:11.4f}" for v in (s.rmse, s.mean, s.median, s.max)) + f"  {unit}"
+
+
+def _shown_relations(found: RelationErrors, laser_delay: float) -> Shown:
+    count, missing = len(found.answered), int((~found.answered).sum())
+    t, r = found.translations, found.rotations
+    summary = {
+        "count": count, "not_answered": missing, "share_far": found.far, "laser_delay": laser_delay,
+        "translation": _plain(t), "rotation": _plain(r),
+    }  # fmt: skip
+    return summary, [
+        f"{'relations':<24}{'mean':>11}{'sd':>11}{'median':>11}{'max':>11}",
+        f"{'  translation':<24}{t.mean:11.4f}{t.std:11.4f}{t.median:11.4f}{t.max:11.4f}  m",
+        f"{'  rotation':<24}" + "".join(f"{_DEGREES * v:11.4f}" for v in (r.mean, r.std, r.median, r.max)) + "  deg",
+        f"{count} relations, {missing} not answered; {found.far:.1%} beyond {FAR:g} m or not answered; "
+        f"asked at the lidar's clock {laser_delay:+.3f} s",
+    ]
+
+
+def _shown_anchors(a: AnchorErrors) -> Shown:
+    errors = dict(zip(a.ids, a.distances.tolist(), strict=True))
+    lines = [f"anchors: rmse {a.rmse:.3f} m over {len(a.ids)}"] if a.ids else ["anchors: none could be compared"]
+    lines += [f"  {name:<8} {distance:8.3f} m" for name, distance in errors.items()]
+    return {**_plain(a), "errors": errors}, lines + ([f"  without an estimate: {', '.join(a.missing)}"] if a.missing else [])
+
+
+def _shown_landmarks(e: LandmarkErrors, title: str) -> Shown:
+    rows = zip(e.pairs, e.true_distances.tolist(), e.distances.tolist(), e.errors.tolist(), strict=True)
+    pairs = [{"a": a, "b": b, "true": t, "found": d, "error": x} for (a, b), t, d, x in rows]
+    lines = [f"{title}: mean distance error {e.mean:.4f} m over {len(e.pairs)} pairs" if pairs else f"{title}: none found"]
+    row = "  {0:<14} true {true:8.3f}   found {found:8.3f}   error {error:7.4f} m"
+    lines += [row.format(f"{p['a']} - {p['b']}", **p) for p in pairs]
+    lines += [f"  not found: {', '.join(e.missing)}"] if e.missing else []
+    return {"mean": e.mean if pairs else None, "pairs": pairs, "missing": list(e.missing)}, lines
+
+
+def _shown_walls(walls: WallErrors) -> Shown:
+    return _plain(walls), [
+        f"walls: {100 * walls.precision:.1f} % of the occupied cells lie within {walls.tolerance:g} m of a true surface, "
+        f"{100 * walls.recall:.1f} % of the visible walls is drawn"
+    ]
+
+
+def _plain(figures: Any) -> dict[str, Any]:
+    """Return the plain numbers and names of a dataclass; arrays are left out."""
+    plain = {f.name: getattr(figures, f.name) for f in dataclasses.fields(figures)}
+    return {k: v for k, v in plain.items() if isinstance(v, float | int | str | tuple)}

@@ -3,8 +3,10 @@
 import os
 import signal
 import sys
+from _thread import interrupt_main
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Timer
 from typing import Any
 
 _SOON = 0.02
@@ -45,9 +47,6 @@ def interruptible() -> Iterator[list[int]]:
 
 @contextmanager
 def _raised_again(came: list[int]) -> Iterator[None]:
-    from _thread import interrupt_main
-    from threading import Timer
-
     usual = sys.unraisablehook
 
     def dropped(error: Any) -> None:

@@ -1,47 +1,35 @@
 """`uwblite localize --live`: the pose as JSON lines while a robot drives."""
 
 import argparse
+import json
 import math
+import os
+import select
+import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..errors import UsageError
+from ..io.log_parts import GrowingFile
+from ..io.source import open_input
+from ..io.stored_result import StoredResult, read_result
+from ..localization import LocalizerState
+from ..localization.known_map import KnownMap, from_result
+from ..localization.live_feed import LiveFeed, Patience
+from ..server.live import LivePage
+from ..server.pose_status import PoseStatus
 from . import console
-from .options import mounted, number
-from .serving import LOCAL, page_address, serving
-
-if TYPE_CHECKING:
-    from ..io.stored_result import StoredResult
-    from ..localization import LocalizerState
-    from ..localization.known_map import KnownMap
+from .inputs import mounted
+from .serving import serving
 
 DEVICES = ("odometry", "lidar", "uwb", "gyro")
 
 
-def add_live_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of --live."""
-    group = parser.add_argument_group("live (docs/navigation.md)")
-    group.add_argument("--live", action="store_true", help="follow the log, or devices, and say the pose as it becomes known")
-    group.add_argument("--rate", metavar="HZ", type=number(above=0), default=10.0, help="lines per second of driving (10)")
-    group.add_argument("--idle", metavar="S", type=number(above=0), help="end when the log has not grown for so long (never)")
-    late = "without data of a sensor for so long, and three of its periods, it is said to be silent (2)"
-    group.add_argument("--late", metavar="S", type=number(above=0), default=2.0, help=late)
-    lost = "without any data for so long the pose counts as lost (10)"
-    group.add_argument("--lost-after", metavar="S", type=number(above=0), default=10.0, help=lost)
-    page = "show the pose on the map, on a page for this computer; an address opens it to others, such as 0.0.0.0:8000"
-    group.add_argument("--serve", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
-    for name, form in (("odometry", "NAME:PORT"), ("lidar", "[NAME:]PORT"), ("uwb", "[NAME:]PORT"), ("gyro", "NAME:PORT")):
-        help_text = "device, as for uwblite record" + ("; repeatable" if name == "uwb" else "")
-        group.add_argument(f"--{name}", metavar=form, action="append", help=help_text)
-
-
 def run_live(args: argparse.Namespace) -> int:
     """Say poses until the log ends or somebody says stop."""
-    from ..errors import UsageError
-    from ..io.stored_result import read_result
-    from ..localization.known_map import from_result
-
     devices = any(getattr(args, name) for name in DEVICES)
     if devices == bool(args.log):
         raise UsageError("--live needs either a log to follow (- = standard input) or devices: --odometry, --lidar, --uwb")
@@ -59,13 +47,11 @@ def run_live(args: argparse.Namespace) -> int:
 
 def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
     """Follow devices or a log and return the exit code."""
-    import signal
-
     stopped: list[int] = []
     before = {n: signal.signal(n, lambda k, _f: stopped.append(k)) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
         if devices:
-            from .live_devices import record_into
+            from .named_devices import record_into
 
             record_into(args, tracker.take, lambda: bool(stopped), tracker.wait)
         else:
@@ -83,11 +69,7 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
 class Tracker:
     """From pieces of a log to lines on stdout."""
 
-    def __init__(self, known: "KnownMap", args: argparse.Namespace) -> None:
-        import time
-
-        from ..localization.live_feed import LiveFeed, Patience
-
+    def __init__(self, known: KnownMap, args: argparse.Namespace) -> None:
         self.state: LocalizerState | None = None
         self.on_state: Callable[[LocalizerState], None] = lambda _: None
         patience = Patience(args.late, args.lost_after)
@@ -112,7 +94,7 @@ class Tracker:
         for state in self._feed.wait(now - self._heard):
             self._say(state)
 
-    def _say(self, state: "LocalizerState") -> None:
+    def _say(self, state: LocalizerState) -> None:
         self.state = state
         if not state.stamp > -float("inf"):
             return
@@ -136,19 +118,17 @@ class Tracker:
 
 
 @contextmanager
-def _shown(result: "StoredResult", tracker: Tracker, where: tuple[str, int] | None) -> Iterator[None]:
+def _shown(result: StoredResult, tracker: Tracker, where: tuple[str, int] | None) -> Iterator[None]:
     """Show the poses on a page, where one is wanted, until the block ends."""
     if where is None:
         yield
         return
-    from ..server.live import LivePage
-    from ..server.pose_status import PoseStatus
 
     page, status = LivePage(f"uwblite localize: {result.folder.name}"), PoseStatus()
     page.show_map(result, paths=False)
     page.show_status(status.nothing)
 
-    def show(state: "LocalizerState") -> None:
+    def show(state: LocalizerState) -> None:
         if (news := status.take(state)) is not None:
             page.show_status(news)
 
@@ -158,10 +138,8 @@ def _shown(result: "StoredResult", tracker: Tracker, where: tuple[str, int] | No
         yield
 
 
-def line_of(state: "LocalizerState") -> str:
+def line_of(state: LocalizerState) -> str:
     """Return a state as one line of JSON; numbers that are not known are null."""
-    import json
-
     fields: dict[str, Any] = {
         "stamp": round(state.stamp, 6),
         "pose": [round(v, 5) for v in state.pose.tolist()] if math.isfinite(state.pose.sum()) else None,
@@ -186,7 +164,7 @@ _MOST_ALTERNATIVES = 8
 """In a line."""
 
 
-def tell_doubts(result: "StoredResult") -> None:
+def tell_doubts(result: StoredResult) -> None:
     """Say where a map was doubted when it was made: poses in it are no better."""
     doubts = result.report.get("doubts")
     for doubt in doubts if isinstance(doubts, list) else []:
@@ -194,7 +172,7 @@ def tell_doubts(result: "StoredResult") -> None:
         console.note(f"uwblite: warning: the map is doubted: {text}")
 
 
-def _tell_map(known: "KnownMap") -> None:
+def _tell_map(known: KnownMap) -> None:
     if not known.anchors.ids:
         console.note("uwblite: warning: the map has no anchor with a place: the robot is localised by the walls alone")
     if known.walls is None:
@@ -203,11 +181,6 @@ def _tell_map(known: "KnownMap") -> None:
 
 def _stdin() -> Iterator[bytes]:
     """Yield what standard input holds, as it comes, and nothing from time to time where nothing comes."""
-    import os
-    import select
-
-    from ..io.source import open_input
-
     stream = open_input("-")
     while True:
         if not select.select([stream], [], [], _WAITING)[0]:
@@ -220,10 +193,6 @@ def _stdin() -> Iterator[bytes]:
 
 def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Iterator[bytes]:
     """Yield what a log holds and what is added to it, and nothing where nothing is."""
-    import time
-
-    from ..io.log_parts import GrowingFile
-
     file = GrowingFile(path)
     if file.skipped:
         console.note(f"uwblite: {file.skipped / 1e6:.1f} MB of {path} lie further back and are not read")

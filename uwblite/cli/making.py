@@ -1,42 +1,51 @@
 """Recordings of a command line read, mapped and written, as `uwblite map` and `uwblite batch` do it; nothing is said here."""
 
 import argparse
+import os
 import shlex
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from ..config import override
+from ..constraints import Constraints
+from ..errors import ConfigError
+from ..io.constraints_file import parse_constraints, read_anchors
+from ..io.files import sha256_of
+from ..io.result_text import RunRecord, base_name
+from ..io.results import write_result
+from ..io.settings_toml import differences, to_toml
+from ..io.source import read_settings
+from ..map_result import MapResult
+from ..mapping import MappingConfig, Progress, Stage, build_map
+from ..pipeline.mapping_config import preset
+from ..pipeline.scan_selection import prepared
+from ..sensor_log import SensorLog
+from .cost import expected_cost, together
+from .formats import read_recording
+from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
+from .memory import FreedMemory, shortage
 from .wording import findings_with_options, with_options
 from .workers import versions
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
-    from ..constraints import Constraints
-    from ..map_result import MapResult
-    from ..mapping import MappingConfig, Progress, Stage
-    from ..sensor_log import SensorLog
 
 
 class Made(NamedTuple):
     """A map that is written."""
 
-    logs: "list[SensorLog]"
-    result: "MapResult"
+    logs: list[SensorLog]
+    result: MapResult
     names: list[str]
     """Of the files in --out, in the order in which a user wants to see them."""
     seconds: float
     """From the first recording's first byte to the last file."""
 
 
-def read_logs(args: argparse.Namespace, executor: "Executor | None" = None) -> "list[SensorLog]":
+def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> list[SensorLog]:
     """Return the recordings of the command line, with its mounting."""
-    from .formats import read_recording
-    from .options import apply_mounting, bag_choices
-
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
     told = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
@@ -45,10 +54,10 @@ def read_logs(args: argparse.Namespace, executor: "Executor | None" = None) -> "
 
 def make(
     args: argparse.Namespace,
-    logs: "list[SensorLog]",
+    logs: list[SensorLog],
     reading: float,
-    progress: "Progress | None" = None,
-    executor: "Executor | None" = None,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
     note: Callable[[str], None] | None = None,
     maps: int = 1,
 ) -> Made:
@@ -65,15 +74,9 @@ def make(
     ------
     ConfigError : the map needs more than twice the memory there is, and args.ignore_memory is not set.
     """
-    from ..io.result_text import RunRecord
-    from ..io.results import write_result
-    from ..mapping import build_map
-    from ..pipeline.scan_selection import prepared
-    from .freed_memory import FreedMemory
-
     config, constraints, freed = settings(args), known(args), FreedMemory()
 
-    def report(stage: "Stage", done: int, total: int) -> object:
+    def report(stage: Stage, done: int, total: int) -> object:
         freed.give_back(over=done >= total)
         return progress(stage, done, total) if progress is not None else None
 
@@ -101,13 +104,9 @@ def make(
 
 
 def _check_memory(
-    logs: "list[SensorLog]", config: "MappingConfig", ignore: bool, note: Callable[[str], None] | None, maps: int
+    logs: list[SensorLog], config: MappingConfig, ignore: bool, note: Callable[[str], None] | None, maps: int
 ) -> None:
     """Refuse a map that will not fit in memory, or note that it may not."""
-    from ..errors import ConfigError
-    from .cost import expected_cost, together
-    from .memory import shortage
-
     found = shortage(together([expected_cost(log, config) for log in logs])["megabytes"], maps)
     if found is None:
         return
@@ -117,10 +116,8 @@ def _check_memory(
         note(f"uwblite: {found.text}")
 
 
-def config_text(config: "MappingConfig") -> str:
+def config_text(config: MappingConfig) -> str:
     """Return the config.toml of a result."""
-    from ..io.settings_toml import to_toml
-
     return to_toml(config, header="settings in force; `uwblite config` explains them")
 
 
@@ -129,44 +126,29 @@ def given_files(args: argparse.Namespace) -> dict[str, str]:
 
     What can be read once only, such as a pipe, has none.
     """
-    import os
-
-    from ..io.files import sha256_of
-
     named = {"constraints": args.constraints, "anchors-from": args.anchors_from, "uwb-mapping": args.uwb_mapping}
     return {option: sha256_of(file) for option, file in named.items() if file and os.path.isfile(file)}
 
 
-def settings(args: argparse.Namespace) -> "MappingConfig":
-    from ..config import override
-    from .options import effective_config
-
+def settings(args: argparse.Namespace) -> MappingConfig:
     config = override(effective_config(args), [f"use_{name}=false" for name in args.without])
     short = {"grid.resolution": args.resolution, "align": args.align, "crop": args.crop and list(args.crop)}
     return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
 
 
-def changed_settings(args: argparse.Namespace, config: "MappingConfig") -> tuple[str, ...]:
+def changed_settings(args: argparse.Namespace, config: MappingConfig) -> tuple[str, ...]:
     """Return the settings that differ from those of the command line's preset, as --set takes them."""
-    from ..io.settings_toml import differences
-    from ..mapping import MappingConfig
-    from ..pipeline.mapping_config import preset
-
     return tuple(differences(config, preset(args.preset) if args.preset else MappingConfig()))
 
 
-def known(args: argparse.Namespace) -> "Constraints":
-    from ..constraints import Constraints
-    from ..io.constraints_file import parse_constraints, read_anchors
-    from ..io.source import read_settings
-
+def known(args: argparse.Namespace) -> Constraints:
     earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
     if not args.constraints:
         return earlier
     return earlier + parse_constraints(read_settings(args.constraints), args.constraints)
 
 
-def repeat_command(args: argparse.Namespace, config: "MappingConfig") -> str:
+def repeat_command(args: argparse.Namespace, config: MappingConfig) -> str:
     """Return the command that makes the same map again, in a folder with the recordings and other files that it names.
 
     Files stand with their names alone: the result is the same wherever they lie.
@@ -175,8 +157,6 @@ def repeat_command(args: argparse.Namespace, config: "MappingConfig") -> str:
     ----------
     config : the settings in force.
     """
-    from ..io.result_text import base_name
-
     words = ["uwblite", "map", *map(base_name, args.logs)]
     words += [f"--preset={args.preset}"] if args.preset else []
     words += [f"--set={setting}" for setting in changed_settings(args, config)]
@@ -184,18 +164,11 @@ def repeat_command(args: argparse.Namespace, config: "MappingConfig") -> str:
         words.append(f"--every-nth-scan={args.every_nth_scan}")
     for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
         words += [option, base_name(value)] if value else []
-    if args.laser_pose is not None:
-        words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
-    if args.laser_flipped:
-        words.append("--laser-flipped")
+    words += mounting_words(args)
     for option in ("odometry_topic", "scan_topic", "imu_topic", "uwb_mapping", "base_frame"):
         if value := getattr(args, option):
             words.append(f"--{option.replace('_', '-')}={base_name(value) if option == 'uwb_mapping' else value}")
     words += [f"--uwb-topic={topic}" for topic in args.uwb_topic]
-    if args.tag is not None:
-        words.append("--tag=" + ",".join(map(repr, args.tag)))
-    if args.anchor_height is not None:
-        words.append(f"--anchor-height={args.anchor_height!r}")
     words += ["--scale-map"] if args.scale_map else []
     return shlex.join([*words, "--out", "map_again"])
 

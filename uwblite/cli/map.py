@@ -1,99 +1,35 @@
 """`uwblite map`: from recordings to a map."""
 
 import argparse
+import os
 import shlex
 import time
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, number, numbers, place
-from .workers import add_worker_arguments, workers
-
-if TYPE_CHECKING:
-    from ..mapping import Stage
-    from ..sensor_log import SensorLog
-    from .making import Made
-
-HELP = "map a recording: trajectory, anchors, occupancy grid, report"
-EPILOG = """\
-examples:
-  uwblite map run.log --out map/                       everything at its best
-  uwblite map run.log.gz --out map/ --laser-flipped    the laser is mounted upside down
-  uwblite map run.log --out a/ --without uwb           what wheels and lidar alone can do
-  uwblite map run.log --out b/ --preset paper          the paper's plain choices
-  uwblite map run.log --out c/ --set grid.resolution=0.02
-  uwblite map run.log --out d/ --align walls --crop 0,0,12,8
-  uwblite map monday.log tuesday.log --out both/       one map of several recordings: anchors tie them together
-  uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
-  uwblite map run.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
-  uwblite map run.log --out map/ --scheduler tcp://head:8786    the heavy stages on a cluster of dask.distributed
-  uwblite map run.log --dry-run                        read, and estimate time and memory
-
-files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
-  trajectory_covariance.csv, anchors.csv, range_errors.csv, graph.g2o, graph.pyfg, graph_stamps.csv, config.toml,
-  report.json
-exit code 3: the files are written, but the result should not be trusted; the reasons are named
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    several = "CARMEN log, plain or .gz, ROS bag or CSV folder; several are mapped together; - reads a log from standard input"
-    parser.add_argument("logs", metavar="LOG", nargs="+", help=several)
-    out = parser.add_argument("--out", type=place, metavar="DIR", required=True, help="folder for the result")
-    parser.add_argument("--force", action="store_true", help="replace a result that is already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
-    text = "read, estimate time and memory, and map nothing; needs no --out"
-    parser.add_argument("--dry-run", action=_Instead, nargs=0, default=False, const=out, help=text)
-    text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
-    parser.add_argument("--corrected-log", type=place, metavar="FILE", help=text)
-    add_worker_arguments(parser, "processes for the heavy stages (1)")
-    add_map_arguments(parser)
-
-
-class _Instead(argparse.Action):
-    """A switch with which another option, its `const`, is not required."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: Any) -> None:
-        setattr(namespace, self.dest, True)
-        self.const.required = False
-
-
-def add_map_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what a map is made of and how, whether of one recording or of many."""
-    without = parser.add_argument("--without", action="append", default=[], choices=("uwb", "loops", "lidar"))
-    without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
-    text = "read every n-th laser scan only; the others take neither time nor memory (1)"
-    counted = number(above=0, whole=True)
-    parser.add_argument("--every-nth-scan", metavar="N", type=counted, default=1, help=text)
-    output = parser.add_argument_group("map")
-    edge = "edge of a cell, m: short for --set grid.resolution=M"
-    output.add_argument("--resolution", metavar="M", type=number(above=0), help=edge)
-    align = "where the axes lie: odometry (default), first-pose, walls (along x and y), anchors; short for --set align=HOW"
-    output.add_argument("--align", metavar="HOW", choices=("odometry", "first-pose", "walls", "anchors"), help=align)
-    box = "keep this part of the grid, m: short for --set crop=[...]"
-    output.add_argument("--crop", metavar="X0,Y0,X1,Y1", type=numbers(4), help=box)
-    output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
-    output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
-    output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
-    beforehand = parser.add_argument_group("known beforehand")
-    text = "surveyed anchors, pinned poses, distances, closures, see docs/formats.md"
-    beforehand.add_argument("--constraints", type=place, metavar="FILE.toml", help=text)
-    text = "go on in the frame of an earlier map: its anchors.csv; anchors that were moved since are named"
-    beforehand.add_argument("--anchors-from", type=place, metavar="FILE.csv", help=text)
-    text = "map although it is expected to need more than twice the memory that this computer, control group or shell gives"
-    parser.add_argument("--ignore-memory", action="store_true", help=text)
-    add_settings_arguments(parser)
-    add_mounting_arguments(parser)
-    add_bag_arguments(parser)
+from ..errors import UsageError
+from ..findings import DOUBT, folded
+from ..io.corrected_log import poses_of_scans, write_corrected_log
+from ..io.folders import sole_writer
+from ..io.result_text import notices
+from ..io.results import check_target
+from ..mapping import Stage
+from ..report.printable import duration
+from ..screening.screen import screen
+from ..sensor_log import SensorLog
+from . import console
+from .cost import expected_cost, together
+from .formats import format_of
+from .inputs import name_recordings_once
+from .making import Made, make, peak_memory, read_logs, settings
+from .memory import shortage
+from .wording import anchor_line, calibration_line
+from .workers import workers
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..io.folders import sole_writer
-    from ..io.results import check_target
-    from .options import name_recordings_once
-
     name_recordings_once(args)
     _check_corrected_log(args)
     if args.dry_run:
@@ -104,8 +40,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _map(args: argparse.Namespace) -> int:
-    from . import console
-
     began = time.perf_counter()
     logs = _read(args)
     made = _make_shown(args, logs, time.perf_counter() - began)
@@ -115,23 +49,20 @@ def _map(args: argparse.Namespace) -> int:
     return 3 if made.result.doubts else 0
 
 
-def _read(args: argparse.Namespace) -> "list[SensorLog]":
+def _read(args: argparse.Namespace) -> list[SensorLog]:
     """Return the recordings of the command line; what is wrong with their files is said."""
-    from .making import read_logs
-
     with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
         logs = read_logs(args, executor)
-    _report_reader_warnings(logs)
+    for notes in (log.notes for log in logs):
+        if notes.broken:
+            number, why = notes.broken_lines[0]
+            console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
+        console.note_of(notes.source, notes.warnings)
     return logs
 
 
 def _check_corrected_log(args: argparse.Namespace) -> None:
     """Refuse --corrected-log beforehand where it cannot be written."""
-    import os
-
-    from ..errors import UsageError
-    from .formats import format_of
-
     if not args.corrected_log:
         return
     if len(args.logs) > 1 or args.logs[0] == "-" or format_of(args.logs[0]) in ("bag", "csv"):
@@ -142,10 +73,7 @@ def _check_corrected_log(args: argparse.Namespace) -> None:
         raise UsageError("--corrected-log names the log itself; give another file")
 
 
-def _write_corrected_log(args: argparse.Namespace, made: "Made") -> None:
-    from ..io.corrected_log import poses_of_scans, write_corrected_log
-    from . import console
-
+def _write_corrected_log(args: argparse.Namespace, made: Made) -> None:
     poses = partial(poses_of_scans, made.result, made.logs[0])
     written, left_out = write_corrected_log(args.corrected_log, args.logs[0], poses)
     if left_out:
@@ -155,45 +83,21 @@ def _write_corrected_log(args: argparse.Namespace, made: "Made") -> None:
         )
 
 
-def _make_shown(args: argparse.Namespace, logs: "list[SensorLog]", reading: float) -> "Made":
+def _make_shown(args: argparse.Namespace, logs: list[SensorLog], reading: float) -> Made:
     """Map recordings with a progress bar, on the processes or the cluster that the command line asks for."""
-    from . import console
-    from .making import make
-    from .stage_shares import Overall
-
     lidar = "lidar" not in args.without and any(log.scans is not None for log in logs)
     progress, overall = console.Progress(), Overall(lidar=lidar)
 
-    def report(stage: "Stage", done: int, total: int) -> None:
+    def report(stage: Stage, done: int, total: int) -> None:
         if stage.detail:
             console.note(f"uwblite: {stage}")
         progress(stage, done, total, overall.take(stage, done, total))
 
-    try:
-        with workers(args.jobs, args.scheduler) as executor:
-            return make(args, logs, reading, report, executor, console.note)
-    finally:
-        progress.close()
-
-
-def _report_reader_warnings(logs: list["SensorLog"]) -> None:
-    from . import console
-
-    for notes in (log.notes for log in logs):
-        if notes.broken:
-            number, why = notes.broken_lines[0]
-            console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
-        for warning in notes.warnings:
-            console.note(f"uwblite: {notes.source}: {warning}")
+    with closing(progress), workers(args.jobs, args.scheduler) as executor:
+        return make(args, logs, reading, report, executor, console.note)
 
 
 def _dry_run(args: argparse.Namespace) -> int:
-    from ..screening.screen import screen
-    from . import console
-    from .cost import expected_cost, together
-    from .making import settings
-    from .memory import shortage
-
     config = settings(args)
     costs = [expected_cost(screen(log, config.detect_laser_flip), config) for log in _read(args)]
     rows = [{"log": name, "expected cost of map": each} for name, each in zip(args.logs, costs, strict=True)]
@@ -211,13 +115,8 @@ def _cost_line(name: str, cost: dict[str, float]) -> str:
     return f"{name}: about {cost['seconds']:.0f} s of a desktop computer, {cost['megabytes']:.0f} MB{grid}"
 
 
-def summary_json(args: argparse.Namespace, made: "Made") -> dict[str, Any]:
+def summary_json(args: argparse.Namespace, made: Made) -> dict[str, Any]:
     """Return the summary for programs; report.json has everything."""
-    import os
-
-    from ..io.result_text import notices
-    from .making import peak_memory
-
     result = made.result
     return {
         "out": args.out,
@@ -240,14 +139,8 @@ def summary_json(args: argparse.Namespace, made: "Made") -> dict[str, Any]:
 _LABELS = {"doubt": "DOUBT", "warning": "warning", "note": "note"}
 
 
-def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
+def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
     """Return the summary for people."""
-    import os
-
-    from ..findings import DOUBT, folded
-    from ..report.printable import duration
-    from .wording import anchor_line, calibration_line
-
     result, seconds = made.result, made.seconds
     span = sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in made.logs)
     lines = [f"mapped {duration(span)} of driving in {duration(seconds)} ({span / max(seconds, 1e-9):.0f} times real time)"]
@@ -270,3 +163,51 @@ def summary_lines(args: argparse.Namespace, made: "Made") -> list[str]:
     page, out = shlex.quote(os.path.join(args.out, "report.html")), shlex.quote(args.out)
     lines.append(f"next: open {page} in a browser, or: uwblite view {out}")
     return lines
+
+
+if TYPE_CHECKING:
+    from ..mapping import Stage
+
+_WITH_LIDAR = (
+    ("keyframes", 0.04), ("edges", 0.01), ("bootstrap", 0.02), ("first optimisation", 0.03), ("constraints", 0.01),
+    ("clouds", 0.04), ("keyframes added", 0.03), ("scan-to-scan matching", 0.36), ("clouds made again", 0.06),
+    ("ranges re-estimated", 0.02), ("loose links", 0.01), ("long stretches", 0.01), ("loop closure", 0.18),
+    ("second optimisation", 0.01), ("joint refinement", 0.11), ("matched once more", 0.01), ("surfaces", 0.05),
+    ("map consistency", 0.01),
+    ("landmark distances", 0.01), ("occupancy grid", 0.05), ("summary", 0.01),
+)  # fmt: skip
+"""Means over two recordings with radio and lidar and six with lidar alone; in the order in which they come."""
+_WITHOUT_LIDAR = (
+    ("keyframes", 0.03), ("edges", 0.01), ("bootstrap", 0.24), ("first optimisation", 0.26), ("constraints", 0.01),
+    ("second optimisation", 0.01), ("landmark distances", 0.01), ("occupancy grid", 0.01), ("summary", 0.42),
+)  # fmt: skip
+"""Means over two recordings with radio alone; the last optimisation counts to the summary."""
+
+
+class Overall:
+    """Turns the progress of stages into the progress of all."""
+
+    def __init__(self, *, lidar: bool = True) -> None:
+        self._shares = _WITH_LIDAR if lidar else _WITHOUT_LIDAR
+        self.share = 0.0
+        """Of the whole work, 0..1; never falls."""
+
+    def take(self, stage: "Stage", done: int, total: int) -> float:
+        """Return the share of the whole work that is done; a stage that is not known leaves it as it is.
+
+        Parameters
+        ----------
+        stage : of one with laps, whose number is not known beforehand, each lap takes half of what is left of its share.
+        done, total : steps of the stage.
+        """
+        within = min(done / total, 1.0) if total > 0 else 0.0
+        if stage.lap:
+            within = 1.0 - 0.5 ** (stage.lap - 1 + within)
+        before = 0.0
+        whole = sum(share for _, share in self._shares)
+        for known, share in self._shares:
+            if known == stage.name:
+                self.share = max(self.share, (before + share * within) / whole)
+                break
+            before += share
+        return self.share

@@ -1,9 +1,10 @@
-"""How much memory this process may have, compared beforehand with what a map needs."""
+"""How much memory this process may have, compared beforehand with what a map needs; and memory that is freed given back."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import suppress
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from typing import Any, NamedTuple
 
 _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
 _LIBRARIES = 300_000_000
@@ -59,18 +60,18 @@ def _needed(megabytes: float, limit: Limit) -> float:
     """Return bytes as this limit counts them."""
     if not limit.of_addresses:
         return 1e6 * megabytes
-    mapped, resident = _pages()
-    return 1e6 * megabytes + max(mapped - resident, 0)
+    pages = _pages()
+    return 1e6 * megabytes + max(pages.mapped - pages.resident, 0)
 
 
 def limits() -> list[Limit]:
     """Return the limits that this system sets; what cannot be read sets none."""
-    found = [Limit("this computer's memory", total)] if (total := _total()) else []
+    found = [Limit("this computer's memory", total)] if (total := _memory("MemTotal", "SwapTotal")) else []
     if sys.maxsize < _ADDRESSES:
         found.append(Limit("what a 32-bit system can address", _ADDRESSES, of_addresses=True))
     if addresses := address_space():
         found.append(Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True))
-    return found + [Limit("the limit of this control group", size) for size in _group_limits() if size < _NO_LIMIT]
+    return found + ([Limit("the limit of this control group", group)] if (group := group_limit()) else [])
 
 
 def address_space() -> int:
@@ -83,27 +84,55 @@ def address_space() -> int:
     return 0 if soft == resource.RLIM_INFINITY else soft
 
 
-def load_libraries() -> None:
-    """Refuse to begin where numpy and scipy do not fit; let OpenBLAS map its buffers while there is room.
+@contextmanager
+def within_limits() -> Iterator[None]:
+    """Refuse to begin where numpy and scipy do not fit; raise MemoryError within where their process would be killed.
 
-    OpenBLAS tries for ever where it cannot map them, and a control group's process is killed without a word.
+    A control group's process that needs more than the limit is killed without a word. Its private memory gets the same limit,
+    and what OpenBLAS and others have mapped and not used beyond that.
 
     Raises
     ------
-    NoRoom : they do not fit.
+    NoRoom : the libraries do not fit.
     """
     for limit in limits():
         if not limit.of_addresses and limit.bytes < _RESIDENT:
             need = f"numpy and scipy alone need {_RESIDENT / 1e6:.0f} MB"
             raise NoRoom(f"{need}; {limit.name} is {limit.bytes / 1e6:.0f} MB")
-    if not address_space():
+    group = group_limit()
+    if group or address_space():
+        _load_libraries()
+    pages = _pages()
+    if not group or not pages.private:
+        yield
         return
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    most = group + _memory("SwapTotal") + pages.private - pages.used
+    resource.setrlimit(resource.RLIMIT_DATA, (most if before[1] == resource.RLIM_INFINITY else min(most, before[1]), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def allowed() -> str:
+    """Return what to say after "out of memory" of the limits that end a process by an error."""
+    shell, group = address_space(), group_limit()
+    return (f"; the shell allows {shell / 1e6:.0f} MB (ulimit -v)" if shell else "") + (
+        f"; this control group allows {group / 1e6:.0f} MB" if group else ""
+    )
+
+
+def _load_libraries() -> None:
+    """Let OpenBLAS map its buffers while there is room: it tries for ever where it cannot."""
     import mmap
 
     try:
         mmap.mmap(-1, _LIBRARIES).close()
     except OSError as error:
-        raise NoRoom(f"numpy and scipy alone need {_LIBRARIES / 1e6:.0f} MB of addresses") from error
+        raise NoRoom(f"numpy and scipy alone need {_LIBRARIES / 1e6:.0f} MB of addresses{allowed()}") from error
     import numpy as np
     from scipy.linalg import blas
 
@@ -112,20 +141,36 @@ def load_libraries() -> None:
     blas.dsyrk(1.0, square)
 
 
-def _pages() -> tuple[int, int]:
-    """Return what this process has mapped and what of it is in memory, bytes; zeros where that is not known."""
+class _Pages(NamedTuple):
+    """Bytes of this process; zeros where they are not known."""
+
+    mapped: int = 0
+    resident: int = 0
+    private: int = 0
+    """Mapped for this process alone to write."""
+    used: int = 0
+    """Of them in memory."""
+
+
+def _pages() -> _Pages:
     import os
 
     words = _text(f"{_PROC}/self/statm").split()
     with suppress(ValueError, IndexError):
-        return int(words[0]) * os.sysconf("SC_PAGE_SIZE"), int(words[1]) * os.sysconf("SC_PAGE_SIZE")
-    return 0, 0
+        mapped, resident, shared, _, _, private = (int(word) * os.sysconf("SC_PAGE_SIZE") for word in words[:6])
+        return _Pages(mapped, resident, private, resident - shared)
+    return _Pages()
 
 
-def _total() -> int:
-    """Return the memory of this computer with what it can swap, bytes; 0 where it is not known."""
+def _memory(*names: str) -> int:
+    """Return a sum of rows of /proc/meminfo, bytes; 0 where it is not known."""
     rows = dict(line.split(":", 1) for line in _text(f"{_PROC}/meminfo").splitlines() if ":" in line)
-    return sum(1024 * int(rows[name].split()[0]) for name in ("MemTotal", "SwapTotal") if rows.get(name, "").split())
+    return sum(1024 * int(rows[name].split()[0]) for name in names if rows.get(name, "").split())
+
+
+def group_limit() -> int:
+    """Return the smallest limit of this process's control groups, bytes; 0 = none."""
+    return min((size for size in _group_limits() if size < _NO_LIMIT), default=0)
 
 
 def _group_limits() -> Iterator[int]:
@@ -147,3 +192,43 @@ def _text(path: str) -> str:
             return file.read()
     except OSError:
         return ""
+
+
+_GROWN = 64 << 20
+"""Bytes by which the process has grown since memory was last given back, when it is worth doing again: each page that is used
+anew costs a microsecond."""
+_OF_STATM = "/proc/self/statm"
+
+
+class FreedMemory:
+    """Gives freed pages of all heaps back; does nothing where the C library cannot (it is not glibc)."""
+
+    def __init__(self) -> None:
+        self._resident = 0
+
+    def give_back(self, *, over: bool) -> None:
+        """Give back what is free where a stage is over; within one only if the process has grown much since the last time."""
+        trim = _trim()
+        if trim is not None and (over or _resident() > self._resident + _GROWN):
+            trim(0)
+            self._resident = _resident()
+
+
+@cache
+def _trim() -> Callable[[int], Any] | None:
+    if not sys.platform.startswith("linux"):
+        return None
+    import ctypes
+
+    return getattr(ctypes.CDLL(None), "malloc_trim", None)
+
+
+def _resident() -> int:
+    """Return the memory of this process, bytes; 0 where it is not known, as where /proc is not mounted."""
+    import os
+
+    try:
+        with open(_OF_STATM, encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0

@@ -1,27 +1,27 @@
-"""Devices and mounting as a command line names them, for `uwblite record` and the live pose."""
+"""Devices and mounting as a command line names them, for `uwblite record` and for `uwblite localize --live`."""
 
 import argparse
 import re
-from typing import TYPE_CHECKING
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
 
+from ..drivers.device_options import Setup
+from ..drivers.devices import SENSORS, open_device
+from ..drivers.events import Note, Pose
+from ..drivers.link import Link
+from ..drivers.log_file import LogFile
+from ..drivers.ports import stable_name
+from ..drivers.recorder import Recorder
+from ..drivers.transport import check_pyserial, check_url
+from ..errors import ConfigError
 from .console import note
-
-if TYPE_CHECKING:
-    from ..drivers.events import Note, Pose
-    from ..drivers.link import Link
-
-MOST = {"uwb": 9, "lidar": 5, "gyro": 1, "odometry": 1}
-"""How many of a kind a log keeps apart."""
+from .log_verbs import MOST
 
 
-def device_links(args: argparse.Namespace, pose: "Pose" = (0.0, 0.0, 0.0)) -> list["Link"]:
+def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list[Link]:
     """Return the devices that the command line names; pose is where the odometry goes on."""
-    from ..drivers.device_options import Setup
-    from ..drivers.devices import SENSORS, open_device
-    from ..drivers.link import Link
-    from ..drivers.transport import check_pyserial, check_url
-    from ..errors import ConfigError
-
     names = ("steps", "cluster", "skip", "narrow", "baud")
     lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}", None)) is not None}
     links = []
@@ -49,10 +49,8 @@ def mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str, 
     return params
 
 
-def use_lasting_names(links: list["Link"]) -> None:
+def use_lasting_names(links: list[Link]) -> None:
     """Open ports by names that stay when they are unplugged and plugged in again."""
-    from ..drivers.ports import stable_name
-
     for link in links:
         better = stable_name(link.url)
         if better:
@@ -62,11 +60,42 @@ def use_lasting_names(links: list["Link"]) -> None:
 
 def host_name() -> str:
     """Return this computer's name as one word of a log."""
-    import socket
-
     return re.sub(r"\s+", "_", socket.gethostname()) or "host"
 
 
-def show_note(seconds: float, message: "Note") -> None:
+def show_note(seconds: float, message: Note) -> None:
     """Print what a recorder notes, with the seconds since its begin."""
     note(f"[{seconds:8.1f} s] {message.level}: {message.text}")
+
+
+class LinesTo(LogFile):
+    """A log that is written nowhere."""
+
+    def __init__(self, take: Callable[[bytes], None]) -> None:
+        self._take = take
+        self.head, self.path, self.first, self.bytes, self.part = [], Path("-"), Path("-"), 0, 1
+
+    def write(self, lines: list[str]) -> None:
+        """Hand lines on."""
+        if lines:
+            data = ("\n".join(lines) + "\n").encode("ascii", "replace")
+            self.bytes += len(data)
+            self._take(data)
+
+    def restore(self) -> bool:
+        """Return False: nothing can be deleted."""
+        return False
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def record_into(
+    args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool], wait: Callable[[], None]
+) -> None:
+    """Read devices until asked to stop, and hand on what `uwblite record` would write; wait is called meanwhile."""
+    links = device_links(args)
+    offset = time.time() - time.monotonic()
+    recorder = Recorder(links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset, host=host_name(), on_note=show_note)
+    recorder.begin([])
+    recorder.run(duration=None, stopping=stopping, on_status=wait)

@@ -1,65 +1,31 @@
 """`uwblite optimize`: the solver on a pose graph of any origin, no robot needed."""
 
 import argparse
-from typing import TYPE_CHECKING, Any, NamedTuple
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from itertools import chain
+from typing import Any, NamedTuple
 
-from .options import number, place
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from ..graph.certificate import Certificate
-    from ..graph.graph import Graph
-    from ..graph.solver import Progress, SolverConfig, SolverSummary
-    from ..io.graph_file import GraphFile
-    from ..radio.graph_starts import Start
-
-HELP = "optimise a pose graph: g2o, TORO or PyFG in, optimised graph and trajectory out"
-EPILOG = """\
-examples:
-  uwblite optimize graph.g2o --out optimised.g2o
-  uwblite optimize graph.pyfg --out optimised.pyfg --trajectory path.tum --from-odometry
-  uwblite optimize loops.g2o --out straight.g2o --kernel huber --kernel-scale 2
-  uwblite optimize graph.pyfg --incremental --out optimised.pyfg   the odometry bends so far that all at once fails
-  uwblite optimize loops.g2o --robust --out straight.g2o           some loop closures or ranges are false
-  uwblite optimize graph.g2o --json                chi2 and iterations only, nothing is written
-
-exit code 3: the search did not converge
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("graph", help=".g2o, TORO (.graph, .toro) or .pyfg file, plain or .gz; - reads standard input")
-    parser.add_argument("--out", type=place, metavar="FILE", help="optimised graph; .g2o or .pyfg by its name, .gz compresses")
-    parser.add_argument("--trajectory", type=place, metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
-    parser.add_argument("--from-odometry", action="store_true", help="forget the file's estimates, start from the odometry")
-    way = parser.add_mutually_exclusive_group()
-    adding = "start from the odometry and add poses in the order of time, anchors when their ranges place them"
-    way.add_argument("--incremental", action="store_true", help=adding)
-    deciding = "decide which loop closures and ranges are outliers, by graduated non-convexity, and leave them out"
-    way.add_argument("--robust", action="store_true", help=deciding)
-    parser.add_argument("--kernel", metavar="NAME", default="none", help="robust kernel on edges that close loops, and ranges")
-    bend = "standard deviations where it bends (2)"
-    parser.add_argument("--kernel-scale", metavar="K", type=number(above=0), default=2.0, help=bend)
-    setting = "solver setting, e.g. max_iterations=200; repeatable"
-    parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=setting)
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+from ..config import override
+from ..errors import ConfigError
+from ..graph.certificate import Certificate, certify
+from ..graph.gnc import optimize_gnc, outlier_thresholds
+from ..graph.graph import Graph
+from ..graph.loop_edges import misfit, with_kernel
+from ..graph.robust import Kernel
+from ..graph.solver import ALL_WORK_DONE, Progress, SolverConfig, SolverSummary, optimize
+from ..io.graph_file import GraphFile
+from ..io.tum import write_tum
+from ..radio.graph_starts import Start, starts, starts_nearby
+from ..radio.incremental import optimize_incrementally
+from . import console
+from .formats import graph_format, read_graph, refuse_existing, write_graph
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    import dataclasses
-
-    from ..config import override
-    from ..errors import ConfigError
-    from ..graph.loop_edges import with_kernel
-    from ..graph.robust import Kernel
-    from ..graph.solver import SolverConfig
-    from . import console
-    from .formats import graph_format, read_graph, refuse_existing, write_graph
-
     if args.out:
         graph_format(args.out)
     refuse_existing(args.force, args.out, args.trajectory)
@@ -67,21 +33,15 @@ def run(args: argparse.Namespace) -> int:
     file = read_graph(args.graph, from_odometry=args.from_odometry or args.incremental)
     if args.incremental and (count := len(set(file.chains.tolist()))) > 1:
         raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
-    for warning in file.warnings:
-        console.note(f"uwblite: {args.graph}: {warning}")
+    console.note_of(args.graph, file.warnings)
     file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
-    progress = console.Progress()
-    try:
+    with closing(console.Progress()) as progress:
         search = _Search(args, config, lambda done, most: progress("optimising", done, most), _allowed(args, file.graph))
         best, known = _best(search, file, args)
-    finally:
-        progress.close()
     solved_file = dataclasses.replace(file, graph=best.start.placed(best.graph))
     if args.out:
         write_graph(args.out, solved_file)
     if args.trajectory:
-        from ..io.tum import write_tum
-
         write_tum(args.trajectory, file.stamps, best.graph.poses)
     figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.start.unplaced])
     figures["closures"] = _closures(best.graph, file.pose_ids)
@@ -93,12 +53,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if best.summary.converged else 3
 
 
-def _best(search: "_Search", file: "GraphFile", args: argparse.Namespace) -> tuple["_Solution", "Certificate"]:
+def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> tuple["_Solution", Certificate]:
     """Return the lowest minimum that is found, and what is known of the global one."""
-    from itertools import chain
-
-    from ..radio.graph_starts import starts, starts_nearby
-
     solutions = search.solved(starts(file.graph, file.chains))
     best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
     known = search.certificate(best)
@@ -121,7 +77,7 @@ _EDGES = 100_000
 """Up to so many; larger graphs have work by the square of their number."""
 
 
-def _allowed(args: argparse.Namespace, graph: "Graph") -> float:
+def _allowed(args: argparse.Namespace, graph: Graph) -> float:
     """Return the work that a search may take: counted, for the same file must end in the same bytes on any computer.
 
     Whoever sets the number of iterations gets as many.
@@ -134,20 +90,20 @@ def _allowed(args: argparse.Namespace, graph: "Graph") -> float:
 class _Solution(NamedTuple):
     """An optimised graph."""
 
-    graph: "Graph"
-    summary: "SolverSummary"
+    graph: Graph
+    summary: SolverSummary
     outliers: dict[str, int]
     """By kind of edge."""
-    start: "Start"
+    start: Start
 
 
 class _Search:
     """Optimises a graph from one start after another, in the way that the options ask for, while there is work allowed."""
 
-    def __init__(self, args: argparse.Namespace, config: "SolverConfig", progress: "Progress", allowed: float) -> None:
+    def __init__(self, args: argparse.Namespace, config: SolverConfig, progress: Progress, allowed: float) -> None:
         self.args, self.config, self.progress, self.left = args, config, progress, allowed
 
-    def solved(self, starts: "Iterable[Start]") -> "Iterator[_Solution]":
+    def solved(self, starts: Iterable[Start]) -> "Iterator[_Solution]":
         """Yield the solutions from starts."""
         starts = iter(starts)
         while self.left > 0.0 and (start := next(starts, None)) is not None:
@@ -155,35 +111,24 @@ class _Search:
             self.left -= solution.summary.work
             yield solution
 
-    def _solution(self, start: "Start") -> "_Solution":
+    def _solution(self, start: Start) -> "_Solution":
         if self.args.robust:
             return self._without_outliers(start)
         if self.args.incremental:
-            from ..radio.incremental import optimize_incrementally
-
             return _Solution(*optimize_incrementally(start.graph, self.config, self.progress, self.left), {}, start)
-        from ..graph.solver import optimize
-
         return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
 
-    def _without_outliers(self, start: "Start") -> "_Solution":
-        import dataclasses
-
-        from ..graph.gnc import optimize_gnc, outlier_thresholds
-
+    def _without_outliers(self, start: Start) -> "_Solution":
         graph = start.graph
         solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), self.config, self.progress, self.left)
-        outliers: dict[str, int] = {}
+        outliers = Counter[str]()
         for k, weight in weights.items():
-            name = type(graph.edges[k]).__name__
-            outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
+            outliers[type(graph.edges[k]).__name__] += int((weight == 0.0).sum())
         # The file keeps every edge; which ones were left out is not a property of the measurements.
         return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
 
-    def certificate(self, solution: "_Solution") -> "Certificate":
+    def certificate(self, solution: "_Solution") -> Certificate:
         """Return what is known of the global minimum."""
-        from ..graph.certificate import Certificate, certify
-
         if self.args.robust:
             return Certificate(False, 0.0, "a search decided which edges are outliers")
         if not solution.summary.converged:
@@ -191,32 +136,27 @@ class _Search:
         return certify(solution.graph, max(self.left, 0.0))
 
 
-def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> dict[str, Any]:
-    edges: dict[str, int] = {}
+def _figures(file: GraphFile, summary: SolverSummary, lost: list[str]) -> dict[str, Any]:
+    edges = Counter[str]()
     for kind in file.graph.edges:
-        edges[type(kind).__name__] = edges.get(type(kind).__name__, 0) + len(kind)
+        edges[type(kind).__name__] += len(kind)
     return {
         "poses": len(file.graph.poses),
         "anchors": len(file.graph.anchors),
         "edges": edges,
         "skipped": file.skipped,
-        "chi2_initial": summary.chi2_initial,
-        "chi2": summary.chi2,
-        "dof": summary.dof,
-        "chi2_per_dof": summary.chi2_per_dof,
-        "iterations": summary.iterations,
-        "converged": summary.converged,
-        "reason": summary.reason,
+        **{name: getattr(summary, name) for name in _OF_SUMMARY},
         "chains": len(set(file.chains.tolist())),
         "unplaced_anchors": lost,
         "exit_code": 0 if summary.converged else 3,
     }
 
 
-def _closures(graph: "Graph", names: tuple[str, ...]) -> dict[str, Any]:
-    """Return how many loop closures there are, how many are far off, and the poses of the worst."""
-    from ..graph.loop_edges import misfit
+_OF_SUMMARY = ("chi2_initial", "chi2", "dof", "chi2_per_dof", "iterations", "converged", "reason")
 
+
+def _closures(graph: Graph, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return how many loop closures there are, how many are far off, and the poses of the worst."""
     found = misfit(graph)
     worst = [names[k] for k in found.worst] if found.closures else None
     return {"count": found.closures, "far_off": found.off, "worst": worst, "contradict": found.most}
@@ -227,8 +167,6 @@ _TRY = "try --set max_iterations=1000, --from-odometry --incremental or --robust
 
 
 def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
-    from ..graph.solver import ALL_WORK_DONE
-
     edges = ", ".join(f"{count} {name}" for name, count in figures["edges"].items())
     lines = [f"{figures['poses']} poses, {figures['anchors']} anchors, {edges}"]
     per = f"{figures['chi2_per_dof']:.3f} per degree of freedom" if figures["dof"] > 0 else "nothing is measured twice"

@@ -1,15 +1,20 @@
-"""Options that several verbs share: numbers, the settings of the mapper, and how the sensors are mounted."""
+"""What the options of all verbs are made of: readers of their values, and the groups that several verbs share."""
 
 import argparse
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from ..io.bag_topics import BagTopics
-    from ..io.uwb_mapping import UwbMapping
-    from ..mapping import MappingConfig
-    from ..sensor_log import SensorLog, SensorMounting
+
+class Verb(NamedTuple):
+    """A verb of the command line; what it does is `run` of the module of its name, loaded when it is asked for."""
+
+    help: str
+    epilog: str
+    """Examples first."""
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    matrices: bool = True
+    """Whether it makes or reads maps in this process, for which numpy and scipy must fit into memory."""
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,41 +24,6 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--config", type=place, metavar="FILE.toml", help="settings from a file, as `uwblite config` prints it")
     example = "change one setting, e.g. icp.max_iterations=30; repeatable"
     group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)
-
-
-def name_recordings_once(args: argparse.Namespace) -> None:
-    """Let what `*.log` names stand for recordings, each once, where it names several parts of one, or one twice."""
-    from ..io.log_parts import each_once
-    from . import console
-
-    logs = each_once(args.logs)
-    if len(logs) < len(args.logs):
-        files = f"{len(args.logs)} files are {len(logs)} recording{'s' * (len(logs) > 1)}"
-        console.note(f"uwblite: {files}: a recording in several parts, or named twice, counts once")
-    args.logs = logs
-
-
-def effective_config(args: argparse.Namespace) -> "MappingConfig":
-    """Return the settings that --preset, --config and --set amount to.
-
-    Raises
-    ------
-    UsageError : a preset or setting does not exist, or has a value that it cannot have.
-    """
-    from ..config import merge, override, parse_toml
-    from ..errors import ConfigError, UsageError
-    from ..io.source import read_settings
-    from ..pipeline.mapping_config import MappingConfig, preset
-
-    # The user's mounting of the laser overrides what the scans show.
-    given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
-    text = read_settings(args.config) if args.config else ""
-    try:
-        config = preset(args.preset) if args.preset else MappingConfig()
-        config = merge(config, parse_toml(text, args.config))
-        return override(config, [*given, *args.set])
-    except ConfigError as error:
-        raise UsageError(str(error)) from None
 
 
 def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,16 +45,6 @@ def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
     bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
     bag.add_argument("--uwb-mapping", type=place, metavar="FILE.toml", help="where ranges stand in messages: docs/formats.md")
     bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
-
-
-def bag_choices(args: argparse.Namespace) -> "tuple[BagTopics, tuple[UwbMapping, ...]]":
-    """Return the topics and mappings that the command line names."""
-    from ..io.bag_topics import BagTopics
-    from ..io.source import read_settings
-    from ..io.uwb_mapping import parse_mappings
-
-    mappings = parse_mappings(read_settings(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
-    return BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.imu_topic, args.base_frame), mappings
 
 
 def number(
@@ -137,25 +97,13 @@ _LARGEST = 1e7
 """m; no place on Earth is farther from another one."""
 
 
-def apply_mounting(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
-    """Return the log with the mounting of the command line in place of its own."""
-    import dataclasses
-
-    return dataclasses.replace(log, mounting=mounted(log.mounting, args))
+LOCAL = ("127.0.0.1", 8000)
+"""Where a page is found that nobody has put elsewhere."""
 
 
-def mounted(mounting: "SensorMounting", args: argparse.Namespace) -> "SensorMounting":
-    """Return a mounting with what the command line says in place of its own."""
-    import dataclasses
-
-    import numpy as np
-
-    if args.laser_pose is not None:
-        mounting = dataclasses.replace(mounting, T_base_laser=np.array(args.laser_pose), laser_is_base=False)
-    if args.laser_flipped:
-        mounting = dataclasses.replace(mounting, laser_flipped=True)
-    if args.tag is not None:
-        mounting = dataclasses.replace(mounting, tag_position=np.array(args.tag))
-    if args.anchor_height is not None:
-        mounting = dataclasses.replace(mounting, anchor_height=args.anchor_height, anchor_heights={})
-    return mounting
+def page_address(text: str) -> tuple[str, int]:
+    """Read [ADDRESS:]PORT; without an address, of this computer alone."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit()) or not 0 < int(port) <= 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port such as 8000 or 0.0.0.0:8000")
+    return host or LOCAL[0], int(port)

@@ -1,50 +1,24 @@
 """`uwblite plan-anchors`: where the next anchors help most."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from .options import number
+import numpy as np
+
+from ..errors import ConfigError
+from ..io.files import write_text
+from ..io.png import write_png
+from ..io.stored_result import StoredResult, read_result
+from ..radio.anchor_planning import AnchorPlan, plan_anchors
+from ..report.error_map import draw_errors, side_by_side
+from ..report.picture import PictureAnchor
+from . import console
+from .formats import refuse_existing
 from .wording import signed
-
-if TYPE_CHECKING:
-    from ..io.stored_result import StoredResult
-    from ..radio.anchor_planning import AnchorPlan
-
-HELP = "say where further anchors help most, by the expected error of a position over the free space of a map"
-EPILOG = """\
-examples:
-  uwblite plan-anchors --map map/ --count 2                 -> anchor_plan.csv and anchor_plan.png
-  uwblite plan-anchors --map map/ --count 1 --reach 12      the radios reach 12 m
-  uwblite plan-anchors --map map/ --count 3 --from-nothing  as if there were no anchors yet
-
-The error at a place is that of a position from one range to each anchor within reach: 0.1 m of noise in line of sight, 0.5 m
-through walls. Anchors are put half a metre from walls; where that cannot be done, the picture shows what is nearly as good.
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: map.yaml, anchors.csv")
-    parser.add_argument("--count", metavar="N", type=number(above=0, whole=True), default=1, help="how many anchors (1)")
-    parser.add_argument("--reach", metavar="M", type=number(above=0), default=25.0, help="m up to which a radio reaches (25)")
-    parser.add_argument("--from-nothing", action="store_true", help="leave out the anchors that are there")
-    parser.add_argument("--out", metavar="NAME", default="anchor_plan", help="NAME.csv and NAME.png are written (anchor_plan)")
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    import numpy as np
-
-    from ..errors import ConfigError
-    from ..io.files import write_text
-    from ..io.png import write_png
-    from ..io.stored_result import read_result
-    from ..radio.anchor_planning import plan_anchors
-    from . import console
-    from .formats import refuse_existing
-
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     result = read_result(args.map)
@@ -70,9 +44,7 @@ def _errors(figures: dict[str, Any]) -> str:
     return f"expected error of a position {mean:.2f} m, in 95 % of the free space below {most:.2f} m"
 
 
-def _figures(args: argparse.Namespace, plan: "AnchorPlan", today: int) -> dict[str, Any]:
-    import numpy as np
-
+def _figures(args: argparse.Namespace, plan: AnchorPlan, today: int) -> dict[str, Any]:
     errors = [{"mean_error": float(e.mean()), "error_95": float(np.quantile(e, 0.95))} for e in plan.errors]
     places = [{"id": f"new{k}", "x": float(x), "y": float(y)} for k, (x, y) in enumerate(plan.places, 1)]
     return {
@@ -90,11 +62,8 @@ def _table(figures: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _picture(result: "StoredResult", plan: "AnchorPlan", from_nothing: bool) -> Any:
+def _picture(result: StoredResult, plan: AnchorPlan, from_nothing: bool) -> Any:
     """Return the map today and with the new anchors, side by side, coloured by the expected error."""
-    from ..report.error_map import draw_errors, side_by_side
-    from ..report.picture import PictureAnchor
-
     assert result.grid is not None
     there = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
     new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]

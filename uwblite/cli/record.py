@@ -1,98 +1,28 @@
 """``uwblite record``: read the tag, the lidar and the base, and write a log."""
 
 import argparse
-import re
+import signal
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from .console import note, say, say_json
-from .named_devices import MOST, device_links, host_name, mounting_params, show_note, use_lasting_names
-from .options import number, numbers, place
-from .serving import LOCAL, page_address
-
-if TYPE_CHECKING:
-    from ..drivers.recorder import Recorder
-
-HELP = "record UWB tag, lidar, base and gyro into a log that `uwblite map` reads"
-EPILOG = """
-examples:
-  uwblite devices                                     what is plugged in, and is it set up?
-  uwblite record --uwb /dev/serial/by-id/usb-SEGGER... --lidar /dev/serial/by-id/usb-Hokuyo... \\
-                 --odometry kobuki:/dev/kobuki --out run.log
-  uwblite record --odometry "line:/dev/ttyUSB0?columns=t,left,right&tick=1.2e-4&wheel_base=0.3&time_unit=0.001" \\
-                 --uwb shell:/dev/ttyACM0 --out run.log --duration 600
-  uwblite record --lidar socket://robot.local:2001 --odometry kobuki:socket://robot.local:2002 --out run.log
-  uwblite record ... --out run.log --append           go on after a crash
-  uwblite record ... --out run.log --watch 0.0.0.0:8000  the map while it grows, on every phone in the network
-  uwblite record --uwb tlv:/dev/ttyACM0 --tag 0.2,0,0.6 --uwb tlv:/dev/ttyACM1 --tag=-0.2,0,0.6 --odometry ...
-                                                      a tag in front and one behind
-
-devices (a path, a by-id path, socket://host:port or any other pyserial URL):
-  each is written [NAME:]PORT[?option=value&...]; `uwblite devices --kinds` lists the names with their options
-
-The log is CARMEN text. Each line is with the kernel as soon as it is written, so a crash loses at most the last one, and
-with the disk after --sync seconds. Losses, reconnects and warnings stand in it as COMMENT lines. A recording ends with
---duration, Ctrl-C (exit code 130), SIGTERM or a closed terminal (0). Exit code 3: written, but a device was silent or
-lost much.
-PARAM lines written besides the mounting: laser_time_increment (s between rays), laser_range_min (m), laser_product,
-laser_firmware, laser_serial, uwb_tag_id, uwb_pan_id, uwb_tag_firmware, host_monotonic_zero (log time minus the
-computer's monotonic clock, s).
-"""
-
+from .. import __version__
+from ..drivers.link import Mounting
+from ..drivers.log_file import LogFile, last_state
+from ..drivers.recorder import Recorder
+from ..drivers.transport import absent_port
+from ..errors import DeviceError
+from .child import Child
+from .console import Progress, note, say, say_json
+from .log_verbs import MOST
+from .named_devices import device_links, host_name, mounting_params, show_note, use_lasting_names
 
 _PAGE_NICENESS = 10
 """Of the page beside the recorder."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    devices = parser.add_argument_group("devices")
-    devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name); repeatable")
-    devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name); repeatable")
-    devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
-    gyro = "its heading takes the place of the wheels': line:PORT?columns=t,turn_rate"
-    devices.add_argument("--gyro", metavar="NAME:PORT", action="append", help=gyro)
-    text = "begin although a port does not exist yet; a device that is lost in mid-run is waited for in any case"
-    devices.add_argument("--wait", action="store_true", help=text)
-    output = parser.add_argument_group("output")
-    output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
-    output.add_argument("--append", action="store_true", help="go on with a log that broke off")
-    output.add_argument("--rotate", metavar="SIZE", type=_size, default=0, help="begin a new part at this size, e.g. 500M")
-    output.add_argument("--duration", metavar="S", type=number(above=0), help="stop after so many seconds")
-    pause = "s between syncs to the disk (1; 0 = each write)"
-    output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
-    output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
-    page = "show the map while it grows, as uwblite watch does, in a process of its own (127.0.0.1:8000)"
-    output.add_argument("--watch", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
-    laser = parser.add_argument_group("lidar")
-    laser.add_argument("--lidar-steps", metavar="A:B", help="first and last step, e.g. 128:640 (all: 44:725)")
-    merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
-    laser.add_argument("--lidar-cluster", metavar="N", type=merged, help="steps merged into one reading (1)")
-    laser.add_argument("--lidar-skip", metavar="N", type=skipped, help="scans left out between two (0)")
-    narrow = "2-character readings up to 4.095 m, for slow RS-232"
-    laser.add_argument("--lidar-narrow", action="store_const", const=1, help=narrow)
-    laser.add_argument("--lidar-baud", metavar="N", type=number(whole=True), help="bit/s to try first on RS-232 (115200)")
-    mounting = parser.add_argument_group("mounting, for the log")
-    pose = "laser on the base: m, m, rad; once for each --lidar, in their order"
-    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), action="append", help=pose)
-    flipped, which = "the laser is mounted upside down; K: the K-th lidar", number(1, MOST["lidar"], whole=True)
-    mounting.add_argument("--laser-flipped", metavar="K", nargs="?", const=1, type=which, action="append", help=flipped)
-    tag = "UWB tag on the base, z above the floor: m; once for each --uwb, in their order"
-    mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), action="append", help=tag)
-    mounting.add_argument("--anchor-height", metavar="H", type=number(), help="height of the anchors above the floor, m")
-
-
 def run(args: argparse.Namespace) -> int:
     """Record until the time is over or somebody stops it."""
-    import signal
-    import time
-
-    from ..drivers.link import Mounting
-    from ..drivers.log_file import LogFile, last_state
-    from ..drivers.recorder import Recorder
-    from ..drivers.transport import absent_port
-    from ..errors import DeviceError
-
     if not any(getattr(args, sensor) for sensor in MOST):
         note("uwblite: error: name at least one of --uwb, --lidar, --gyro, --odometry; `uwblite devices` lists what is there")
         return 2
@@ -137,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     return _finish(recorder, args.json, bool(stopped) and stopped[0] == signal.SIGINT)
 
 
-def _finish(recorder: "Recorder", as_json: bool, interrupted: bool) -> int:
+def _finish(recorder: Recorder, as_json: bool, interrupted: bool) -> int:
     doubts = recorder.doubts()
     if as_json:
         say_json(_summary(recorder, doubts))
@@ -151,7 +81,7 @@ def _finish(recorder: "Recorder", as_json: bool, interrupted: bool) -> int:
     return 130 if interrupted else 3 if doubts else 0
 
 
-def _summary(recorder: "Recorder", doubts: list[str]) -> dict[str, Any]:
+def _summary(recorder: Recorder, doubts: list[str]) -> dict[str, Any]:
     return {
         "log": str(recorder.log.first),
         "parts": recorder.log.part,
@@ -180,8 +110,6 @@ def _last_part(path: Path) -> Path:
 
 
 def _head(args: argparse.Namespace, remark: str) -> list[str]:
-    from .. import __version__
-
     devices = ", ".join(f"{name} {spec}" for name in MOST for spec in getattr(args, name) or [])
     return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
 
@@ -190,8 +118,6 @@ class _Watching:
     """`uwblite watch` beside the recorder, which goes on whatever becomes of it."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        from .child import Child
-
         host, port = args.watch
         words = ["watch", args.out, "--host", host, "--port", str(port)]
         self._child: Child | None = None
@@ -215,10 +141,8 @@ class _Watching:
             self._child.stop()
 
 
-def _status_line(recorder: "Recorder", watching: _Watching | None = None) -> Any:
+def _status_line(recorder: Recorder, watching: _Watching | None = None) -> Any:
     """Return what draws the status line, on a terminal only, and looks after the page."""
-    from .console import Progress
-
     bar = Progress()
 
     def show() -> None:
@@ -230,7 +154,7 @@ def _status_line(recorder: "Recorder", watching: _Watching | None = None) -> Any
     return show
 
 
-def status_text(recorder: "Recorder") -> str:
+def status_text(recorder: Recorder) -> str:
     """Return rates, anchors, damage and disk in one line."""
     parts = []
     for link in recorder.links:
@@ -245,10 +169,3 @@ def status_text(recorder: "Recorder") -> str:
         parts.append(text)
     free = recorder.log.free_bytes() / 1e9
     return f"{recorder.log.bytes / 1e6:.1f} MB | {' | '.join(parts)} | disk {free:.1f} GB left"
-
-
-def _size(text: str) -> int:
-    match = re.fullmatch(r"(\d+)([kMG]?)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 500M")
-    return int(match[1]) * {"": 1, "k": 1000, "M": 10**6, "G": 10**9}[match[2]]

@@ -1,38 +1,25 @@
 """A page served from a thread of its own, for as long as a verb works."""
 
-import argparse
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from ..server.live import LivePage
-
-LOCAL = ("127.0.0.1", 8000)
-"""Where a page is found that nobody has put elsewhere."""
-
-
-def page_address(text: str) -> tuple[str, int]:
-    """Read [ADDRESS:]PORT; without an address, of this computer alone."""
-    host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdigit()) or not 0 < int(port) <= 65535:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port such as 8000 or 0.0.0.0:8000")
-    return host or LOCAL[0], int(port)
+from ..server.live import LivePage
+from ..server.web import server_for
+from .options import LOCAL
 
 
 @contextmanager
-def serving(page: "LivePage", host: str, port: int) -> Iterator[str]:
+def serving(page: LivePage, host: str, port: int) -> Iterator[str]:
     """Serve a page until the block ends; give the address at which it is found.
 
     Raises
     ------
     OSError : the port is taken, or the address is none of this computer's.
     """
-    import threading
-
-    from ..server.web import server_for
-
-    server = server_for(page, port, host, _own_names())
+    name = socket.gethostname()
+    server = server_for(page, port, host, (name, f"{name}.local") if name else ())
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True)
     thread.start()
     try:
@@ -43,18 +30,8 @@ def serving(page: "LivePage", host: str, port: int) -> Iterator[str]:
         server.server_close()
 
 
-def _own_names() -> tuple[str, ...]:
-    """Return the names under which other computers may know this one."""
-    import socket
-
-    name = socket.gethostname()
-    return (name, f"{name}.local") if name else ()
-
-
 def _address(listening: str) -> str:
     """Return where a page is to be found; of one that is open to the network, under this computer's address in it."""
-    import socket
-
     host, _, port = listening.rpartition(":")
     if host in ("0.0.0.0", ""):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

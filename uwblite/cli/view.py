@@ -4,45 +4,19 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from .options import number, place
-
-if TYPE_CHECKING:
-    from ..io.stored_result import StoredResult
-
-HELP = "look at results in the browser, side by side; reject or force closures, pin anchors, and map again"
-EPILOG = """\
-examples:
-  uwblite view map/                          one result
-  uwblite view before/ after/                two of them side by side: settings, days, presets
-  uwblite view map/ run.log                  with the recording, to map it again after a correction
-  uwblite view map/ run.log --port 8765      always the same address
-
-A click on a closure or an anchor offers what can be done with it; it goes into the constraints file that is named at the
-start, and "Map again" makes DIR_2, DIR_3 ... beside DIR. The page is served to this computer alone; Ctrl-C ends it.
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    text = "result of uwblite map, or a recording that one was made of; recordings beside the results are found by themselves"
-    parser.add_argument("paths", metavar="DIR|FILE", nargs="+", help=text)
-    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=0, help="port (any that is free)")
-    parser.add_argument("--constraints", type=place, metavar="FILE.toml", help="where corrections go (DIR_constraints.toml)")
-    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+from ..errors import ConfigError
+from ..io.files import sha256_of
+from ..io.stored_result import StoredResult, read_result
+from ..server.app import app_of
+from ..server.web import server_for
+from . import console
+from .child import Child
+from .formats import format_of
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..errors import ConfigError
-    from ..io.stored_result import read_result
-    from ..server.app import app_of
-    from ..server.web import server_for
-    from . import console
-    from .child import Child
-    from .formats import format_of
-
     folders = [path for path in args.paths if format_of(path) == "map"]
     if not folders:
         raise ConfigError(f"{args.paths[0]} holds no result; map it first: uwblite map {args.paths[0]} --out map")
@@ -71,11 +45,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recordings(named: Sequence[str], results: "Sequence[StoredResult]") -> dict[str, Path]:
+def _recordings(named: Sequence[str], results: Sequence[StoredResult]) -> dict[str, Path]:
     """Return the recordings at hand by the SHA-256 of their bytes: those that are named, and those the results name."""
-    from ..errors import ConfigError
-    from ..io.files import sha256_of
-
     wanted = {str(i.get("sha256")) for r in results for i in r.report.get("inputs") or ()}
     found: dict[str, Path] = {}
     for name in named:

@@ -2,29 +2,20 @@
 
 import argparse
 import os
+import signal
 import time
-from typing import TYPE_CHECKING
+from contextlib import suppress
 
-from .options import add_mounting_arguments, add_settings_arguments, number, place
-
-if TYPE_CHECKING:
-    from ..io.stored_result import StoredResult
-    from ..server.live import LivePage
-    from ..server.rounds import Round
-    from .child import Child
-
-HELP = "follow a growing log: the map so far, silent sensors and what to drive next, on a page for phone and computer"
-EPILOG = """\
-examples:
-  uwblite watch run.log                       http://127.0.0.1:8000/ on this computer
-  uwblite watch run.log --host 0.0.0.0        for every phone and computer in the network
-  uwblite record ... --out run.log --watch    records and watches
-  uwblite watch run.log --laser-flipped       how the map is made, as for uwblite map
-
-The log may be written by anything, may have parts (record --rotate), and need not be there yet. It is mapped again and again
-in a process of the lowest priority, into LOG_watch, with scans left out so that a round takes a tenth of the time since the
-last one at most; once the log rests, from all scans. Whoever can reach the page can see it, and nobody can change anything.
-"""
+from ..errors import ConfigError, UwbliteError
+from ..io.carmen_live import LogTail
+from ..io.results import check_target
+from ..io.stored_result import StoredResult, read_result
+from ..server.live import LivePage, watch_status
+from ..server.rounds import Round, next_thinning
+from . import console
+from .child import Child
+from .inputs import effective_config, mounting_words
+from .serving import serving
 
 _STEP = 1.0
 """s between looks at the log."""
@@ -34,27 +25,8 @@ _LONGEST = 1800.0
 """s after which a round has failed."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the verb."""
-    parser.add_argument("log", metavar="LOG", help="CARMEN log that is being written, its first part where it has several")
-    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=8000, help="port (8000; 0 = any)")
-    parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="address to listen on (this computer alone)")
-    parser.add_argument("--out", metavar="DIR", type=place, help="folder for the latest map (LOG_watch)")
-    parser.add_argument("--force", action="store_true", help="replace a map that is already in --out")
-    add_settings_arguments(parser)
-    add_mounting_arguments(parser)
-
-
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    import signal
-    from contextlib import suppress
-
-    from ..server.live import LivePage
-    from . import console
-    from .options import effective_config
-    from .serving import serving
-
     effective_config(args)
     folder = _folder(args)
     page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
@@ -64,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
             with suppress(OSError, AttributeError):
                 os.nice(_OWN_NICENESS)
             with suppress(ValueError):  # not the main thread: signals are somebody else's
-                signal.signal(signal.SIGTERM, _interrupt)
+                signal.signal(signal.SIGTERM, signal.default_int_handler)
             console.say(f"open {address} in a browser; Ctrl-C ends it")
             console.note(f"uwblite: the latest map is in {folder}")
             console.flush()
@@ -78,15 +50,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _interrupt(_number: int, _frame: object) -> None:
-    raise KeyboardInterrupt
-
-
 def _folder(args: argparse.Namespace) -> str:
     """Return where the maps go, refusing what cannot be watched."""
-    from ..errors import ConfigError
-    from ..io.results import check_target
-
     if args.log == "-" or args.log.endswith(".gz"):
         raise ConfigError(f"{args.log} does not grow in a way that can be followed; name the plain log that is being written")
     if os.path.exists(args.log) and not os.path.isfile(args.log):
@@ -101,11 +66,7 @@ def map_options(args: argparse.Namespace) -> list[str]:
     """Return the options of `uwblite map` that settings and mounting amount to."""
     words = [f"--set={value}" for value in args.set]
     words += [f"--{name}={value}" for name in ("preset", "config") if (value := getattr(args, name))]
-    words += ["--laser-flipped"] if args.laser_flipped else []
-    for name in ("laser_pose", "tag"):
-        if (values := getattr(args, name)) is not None:
-            words.append(f"--{name.replace('_', '-')}=" + ",".join(map(repr, values)))
-    return words + ([] if args.anchor_height is None else [f"--anchor-height={args.anchor_height!r}"])
+    return words + mounting_words(args)
 
 
 class Watch:
@@ -116,9 +77,7 @@ class Watch:
     folder : where the maps go; a map of an earlier watch is shown at once.
     """
 
-    def __init__(self, log: str, folder: str, page: "LivePage", options: list[str]) -> None:
-        from ..io.log_tail import LogTail
-
+    def __init__(self, log: str, folder: str, page: LivePage, options: list[str]) -> None:
         self.tail, self.folder, self.page, self.options = LogTail(log), folder, page, options
         self.result: StoredResult | None = None
         self.last: Round | None = None
@@ -136,9 +95,6 @@ class Watch:
         ----------
         now : s, a clock that never leaps.
         """
-        from ..server.live import watch_status
-        from ..server.rounds import next_thinning
-
         self._follow(now)
         if self.tail.restarts != self._restarts:
             self._forget()
@@ -175,8 +131,6 @@ class Watch:
         self.page.show_map(None)
 
     def _launch(self, nth: int, now: float) -> None:
-        from .child import Child
-
         words = ["map", self.tail.path, "--out", self.folder, "--force", "-q", "--every-nth-scan", str(nth), *self.options]
         self._job_began, self._job_recorded, self._job_nth = now, self.tail.seconds, nth
         self._job_cost = _spent_on_rounds(now)
@@ -198,16 +152,11 @@ class Watch:
             self._ended(now, self._job.output().removeprefix("uwblite: error: ") or f"exit code {code}")
 
     def _ended(self, now: float, failure: str) -> None:
-        from ..server.rounds import Round
-
         self._job, self._failure = None, failure
         self.last = Round(now, _spent_on_rounds(now) - self._job_cost, self._job_recorded, self._job_nth, bool(failure))
 
     def _read_result(self, now: float) -> str:
         """Show the map in the folder; return why it cannot be shown, where it is so."""
-        from ..errors import UwbliteError
-        from ..io.stored_result import read_result
-
         if not os.path.isfile(os.path.join(self.folder, "trajectory.tum")):
             return "there is no map"
         try:

@@ -1,14 +1,22 @@
 """Who does the heavy work: this process, several of this computer, or a cluster of dask.distributed."""
 
-import argparse
+import os
+import platform
+import signal
+import time
 from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from threading import Thread
+from typing import Any
 
-from .options import number
+import numpy
+import scipy
 
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
+from .. import __version__
+from ..errors import ConfigError
+from ..io.optional_packages import missing_package
+from . import console
 
 _PARENT_LOOK = 1.0
 """s between looks at whether the main process lives."""
@@ -16,16 +24,8 @@ _SECONDS_TO_CONNECT = 10
 """A scheduler that runs answers within milliseconds."""
 
 
-def add_worker_arguments(parser: argparse.ArgumentParser, jobs: str) -> None:
-    """Declare --jobs, with its help, and --scheduler."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--jobs", metavar="N", type=number(above=0, whole=True), default=1, help=jobs)
-    text = "hand the work to the workers of a dask.distributed scheduler, such as tcp://head:8786"
-    where.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
-
-
 @contextmanager
-def workers(jobs: int, scheduler: str = "") -> "Iterator[Executor | None]":
+def workers(jobs: int, scheduler: str = "") -> Iterator[Executor | None]:
     """Give an executor: the scheduler's workers, so many processes, or, for one job, none."""
     if scheduler:
         with cluster(scheduler) as executor:
@@ -38,9 +38,8 @@ def workers(jobs: int, scheduler: str = "") -> "Iterator[Executor | None]":
 
 
 @contextmanager
-def processes(jobs: int) -> "Iterator[Executor]":
+def processes(jobs: int) -> Iterator[Executor]:
     """Start so many processes; what waits is dropped at the end, and what runs too where an exception ends it."""
-    from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import active_children
 
     executor = ProcessPoolExecutor(jobs, initializer=_begin)
@@ -56,16 +55,13 @@ def processes(jobs: int) -> "Iterator[Executor]":
 
 
 @contextmanager
-def cluster(address: str) -> "Iterator[Executor]":
+def cluster(address: str) -> Iterator[Executor]:
     """Connect to a scheduler, whose workers must have this uwblite.
 
     Raises
     ------
     ConfigError : dask.distributed is missing, no scheduler answers, or a worker has no uwblite or another one.
     """
-    from ..errors import ConfigError
-    from ..io.optional_packages import missing_package
-
     try:
         from distributed import Client
     except ImportError:
@@ -85,9 +81,6 @@ def cluster(address: str) -> "Iterator[Executor]":
 
 def _compare_versions(client: Any) -> None:
     """Refuse workers whose uwblite is another one; other libraries may change the last digits, which is said."""
-    from ..errors import ConfigError
-    from . import console
-
     ours = versions()
     found = client.run(versions, on_error="return")
     if not found:
@@ -104,30 +97,17 @@ def _compare_versions(client: Any) -> None:
 
 def versions() -> dict[str, str]:
     """Return the versions of uwblite, Python and the libraries that results depend on."""
-    import platform
-
-    import numpy
-    import scipy
-
-    from .. import __version__
-
     return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
 
 
 def _begin() -> None:
     """Let Ctrl-C reach the main process alone, which stops the workers; end where it was killed."""
-    import signal
-    from threading import Thread
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
     """End this process once its parent has: nobody else would ever tell a worker that waits for work."""
-    import os
-    import time
-
     parent = os.getppid()
     while os.getppid() == parent:
         time.sleep(_PARENT_LOOK)

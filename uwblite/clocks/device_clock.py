@@ -103,9 +103,15 @@ class DeviceClock:
     """
 
     def __init__(
-        self, tick: float, modulus: int = 0, *, period: float | None = None, latency: float = 0.0, spread: float = 0.0,
+        self,
+        tick: float,
+        modulus: int = 0,
+        *,
+        period: float | None = None,
+        latency: float = 0.0,
+        spread: float = 0.0,
         proven: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.latency, self.tied, self.period = latency, spread, period
         """s; `tied` is by how much the delay may be wrong."""
         self.proven, self._expected = proven, proven

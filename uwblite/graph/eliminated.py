@@ -16,7 +16,7 @@ from scipy import sparse
 
 from ..arrays import Floats, Ints
 from .elimination import order_of_columns
-from .factorization import superlu
+from .factorization import counted, superlu
 from .graph import Linearization
 from .normal_equations import NormalEquations
 from .unknowns import Unknowns
@@ -84,7 +84,9 @@ def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -
     """
     diagonal = normal.diagonal + blocks.among.diagonal()
     damping = sparse.diags(np.where(diagonal > 0.0, _TRACE * diagonal, 1.0))
-    return WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
+    found = WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
+    counted(found, normal.spent)
+    return found
 
 
 class WithBlocks:
@@ -126,6 +128,11 @@ class WithBlocks:
     def U(self) -> sparse.csc_matrix:
         """Upper triangle."""
         return self._lu.U
+
+    @property
+    def nnz(self) -> int:
+        """Entries of the factor."""
+        return int(self._lu.nnz)
 
     def step(self, normal: NormalEquations, blocks: Blocks) -> tuple[Floats, Floats]:
         """Return the step of the graph's unknowns (n,) and of the blocks (b, k) by these slopes."""

@@ -18,6 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import WIDE, Floats, Ints
 from ..errors import SINGULAR, SolverError
+from ..work import ENTRIES, FACTORISATIONS, Work
 from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
 from .schwarz_cg import expected_work
 
@@ -44,6 +45,17 @@ class Factor(Protocol):
 
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n,) or (n, m)."""
+
+    @property
+    def nnz(self) -> int:
+        """Entries of the factor."""
+
+
+def counted(factor: Factor, work: Work) -> Factor:
+    """Return a factor that was made, and count it."""
+    work[FACTORISATIONS] += 1
+    work[ENTRIES] += factor.nnz
+    return factor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,6 +156,11 @@ class BandedFactor:
             return right
         return lapack.dtbtrs(self._factor, right, uplo="L", trans="T" if transposed else "N")[0].reshape(right.shape)
 
+    @property
+    def nnz(self) -> int:
+        """Entries of the factor."""
+        return int(self._factor.size)
+
 
 class BorderedFactor:
     """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T.
@@ -171,3 +188,8 @@ class BorderedFactor:
         if isinstance(self._inside, BandedFactor):
             further = self._inside.half(further, transposed=True)
         return np.concatenate([inner - further, outer])
+
+    @property
+    def nnz(self) -> int:
+        """Entries of the factor."""
+        return self._inside.nnz + int(self._rows.size)

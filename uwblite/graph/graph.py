@@ -20,10 +20,10 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Shape, array_fields, require_index, require_type, settle
+from ..config import documented
 from ..errors import DataError
-from ..field_docs import documented
-from ..validation import Shape, array_fields, require_index, require_type, settle
+from ..work import Work
 from .robust import SQUARED, Kernel
 
 Block = tuple[str, Ints, Floats]
@@ -188,6 +188,8 @@ class Graph:
     """(a,) True = fixed; made without any, all are free."""
     fixed_calibration: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """(c,) True = fixed; made without any, all are free."""
+    work: Work = field(default_factory=Work, repr=False)
+    """To which the operations on this graph, and on all that are made from it, are added; see work.py."""
 
     def __post_init__(self) -> None:
         settle(self, "Graph", {"poses": ("n", 3), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)})

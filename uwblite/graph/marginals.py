@@ -15,6 +15,7 @@ from ..arrays import Floats, Ints
 from ..errors import SolverError
 from .covariances import Covariances
 from .eliminated import Blocks, WithBlocks
+from .factorization import counted
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
@@ -201,7 +202,9 @@ def factor_of(normal: NormalEquations, further: Blocks | None = None) -> SuperLU
 def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) -> SuperLU | WithBlocks:
     if further is None:
         return cast(SuperLU, normal.factor(damping))
-    return WithBlocks(sparse.csc_matrix(normal.matrix + sparse.diags(damping)), further)
+    found = WithBlocks(sparse.csc_matrix(normal.matrix + sparse.diags(damping)), further)
+    counted(found, normal.spent)
+    return found
 
 
 def marginals(

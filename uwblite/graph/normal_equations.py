@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..arrays import WIDE, Floats, Ints
-from .factorization import Factor, choose_ordering
+from ..work import PRODUCTS
+from .factorization import Factor, choose_ordering, counted
 from .graph import Graph, Linearization, kernel_weights, linearize
 from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
 from .schwarz_cg import chains, cut
@@ -57,6 +58,8 @@ class NormalEquations:
         subtrees : order for the selected inverse, not for speed.
         last : poses to be eliminated after all others.
         """
+        self.spent = graph.work
+        """Counts what is done with these equations."""
         self._analysed = free_unknowns(graph), [_touched(lin) for lin in linearized]
         free = self._analysed[0]
         counts = [int(mask.sum()) for mask in free.values()]
@@ -197,6 +200,7 @@ class NormalEquations:
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
         self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
+        self.spent[PRODUCTS] += sum(len(some.products) for places in self._places for some in places)
         for lin, weight, places, free in zip(linearized, weights, self._places, self._free, strict=True):
             jacobians = [jac for _, _, jac in compress(lin.blocks, free)]
             for part, place in zip(_parts(len(lin.residuals)) if jacobians else (), places, strict=True):
@@ -236,7 +240,7 @@ class NormalEquations:
         """
         values = self.values.copy()
         values[self._diagonal] += damping
-        return self._layout.factor(values)
+        return counted(self._layout.factor(values), self.spent)
 
 
 def _touched(lin: Linearization) -> list[_Block]:

@@ -8,9 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
-from ..field_docs import documented
-from ..validation import Shape
+from ..arrays import Floats, Ints, Shape
+from ..config import documented
 from .graph import Block, EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 

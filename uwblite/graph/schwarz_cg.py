@@ -201,6 +201,11 @@ class TwoLevelFactor:
         self.work += steps * self._pieces.work_of_a_step(self._matrix.nnz)
         return solution
 
+    @property
+    def nnz(self) -> int:
+        """Entries of the blocks and of the coarse factor."""
+        return int(self._local.size + self._coarse.size)
+
     def _nearly(self, residual: Floats) -> Floats:
         """Return the approximate solution of the two levels for a residual."""
         number = self._pieces.number

@@ -44,9 +44,9 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import Floats
-from ..config import setting
+from ..config import documented, setting
 from ..errors import ConfigError, SolverError
-from ..field_docs import documented
+from ..work import ENTRIES
 from .anchor_subproblem import with_anchors_solved
 from .descent_rules import as_much_again, extrapolated, relaxed
 from .factorization import Factor
@@ -202,7 +202,9 @@ class _Descent:
         """Try a step, and take it where the cost falls; return why the search ends with it, "" where it goes on."""
         reused, before = self.factor is not None, iterated(self.factor)
         self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
-        self.work += iterated(self.factor) - before if reused else iterated(self.factor) + self.normal.work
+        steps = iterated(self.factor) - before if reused else iterated(self.factor)
+        self.graph.work[ENTRIES] += int(steps)
+        self.work += steps if reused else steps + self.normal.work
         trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
         costs = edge_costs(trial, linearized)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..config import documented
 from ..errors import ConfigError
-from ..field_docs import documented
 
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""

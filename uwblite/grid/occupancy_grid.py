@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats
-from ..config import setting
+from ..config import documented, setting
 from ..errors import ConfigError
-from ..field_docs import documented
 from .geometry import GridGeometry
 from .ray_counter import WEIGHT_UNIT, RayCounter
 

@@ -98,12 +98,7 @@ class OpenBag:
 
 
 def _with_parts(kind: str, fielddefs: Any) -> list[str]:
-    """Return a type and those that its fields are of.
-
-    Raises
-    ------
-    KeyError : one of them is not known.
-    """
+    """Return a type and those that its fields are of; raise KeyError where one is not known."""
     found, left = list[str](), [kind]
     while left:
         if (name := left.pop()) not in found:
@@ -209,12 +204,7 @@ class _NamedPath(type(Path())):  # type: ignore[misc]
 
 
 def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
-    """Return the reader of one file, told by its first bytes, of what is complete where its recording was not closed.
-
-    Raises
-    ------
-    FormatError : it is no bag, or nothing of it is complete.
-    """
+    """Return the reader of one file, told by its first bytes, of what is complete where its recording was not closed."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 

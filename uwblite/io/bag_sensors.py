@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Floats
 from ..sensor_log import Gyro, LaserScans, UwbRanges, fault_of_id
 from .bag_motion import Frames
-from .readings import ScanGeometry, largest_reading, ranges_of, resampled, resampling_warning, without_reach
+from .readings import ScanGeometry, clean, ranges_of, reach_of, resampled, resampling_warning
 from .uwb_mapping import Reading
 
 
@@ -39,7 +39,7 @@ class ScanReadings:
             self.odd[frame] += 1
             return
         want, _, range_min, range_max = self._header.setdefault(frame, (have, *_limits(message)))
-        _clean(readings, range_min, range_max)
+        clean(readings[None], range_min, range_max, zero_is_nothing=True)
         first, step = have.angle_min - want.angle_min, have.angle_increment - want.angle_increment
         if have.beams != want.beams or abs(first) > 1e-3 or abs(step) > 1e-6:
             if not want.is_of_one_lidar_with(have):
@@ -75,9 +75,7 @@ class ScanReadings:
         order = np.argsort(stamps, kind="stable")
         readings = np.stack([rows[k][1] for k in order])
         if range_max == np.inf:
-            range_max = largest_reading(readings)
-            readings[readings > np.float32(range_max)] = np.inf
-            warnings.append(without_reach(range_max))
+            range_max = reach_of(readings, warnings)
         return LaserScans(stamps[order], readings, geometry.angle_min, geometry.angle_increment, sweep, range_min, range_max)
 
     def _geometry(self, message: Any, beams: int) -> ScanGeometry | None:
@@ -112,17 +110,6 @@ def _limits(message: Any) -> tuple[float, float, float]:
     sweep, least, most = (float(getattr(message, name)) for name in ("time_increment", "range_min", "range_max"))
     sweep, least = (value if np.isfinite(value) and value >= 0.0 else 0.0 for value in (sweep, least))
     return sweep, least, most if np.isfinite(most) and most > least else np.inf
-
-
-def _clean(readings: NDArray[np.float32], range_min: float, range_max: float) -> None:
-    """Make readings +inf for nothing seen and nan for too near and error, in the memory given.
-
-    REP-117 distinguishes these; drivers older than it write 0 for no echo.
-    """
-    with np.errstate(invalid="ignore"):
-        nothing = (readings == 0.0) | (readings >= np.float32(range_max))
-        readings[~(readings >= range_min)] = np.nan
-    readings[nothing] = np.inf
 
 
 GRAVITY, SLACK = (9.81, 1.0), 0.2

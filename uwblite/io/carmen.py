@@ -17,10 +17,9 @@ from ..arrays import Floats
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
 from .carmen_laser import LaserMessages
-from .carmen_params import Params
 from .carmen_readings import Block
-from .carmen_stamps import LineClock, judged
-from .carmen_words import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
+from .carmen_stamps import LineClock, judged, time_order
+from .carmen_words import BrokenLine, Params, is_message_name, numbers, stamp_of, why_broken
 from .carmen_writer import write_log
 from .log_parts import parts_of
 from .readings import ranges_of
@@ -186,7 +185,7 @@ class LogReader:
         self.broken += len(broken)
         self.broken_lines += broken[: BROKEN_LINES_KEPT - len(self.broken_lines)]
         self.ends_broken = bool(broken) and broken[-1][0] == self.lines
-        if self.broken > _HOPELESS and self.broken > 0.9 * self.messages:
+        if self.broken > _HOPELESS and self.broken > max(0.9, self.max_broken_share) * self.messages:
             self._refuse()
 
     def _refuse(self) -> None:

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
-from .carmen_params import Params
 from .carmen_readings import Block, Pending
-from .carmen_stamps import LineClock
-from .carmen_words import HEAD, RANK, BrokenLine, Layout, kinds_of, numbers, parse_head, split_tail, time_order
-from .readings import DEFAULT_REACH, ScanGeometry, resampled, resampling_warning
+from .carmen_stamps import LineClock, time_order
+from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
+from .readings import DEFAULT_REACH, ScanGeometry, clean, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""
@@ -190,7 +189,8 @@ class LaserMessages:
                 others += scans.seen
                 continue
             thinned += scans.seen - len(scans.stamps)
-            cleaned = _cleaned(scans.ranges, layout.beams, range_min, self._reach(layout, params))
+            cleaned = np.frombuffer(scans.ranges, dtype=np.float32).reshape(-1, layout.beams)
+            clean(cleaned, range_min, self._reach(layout, params))
             if have != want:
                 resized += len(cleaned)
                 cleaned = resampled(cleaned, have, want)
@@ -248,17 +248,6 @@ _USUAL_STEPS = (0.25, 0.5, 1.0)
 """Angles between beams of SICK scanners, degrees."""
 _FEW_BEAMS = 90
 """Fewer beams than any of these scanners has."""
-
-
-def _cleaned(readings: "array[float]", beams: int, range_min: float, range_max: float) -> NDArray[np.float32]:
-    """Return readings (k, beams) with +inf for nothing seen and nan for error codes, in the memory given."""
-    ranges = np.frombuffer(readings, dtype=np.float32).reshape(-1, beams)
-    for start in range(0, len(ranges), 256):
-        part = ranges[start : start + 256]
-        nothing = part >= np.float32(range_max)
-        part[~(part >= np.float32(range_min))] = np.nan
-        part[nothing] = np.inf
-    return ranges
 
 
 def _sweep_of_urg(geometry: ScanGeometry, range_max: float, stamps: Floats, every_nth: int) -> float:

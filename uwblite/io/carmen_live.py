@@ -1,64 +1,40 @@
-"""A CARMEN log as it is being written: the measurements of each piece of text, in the order of their times."""
+"""A CARMEN log as it is being written: its measurements in the order of their times, and how often each sensor reports.
 
-from dataclasses import dataclass
+Whole lines only are read: the line that is being written now is left for the next time.
+"""
+
+import os
+from array import array
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arrays import Floats
-from ..sensor_log import LaserScans, SensorMounting
+from ..errors import FormatError
+from ..sensor_log import SensorMounting
 from .carmen import LogReader
 from .carmen_stamps import AS_WRITTEN
+from .log_parts import GrowingFile
+from .source import MAX_LINE_BYTES
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Measurement:
-    """One measurement of any kind."""
+class Measured(NamedTuple):
+    """One measurement."""
 
+    sensor: str
+    """'odometry', 'uwb', 'lidar' or 'gyro'."""
     stamp: float
     """s, of a scan that of its first ray."""
     order: float
     """s; when it is complete."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveOdometry(_Measurement):
-    """One pose of the base."""
-
-    pose: Floats
-    """(3,) m, m, rad; drifting frame."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveRange(_Measurement):
-    """One range."""
-
-    anchor_id: str
-    range: float
-    """m."""
-    tag: int
-    """Which of the robot's tags."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveScan(_Measurement):
-    """One scan."""
-
-    scans: LaserScans
-    """The scan and its geometry: one row."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveGyro(_Measurement):
-    """One reading of a gyro."""
-
-    heading: float
-    """rad; from any zero, its bias in it."""
-
-
-Measured = LiveOdometry | LiveRange | LiveScan | LiveGyro
-
-_MOST_PENDING = 1 << 20
-"""Bytes of a line without an end."""
+    value: Any
+    """Pose of the base (3,), m, m, rad, in the drifting frame; range, m; one scan as LaserScans of one row; or heading of the
+    gyro, rad, from any zero, its bias in it."""
+    anchor_id: str = ""
+    tag: int = 0
+    """Of a range: which of the robot's tags."""
 
 
 class LiveReader:
@@ -67,7 +43,6 @@ class LiveReader:
     def __init__(self) -> None:
         self._rest = b""
         self._reader = LogReader("live log", 1, 1.0)
-        self._heading: list[tuple[float, float]] = []
         self._T_base_laser: Floats | None = None
         self.broken = 0
         """Lines that could not be used."""
@@ -82,7 +57,7 @@ class LiveReader:
         text = self._rest + data
         cut = text.rfind(b"\n") + 1
         self._rest = text[cut:]
-        if len(self._rest) > _MOST_PENDING:
+        if len(self._rest) > MAX_LINE_BYTES:
             self._rest, self.broken = b"", self.broken + 1
         return self._taken(text[:cut]) if cut else []
 
@@ -95,21 +70,150 @@ class LiveReader:
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
         poses, turns = np.array(reader.odometry).reshape(-1, 5)[:, :4], np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
-        found: list[Measured] = [LiveOdometry(float(row[0]), float(row[0]), row[1:]) for row in poses]
-        found += [*self._ranges(reader), *self._scans(reader), *(LiveGyro(t, t, heading) for t, heading in turns)]
+        found = [Measured("odometry", float(row[0]), float(row[0]), row[1:]) for row in poses]
+        found += [*self._ranges(reader), *self._scans(reader), *(Measured("gyro", t, t, heading) for t, heading in turns)]
         return sorted(found, key=lambda measured: measured.order)
 
-    def _ranges(self, reader: LogReader) -> list[LiveRange]:
+    def _ranges(self, reader: LogReader) -> list[Measured]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}
         rows = np.array(reader.uwb).reshape(-1, 6)[:, :5].tolist()
         reader.tags = max([reader.tags, *(int(row[4]) + 1 for row in rows)])
-        return [LiveRange(t, t, names[int(anchor)], metres, int(tag)) for t, anchor, metres, _, tag in rows]
+        return [Measured("uwb", t, t, metres, names[int(anchor)], int(tag)) for t, anchor, metres, _, tag in rows]
 
-    def _scans(self, reader: LogReader) -> list[LiveScan]:
+    def _scans(self, reader: LogReader) -> list[Measured]:
         scans, mounted = reader.laser.finish(reader.params, {}, [], {}, AS_WRITTEN)
         if scans is None:
             return []
         if self._T_base_laser is None:
             self._T_base_laser = mounted
         sweep = scans.time_increment * (scans.ranges.shape[1] - 1)
-        return [LiveScan(t, t + sweep, scans.rows(slice(k, k + 1))) for k, t in enumerate(scans.stamps.tolist())]
+        return [Measured("lidar", t, t + sweep, scans.rows(slice(k, k + 1))) for k, t in enumerate(scans.stamps.tolist())]
+
+
+WINDOW = 10.0
+"""s over which rates are taken."""
+_MOST_STAMPS = 2000
+"""Of a sensor within the window."""
+_ODOMETRY_STEP = 0.2
+"""s between the poses that are kept."""
+_MOST_POSES = 100_000
+"""Kept of the odometry: more than five hours."""
+_MOST_ANCHORS = 1000
+
+
+@dataclass(slots=True)
+class Sensor:
+    """What came of a sensor."""
+
+    count: int = 0
+    last: float = float("-inf")
+    """s, latest stamp."""
+    stamps: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_STAMPS))
+    """s, the latest of them."""
+
+    def received(self, stamp: float) -> None:
+        """Take a message."""
+        self.count += 1
+        self.last = max(self.last, stamp)
+        self.stamps.append(stamp)
+
+    def rate(self, now: float) -> float:
+        """Return messages per second over the window before a time of the log."""
+        recent = sum(stamp > now - WINDOW for stamp in self.stamps)
+        span = min(WINDOW, max(now - self.stamps[0], 1.0)) if self.stamps else WINDOW
+        return recent / span
+
+
+class LogTail:
+    """A log that is being written.
+
+    Parameters
+    ----------
+    path : its first part, which need not be there yet.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.restarts = 0
+        """How often the log began again: it was replaced, or became shorter."""
+        self._file: GrowingFile | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self.sensors: dict[str, Sensor] = {}
+        self.anchors: dict[str, Sensor] = {}
+        self.bytes = self.broken = 0
+        self.first, self.last = float("inf"), float("-inf")
+        self._odometry = array("d")
+        self._latest: tuple[float, ...] = ()
+        self._reader = LiveReader()
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first stamp to the last, s."""
+        return max(self.last - self.first, 0.0)
+
+    @property
+    def is_file(self) -> bool:
+        """Whether its path is a file or nothing, and no pipe, device or folder, which cannot be followed."""
+        return os.path.isfile(self.path) or not os.path.exists(self.path)
+
+    def odometry(self) -> tuple[Floats, Floats]:
+        """Return stamps (n,), s, and poses (n, 3), m, m, rad, of the wheels, a few a second and the latest."""
+        newer = self._latest if self._latest and self._latest[0] > self._odometry[-4] else ()
+        table = np.array([*self._odometry, *newer]).reshape(-1, 4)
+        return table[:, 0], table[:, 1:]
+
+    def poll(self) -> bool:
+        """Read what is new, up to a bound; return whether there was anything.
+
+        A file that cannot be read now is as one that has not grown.
+        """
+        try:
+            data = self._read()
+        except (OSError, FormatError):
+            return False
+        self._take(data)
+        return bool(data)
+
+    def _read(self) -> bytes:
+        if self._file is None or self._replaced():
+            if not os.path.isfile(self.path):
+                return b""
+            opened = GrowingFile(self.path, whole=True)
+            if self._file is not None:
+                self._file.close()
+                self._restart()
+            self._file, self._first = opened, os.stat(self.path)
+        before, data = self._file.restarts, self._file.read()
+        if self._file.restarts > before:
+            self._restart()
+            self._first = os.stat(self.path)
+        return data
+
+    def _restart(self) -> None:
+        self.restarts += 1
+        self._begin()
+
+    def _replaced(self) -> bool:
+        """Return whether the first part is another file than before, while a later one is read."""
+        if self._file is None or os.fspath(self._file.path) == self.path or not os.path.isfile(self.path):
+            return False
+        return not os.path.samestat(os.stat(self.path), self._first)
+
+    def _take(self, data: bytes) -> None:
+        self.bytes += len(data)
+        for measured in self._reader.feed(data):
+            stamp, name = measured.stamp, "radio" if measured.sensor == "uwb" else measured.sensor
+            self.first, self.last = min(self.first, stamp), max(self.last, stamp)
+            self.sensors.setdefault(name, Sensor()).received(stamp)
+            if name == "odometry":
+                self._pose(stamp, measured.value.tolist())
+            elif measured.anchor_id in self.anchors or (measured.anchor_id and len(self.anchors) < _MOST_ANCHORS):
+                self.anchors.setdefault(measured.anchor_id, Sensor()).received(stamp)
+        self.broken = self._reader.broken
+
+    def _pose(self, stamp: float, pose: list[float]) -> None:
+        kept, self._latest = self._odometry, (stamp, *pose)
+        if len(kept) < 4 * _MOST_POSES and (not kept or stamp >= kept[-4] + _ODOMETRY_STEP):
+            kept.extend((stamp, *pose))

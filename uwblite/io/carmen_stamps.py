@@ -12,9 +12,12 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of
-from ..screening.clocks import stand_still
-from .carmen_words import CONFIRMED
+from ..sensor_log import stand_still
 
+CONFIRMED = 0.5
+"""s; a recorder may hold a range back until the next one confirms it."""
+_NEXT = 2.0
+"""s; a part of a log that follows another begins so much later at most."""
 _FAR = 10.0
 """s; no message waits so long for its line."""
 _IN_A_ROW = 3
@@ -119,14 +122,10 @@ def judged(
 
 
 def _without_leaps(poses: Floats, own: Bools) -> Floats:
-    """Return the poses (n, 3) of a corrected log without leaps.
+    """Return the poses (n, 3) of a corrected log without leaps; some (n,) are the odometry's own, the others of laser messages.
 
     Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
     X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
-
-    Parameters
-    ----------
-    own : (n,) which poses are the odometry's, not those of a laser message.
     """
     laser, number = np.flatnonzero(~own), np.arange(len(own))
     following = np.searchsorted(laser, number)
@@ -214,3 +213,31 @@ def placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[
         f" {stamps[first]:.4g} s in line {lines[first]}): they are placed by the order of the lines"
     )
     return np.where(false, np.interp(lines, lines[~false], stamps[~false]), stamps)
+
+
+def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> Ints:
+    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
+
+    Parameters
+    ----------
+    set_back : takes by how much the clock was set back at most, s, by what.
+    """
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - CONFIRMED))
+    if late:
+        warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
+        if set_back is not None:
+            set_back[what] = 0.0 if _in_parts(stamps) else float(np.max(np.maximum.accumulate(stamps) - stamps))
+    return np.argsort(stamps, kind="stable")
+
+
+def _in_parts(stamps: Floats) -> bool:
+    """Return whether stamps (n,) are those of one clock in parts that only stand in another order, as `cat` writes them.
+
+    Sorted, one part follows the other; a clock that was set back goes through the same time again, or leaves a gap.
+    """
+    steps = np.diff(stamps, prepend=np.inf)
+    begins = np.flatnonzero((steps < -CONFIRMED) | (steps > _NEXT))
+    first, last = np.minimum.reduceat(stamps, begins), np.maximum.reduceat(stamps, begins)
+    order = np.argsort(first)
+    gap, as_written = first[order][1:] - last[order][:-1], np.diff(order) == 1
+    return bool(np.all((gap >= -CONFIRMED) & (as_written | (gap <= _NEXT))))

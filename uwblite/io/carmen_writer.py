@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..sensor_log import LaserScans, SensorLog
-from .carmen_params import LASER_IS_BASE
-from .decimal_text import encode_fixed_point
+from .carmen_words import LASER_IS_BASE
 from .files import replacing
 
 HOST = "uwblite"
@@ -24,14 +23,6 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
     Stamps are written to the microsecond, odometry to the micrometre and microradian, UWB ranges to 0.1 mm and laser
     readings to the millimetre. An invalid reading is written as 0, "saw nothing" as the maximum range. Messages stand
     in time order; at equal stamps odometry comes first and the laser last.
-
-    Parameters
-    ----------
-    path : the file; replaced only when the new one is complete.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
     """
     with replacing(path) as stream:
         stream.write(b"# CARMEN Logfile\n")
@@ -104,9 +95,10 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
         f"ROBOTLASER1 {_LASER_TYPE} {scans.angle_min:.9f} {fov:.9f} {scans.angle_increment:.9f} "
         f"{_reach(scans):g} 0.01 0 {beams} "
     ).encode()
+    form = b" ".join([b"%.3f"] * beams)
     for start in range(0, len(scans.stamps), _SCANS_AT_A_TIME):
         part = slice(start, start + _SCANS_AT_A_TIME)
-        readings = encode_fixed_point(_without_signs(scans, part), 3)
+        readings = map(form.__mod__, map(tuple, _without_signs(scans, part).tolist()))
         rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
         for text, l, r, stamp in rows:
             yield (

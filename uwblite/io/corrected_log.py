@@ -138,7 +138,6 @@ def write_graph_with_scans(path: str | os.PathLike[str], result: StoredResult, l
 
     Parameters
     ----------
-    path : the file, compressed where its name ends in ``.gz``.
     logs : its recordings, in their order; none: the graph alone.
 
     Returns
@@ -148,7 +147,6 @@ def write_graph_with_scans(path: str | os.PathLike[str], result: StoredResult, l
     Raises
     ------
     FormatError : the result has no graph.g2o.
-    OSError : the file cannot be written.
     """
     source = result.folder / "graph.g2o"
     if not source.is_file():

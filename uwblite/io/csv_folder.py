@@ -25,7 +25,7 @@ from .carmen_stamps import false_stamps, placed
 from .csv_table import csv_rows
 from .files import replacing, write_text
 from .folders import refuse_foreign, replacing_folder, unmarked
-from .readings import largest_reading, ranges_of, without_reach
+from .readings import ranges_of, reach_of
 from .settings_toml import to_toml
 from .source import finite, open_source
 
@@ -130,48 +130,22 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     ------
     FormatError : odometry.csv is missing, or a file is not what it should be.
     """
-    path = Path(folder)
-    digest, warnings = hashlib.sha256(), list[str]()
-    sensors = Sensors()
+    path, read, sensors = Path(folder), _Reading(), Sensors()
     if (path / "sensors.toml").exists():
-        stated = parse_toml("".join(_lines(path / "sensors.toml", digest)), str(path / "sensors.toml"))
+        stated = parse_toml("".join(read.lines(path / "sensors.toml")), str(path / "sensors.toml"))
         if isinstance(scanner := stated.get("scans"), dict) and scanner.get("range_max") != scanner.get("range_max"):
             scanner["range_max"] = np.inf  # nan states none either
         sensors = from_dict(Sensors, stated)
-    table = _table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest, "odometry", warnings)
+    odometry = read.table(path / "odometry.csv", ("stamp", "x", "y", "theta"), "odometry")
     ranges, scans, gyro = (path / f"{name}.csv" for name in ("ranges", "scans", "gyro"))
-    radio = _read_ranges(ranges, digest, warnings) if ranges.exists() else None
-    lidar = _read_scans(scans, sensors.scans, digest, warnings) if scans.exists() else None
-    turns = _table(gyro, ("stamp", "heading"), digest, "gyro", warnings) if gyro.exists() else None
+    radio = read.ranges(ranges) if ranges.exists() else None
+    lidar = read.scans(scans, sensors.scans) if scans.exists() else None
+    turns = read.table(gyro, ("stamp", "heading"), "gyro") if gyro.exists() else None
     heading = None if turns is None else Gyro(turns[:, 0].copy(), np.unwrap(turns[:, 1]))
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
-    notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest(), warnings=tuple(warnings))
-    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), radio, lidar, mounting, notes, gyro=heading)
-
-
-def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
-    """Yield the lines of a file, a block in memory at a time."""
-    with open_source(path) as source:
-        for k, block in enumerate(source.blocks()):
-            digest.update(block)
-            try:
-                yield from io.StringIO(block.decode("utf-8" if k else "utf-8-sig"))
-            except UnicodeDecodeError:
-                raise FormatError("not UTF-8 text", str(path)) from None
-
-
-def _columns(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
-    """Yield (line number, fields) behind the header, fields in the order of `names`; quality is 100 where it is missing."""
-    places, width = list[int](), 0
-    for line, row in csv_rows(_lines(path, digest), str(path)):
-        if not places:
-            places, width = _places(row, names, path, line), len(row)
-            if _is_header(row):
-                continue
-        if len(row) != width:
-            raise FormatError(f"{len(row)} columns, expected {width}", str(path), line)
-        yield line, [row[k] if k >= 0 else _BEST for k in places]
+    notes = LogNotes(source=os.fspath(folder), sha256=read.digest.hexdigest(), warnings=tuple(read.warnings))
+    return SensorLog(Odometry(odometry[:, 0].copy(), odometry[:, 1:].copy()), radio, lidar, mounting, notes, gyro=heading)
 
 
 _BEST = "100"
@@ -200,73 +174,86 @@ def _places(row: list[str], names: tuple[str, ...], path: Path, line: int) -> li
     return [k if k < len(row) else -1 for k in range(len(names))]
 
 
+class _Reading:
+    """The files of a folder, read one after another, a block in memory at a time."""
+
+    def __init__(self) -> None:
+        self.digest, self.warnings, self.anchors = hashlib.sha256(), list[str](), dict[str, int]()
+
+    def lines(self, path: Path) -> Iterator[str]:
+        """Yield the lines of a file."""
+        with open_source(path) as source:
+            for k, block in enumerate(source.blocks()):
+                self.digest.update(block)
+                try:
+                    yield from io.StringIO(block.decode("utf-8" if k else "utf-8-sig"))
+                except UnicodeDecodeError:
+                    raise FormatError("not UTF-8 text", str(path)) from None
+
+    def table(self, path: Path, names: tuple[str, ...], what: str, *, empty: bool = False) -> Floats:
+        """Return the named columns (n, names), of anchors their numbers, in the order of sound stamps, the first column."""
+        cells, places, width = array("d"), list[int](), 0
+        for line, row in csv_rows(self.lines(path), str(path)):
+            if not places:
+                places, width = _places(row, names, path, line), len(row)
+                if _is_header(row):
+                    continue
+            if len(row) != width:
+                raise FormatError(f"{len(row)} columns, expected {width}", str(path), line)
+            for name, k in zip(names, places, strict=True):
+                text = row[k] if k >= 0 else _BEST
+                cells.append(self._anchor(text, path, line) if name == "anchor" else _number(text, path, line))
+        if not (cells or empty):
+            raise FormatError("there are no rows", str(path))
+        return self._in_order(np.array(cells).reshape(-1, len(names)), what)
+
+    def _anchor(self, text: str, path: Path, line: int) -> int:
+        if text not in self.anchors and (fault := fault_of_id(one_word(text))):
+            raise FormatError(f"the anchor's id {fault}", str(path), line)
+        return self.anchors.setdefault(text, len(self.anchors))
+
+    def _in_order(self, table: Floats, what: str) -> Floats:
+        """Return rows with their stamps in order, those that no clock gives placed by their rows; the header is line 1."""
+        stamps = table[:, 0]
+        table[:, 0] = placed(np.arange(2, len(stamps) + 2), stamps, false_stamps(stamps), what, self.warnings)
+        return table[np.argsort(table[:, 0], kind="stable")]
+
+    def ranges(self, path: Path) -> UwbRanges | None:
+        """Return the ranges; None without any."""
+        stamps, anchor, metres, quality = self.table(path, ("stamp", "anchor", "range", "quality"), "range", empty=True).T
+        names = [one_word(name) for name in self.anchors]
+        return ranges_of(stamps, anchor.astype(np.intp), names, metres, quality) if names else None
+
+    def scans(self, path: Path, geometry: Scans) -> LaserScans | None:
+        """Return the scans; None without any."""
+        stamps, readings, beams = array("d"), array("f"), 0
+        for k, (line, row) in enumerate(csv_rows(self.lines(path), str(path))):
+            if k == 0 and _is_header(row):
+                continue
+            beams = beams or len(row) - 1
+            if not beams:
+                raise FormatError("a stamp without readings; each beam has a column", str(path), line)
+            if len(row) != beams + 1:
+                raise FormatError(f"{len(row) - 1} beams, the first scan has {beams}", str(path), line)
+            try:
+                readings.extend([float(cell or "inf") for cell in row[1:]])
+            except ValueError:
+                raise FormatError("a reading is not a number", str(path), line) from None
+            stamps.append(_number(row[0], path, line))
+        if not stamps:
+            return None
+        if geometry.angle_increment == -1.0:
+            what = "scans need their geometry in sensors.toml ([scans] angle_min, angle_increment, range_max)"
+            raise FormatError(what, str(path))
+        times, rows = self._in_order(np.column_stack([stamps, np.arange(len(stamps))]), "scan").T
+        ranges = np.array(readings).reshape(-1, beams)[rows.astype(np.intp)]
+        g, reach = geometry, geometry.range_max
+        with np.errstate(invalid="ignore"):
+            ranges[~(ranges >= g.range_min)] = np.nan
+        if not g.range_min < reach < np.inf:
+            reach = reach_of(ranges, self.warnings)
+        return LaserScans(times, ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)
+
+
 def _number(text: str, path: Path, line: int) -> float:
     return finite(text, f"{text[:30]!r} is not a finite number", str(path), line)
-
-
-def _table(path: Path, names: tuple[str, ...], digest: "hashlib._Hash", what: str, warnings: list[str]) -> Floats:
-    """Return rows (n, k) in the order of their stamps, which are made sound before."""
-    cells = array("d")
-    for line, row in _columns(path, names, digest):
-        cells.extend([_number(cell, path, line) for cell in row])
-    if not cells:
-        raise FormatError("there are no rows", str(path))
-    table = np.array(cells).reshape(-1, len(names))
-    table[:, 0] = _sound(table[:, 0], what, warnings)
-    return table[np.argsort(table[:, 0], kind="stable")]
-
-
-def _sound(stamps: Floats, what: str, warnings: list[str]) -> Floats:
-    """Return stamps (n,), s, in the order of rows, those that no clock gives placed by their rows; the header is line 1."""
-    return placed(np.arange(2, len(stamps) + 2), stamps, false_stamps(stamps), what, warnings)
-
-
-def _read_ranges(path: Path, digest: "hashlib._Hash", warnings: list[str]) -> UwbRanges | None:
-    cells, anchors, names = array("d"), array("q"), dict[str, int]()
-    for line, row in _columns(path, ("stamp", "anchor", "range", "quality"), digest):
-        cells.extend([_number(row[k], path, line) for k in (0, 2, 3)])
-        place = names.get(row[1])
-        if place is None:
-            place = names[row[1]] = len(names)
-            if fault := fault_of_id(one_word(row[1])):
-                raise FormatError(f"the anchor's id {fault}", str(path), line)
-        anchors.append(place)
-    if not cells:
-        return None
-    table = np.array(cells).reshape(-1, 3)
-    stamps = _sound(table[:, 0], "range", warnings)
-    return ranges_of(stamps, np.array(anchors), [one_word(name) for name in names], table[:, 1], table[:, 2])
-
-
-def _read_scans(path: Path, geometry: Scans, digest: "hashlib._Hash", warnings: list[str]) -> LaserScans | None:
-    stamps, readings, beams = array("d"), array("f"), 0
-    for k, (line, row) in enumerate(csv_rows(_lines(path, digest), str(path))):
-        if k == 0 and _is_header(row):
-            continue
-        beams = beams or len(row) - 1
-        if not beams:
-            raise FormatError("a stamp without readings; each beam has a column", str(path), line)
-        if len(row) != beams + 1:
-            raise FormatError(f"{len(row) - 1} beams, the first scan has {beams}", str(path), line)
-        try:
-            readings.extend([float(cell or "inf") for cell in row[1:]])
-        except ValueError:
-            raise FormatError("a reading is not a number", str(path), line) from None
-        stamps.append(_number(row[0], path, line))
-    if not stamps:
-        return None
-    if geometry.angle_increment == -1.0:
-        raise FormatError(
-            "scans need their geometry in sensors.toml ([scans] angle_min, angle_increment, range_max)", str(path)
-        )
-    times = _sound(np.array(stamps), "scan", warnings)
-    order = np.argsort(times, kind="stable")
-    ranges = np.array(readings).reshape(-1, beams)[order]
-    g, reach = geometry, geometry.range_max
-    with np.errstate(invalid="ignore"):
-        ranges[~(ranges >= g.range_min)] = np.nan
-        if not g.range_min < reach < np.inf:
-            reach = largest_reading(ranges)
-            warnings.append(without_reach(reach))
-            ranges[ranges > np.float32(reach)] = np.inf
-    return LaserScans(times[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, reach)

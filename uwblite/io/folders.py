@@ -83,7 +83,8 @@ def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
     _repair(folder, owned)
     beside = not folder.exists() or _may_change_places(folder, owned)
     home, prefix = (folder.parent, f".{shortened(folder.name)}{WAITING}") if beside else (folder, WAITING)
-    _clear(home, prefix)
+    for left in [p for p in home.iterdir() if p.name.startswith(prefix)]:  # of killed writers
+        shutil.rmtree(left, ignore_errors=True)
     waiting = home / f"{prefix}{secrets.token_hex(4)}"
     waiting.mkdir()
     try:
@@ -130,13 +131,6 @@ def _repair(folder: Path, owned: Owned) -> bool:
     (ready / _LIST).unlink()
     shutil.rmtree(ready, ignore_errors=True)
     return True
-
-
-def _clear(home: Path, prefix: str) -> None:
-    """Remove what killed writers left."""
-    for left in list(home.iterdir()):
-        if left.name.startswith(prefix):
-            shutil.rmtree(left, ignore_errors=True)
 
 
 def _may_change_places(folder: Path, owned: Owned) -> bool:

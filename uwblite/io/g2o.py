@@ -139,17 +139,12 @@ def write_g2o(
 
     Parameters
     ----------
-    path : the file, compressed where its name ends in ``.gz``.
     graph : the graph; anchors that are not finite are left out with their ranges.
     anchor_ids : (a,) names of the anchors; a comment gives which vertex is which.
     pose_ids : (n,) names of the poses; vertices bear these names and the anchors' where all of them are numbers, else the
         numbers of their order, and comments give the names.
     ranges : also write EDGE_RANGE_SE2_XY and EDGE_RANGE_SE2, which stock g2o does not know.
     plain : the graph's plain_edges, where they are known.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
     """
     with replacing(path) as stream:
         names = [*(pose_ids or map(str, range(len(graph.poses)))), *anchor_ids]

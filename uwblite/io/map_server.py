@@ -46,10 +46,6 @@ def write_map(
     Returns
     -------
     Paths of the image and of the YAML file.
-
-    Raises
-    ------
-    OSError : a file cannot be written.
     """
     image = Path(folder) / (f"{name}.png" if mode == "scale" else f"{name}.pgm")
     yaml = Path(folder) / f"{name}.yaml"
@@ -130,12 +126,7 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
 
 
 def _origin(settings: Settings, name: str) -> list[float]:
-    """Return the pose of the lower left corner.
-
-    Raises
-    ------
-    FormatError : it is none; older map savers wrote a yaw that is no number.
-    """
+    """Return the pose of the lower left corner; older map savers wrote a yaw that is no number."""
     value = settings.get("origin")
     if not isinstance(value, list):
         raise FormatError("origin must be a list of numbers", name)

@@ -119,17 +119,12 @@ def write_pyfg(
 
     Parameters
     ----------
-    path : the file, compressed where its name ends in ``.gz``.
     graph : the graph; anchors that are not finite are left out with their ranges.
     anchor_ids : (a,) names of the anchors, kept where all of them are such as the format knows: L and a number.
     stamps : (n,) s, time of each pose; None = its number.
     pose_ids : (n,) names of the poses, kept where all are such as the format knows: another letter and a number. Plain
         numbers get the letter A.
     plain : the graph's plain_edges, where they are known.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
     """
     stamps = np.arange(len(graph.poses), dtype=np.float64) if stamps is None else stamps
     with replacing(path) as stream:

@@ -95,24 +95,43 @@ def resampling_warning(resized: int, scans: int, beams: int) -> str:
     return f"{resized} of {scans} scans have other beams than most; they were resampled to {beams} beams"
 
 
-def largest_reading(ranges: NDArray[np.float32]) -> float:
+def clean(ranges: NDArray[np.float32], range_min: float, range_max: float, *, zero_is_nothing: bool = False) -> None:
+    """Make readings, m, +inf for nothing seen and nan for too near and error, in the memory given (REP-117).
+
+    Parameters
+    ----------
+    zero_is_nothing : a 0 is no echo, as drivers of ROS older than REP-117 write it.
+    """
+    for start in range(0, len(ranges), _AT_ONCE):
+        part = ranges[start : start + _AT_ONCE]
+        with np.errstate(invalid="ignore"):
+            nothing = part >= np.float32(range_max)
+            nothing = nothing | (part == 0.0) if zero_is_nothing else nothing
+            part[~(part >= np.float32(range_min))] = np.nan
+        part[nothing] = np.inf
+
+
+_AT_ONCE = 256
+"""Scans cleaned at a time, for the memory that it takes."""
+
+
+def reach_of(ranges: NDArray[np.float32], warnings: list[str]) -> float:
     """Return a reach, m, in place of one that is not stated: just beyond the largest of readings (k, b) that a lidar may make.
 
-    Drivers write the largest number of their type where they saw nothing.
+    Drivers write the largest number of their type where they saw nothing: what is beyond becomes +inf, in the memory given.
     """
     seen = ranges[np.isfinite(ranges) & (np.abs(ranges) < MOST_METRES)]
-    return float(seen.max()) + _BEYOND if len(seen) else DEFAULT_REACH
+    reach = float(seen.max()) + _BEYOND if len(seen) else DEFAULT_REACH
+    with np.errstate(invalid="ignore"):
+        ranges[ranges > np.float32(reach)] = np.inf
+    warnings.append(
+        f"the scans state no reach (range_max is 0, infinite or no number): the largest reading is used, {reach:.2f} m; what"
+        " was beyond reach cannot be told from what was not measured"
+    )
+    return reach
 
 
 DEFAULT_REACH = 80.0
 """m; reach of the scanners whose recordings do not state it."""
 _BEYOND = 0.01
 """m; a reading of the reach itself would mean that nothing was seen."""
-
-
-def without_reach(used: float) -> str:
-    """Say that the reach of the lidar is not stated, and which is used, m."""
-    return (
-        f"the scans state no reach (range_max is 0, infinite or no number): the largest reading is used, {used:.2f} m; what was"
-        " beyond reach cannot be told from what was not measured"
-    )

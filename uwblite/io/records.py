@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import FormatError
-from .source import OVERLONG_LINE, TextSource, finite
+from .source import OVERLONG_LINE, TextSource, number_table
 
 _TAGS_COUNTED = 100
 _FARTHEST = 1e9
@@ -113,17 +113,7 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
     for line, tokens in rows:
         if len(tokens) != width:
             raise result.error(f"{tokens[0].decode()} has {len(tokens) - 1} fields, expected {width - 1}", line)
-    numeric = [tokens[1:first] + tokens[first + layout.names :] for _, tokens in rows]
-    try:
-        values = np.array(numeric, dtype=np.float64).reshape(len(rows), -1)
-    except ValueError:
-        for (line, _), words in zip(rows, numeric, strict=True):
-            for word in words:
-                finite(word, f"{word[:30]!r} is not a number", result.path, line)
-        raise result.error("a number cannot be read", rows[0][0]) from None
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(bad):
-        raise result.error("a number is not finite", rows[bad[0]][0])
+    values = number_table([(n, tokens[1:first] + tokens[first + layout.names :]) for n, tokens in rows], result.path)
     most = np.full(values.shape[1], _MOST)
     most[layout.stamped : layout.stamped + layout.places] = _FARTHEST
     far = np.flatnonzero((np.abs(values) > most).any(axis=1))

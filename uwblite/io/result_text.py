@@ -144,7 +144,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
         "shape": {"poses": result.shape_poses, "covariances": result.shape_covariances},
         "closures": [_closure_entry(c, result.keyframe_stamps) for c in result.closures],
-        "stages": [{"name": s.name, **s.figures} for s in result.stages],
+        "stages": [{"name": s.name, **s.figures, "work": s.work} for s in result.stages],
         "map": None if grid is None else {name: getattr(grid.geometry, name) for name in _GRID_FIELDS} | seen,
         "files": hashes,
     }

@@ -135,12 +135,7 @@ class Collector:
         return SensorLog(odometry, ranges, scans, mounting, log_notes, gyro=gyro)
 
     def _odometry(self, path: str, held: tuple[BagTopic, ...], warnings: list[str]) -> Odometry:
-        """Return the odometry.
-
-        Raises
-        ------
-        FormatError : there is none, or it has no headings.
-        """
+        """Return the odometry; raise FormatError where there is none, or it has no headings."""
         where, cure = self.plan.odometry, "; where tf has a transform from odom to the base: `topics.odometry=/tf`"
         if self._by_transforms:
             best = self.moving.best(self.base_frame)

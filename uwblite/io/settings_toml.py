@@ -6,9 +6,8 @@ from textwrap import wrap
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from ..config import ADVANCED, RANGE, flat, range_text, to_dict
+from ..config import ADVANCED, RANGE, field_docs, flat, range_text, to_dict
 from ..errors import ConfigError
-from ..field_docs import field_docs
 
 
 def differences(config: Any, base: Any) -> list[str]:

@@ -9,10 +9,13 @@ import select
 import stat
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import BinaryIO
 
+import numpy as np
+
+from ..arrays import Floats
 from ..errors import FormatError
 
 BLOCK_BYTES = 1 << 18
@@ -213,6 +216,26 @@ def finite(text: str | bytes, fault: str, path: str, line: int | None = None) ->
     if not math.isfinite(value):
         raise FormatError(fault, path, line)
     return value
+
+
+def number_table(rows: Sequence[tuple[int, Sequence[bytes]]], path: str) -> Floats:
+    """Return the words of rows, equally many in each behind its line, as finite numbers (n, words).
+
+    Raises
+    ------
+    FormatError : with the line, where a word is no number, or not finite, or beyond what can be squared.
+    """
+    try:
+        table = np.array([words for _, words in rows], dtype=np.float64).reshape(len(rows), -1)
+    except ValueError:
+        for line, words in rows:
+            for word in words:
+                finite(word, f"{word[:30]!r} is not a number", path, line)
+        raise FormatError("a number cannot be read", path, rows[0][0]) from None
+    bad = np.flatnonzero(~(np.abs(table) < 1e100).all(axis=1))
+    if len(bad):
+        raise FormatError("a number is not finite", path, rows[bad[0]][0])
+    return table
 
 
 _LARGEST_SETTINGS = 1 << 20

@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import FormatError
 from .files import write_bytes
-from .source import finite, open_source
+from .source import number_table, open_source
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> None:
@@ -75,31 +75,16 @@ def read_rows(path: str | os.PathLike[str], columns: str, what: str) -> Floats:
     ------
     FormatError : a line has not eight finite numbers, or there is none.
     """
-    parts: list[Floats] = [np.zeros((0, 8))]
+    parts = []
     with open_source(path) as source:
-        for rows in source.rows():
-            parts.append(_numbers(rows, source.path, columns))
-        table = np.concatenate(parts)
-        if len(table) == 0:
+        for rows in filter(None, source.rows()):
+            for number, words in rows:
+                if len(words) != 8:
+                    raise FormatError(f"{len(words)} columns, expected 8: {columns}", source.path, number)
+            parts.append(number_table(rows, source.path))
+        if not parts:
             raise FormatError(f"no {what} in it", source.path)
-    return table
-
-
-def _numbers(rows: list[tuple[int, list[bytes]]], path: str, columns: str) -> Floats:
-    """Return (n, 8) finite numbers."""
-    for number, tokens in rows:
-        if len(tokens) != 8:
-            raise FormatError(f"{len(tokens)} columns, expected 8: {columns}", path, number)
-    try:
-        table = np.array([tokens for _, tokens in rows], dtype=np.float64).reshape(-1, 8)
-    except ValueError:
-        cells = [finite(token, f"{token[:30]!r} is not a number", path, n) for n, tokens in rows for token in tokens]
-        table = np.array(cells).reshape(-1, 8)
-    # Squares of the quaternion must stay finite too.
-    bad = np.flatnonzero(~(np.abs(table) < 1e100).all(axis=1))
-    if len(bad):
-        raise FormatError("a number is not finite", path, rows[bad[0]][0])
-    return table
+    return np.concatenate(parts)
 
 
 def read_relations(path: str | os.PathLike[str]) -> tuple[Floats, Floats, Floats]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import WIDE, Floats, Ints
+from ..work import LOOK_UPS, Work
 from .clouds import Clouds
 
 _CLOUDS_AT_ONCE = 64
@@ -43,6 +44,8 @@ class CloudRasters:
     nearest: NDArray[np.signedinteger]
     """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice. Those of the
     first run name none: they stand for all runs that name none."""
+    work: Work
+    """To which look-ups are added: that of the clouds."""
 
     def cells(self, k: int) -> NDArray[np.signedinteger]:
         """Return the raster (x, y) of one cloud."""
@@ -81,7 +84,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
         run[rows][named] = (count + np.arange(len(named))) * _RUN
         kept.append(block[named])
         count += len(named)
-    return CloudRasters(cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1))
+    return CloudRasters(cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1), clouds.work)
 
 
 def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:
@@ -90,7 +93,7 @@ def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> Cloud
     nearest = np.concatenate([one.nearest, other.nearest])
     origin, shape = np.concatenate([one.origin, other.origin]), np.concatenate([one.shape, other.shape])
     start = np.concatenate([one.start, other.start + np.int32(len(one.run))])
-    return CloudRasters(one.cell, origin[which], shape[which], start[which], run, nearest)
+    return CloudRasters(one.cell, origin[which], shape[which], start[which], run, nearest, one.work)
 
 
 def _blocks(clouds: Clouds) -> Iterator[slice]:
@@ -144,6 +147,7 @@ def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
 
 def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
     """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
+    raster.work[LOOK_UPS] += x.size
     per_cell = 1.0 / raster.cell
     # Truncation puts coordinates up to a cell below the raster into its rim, which names no point.
     cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)

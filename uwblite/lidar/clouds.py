@@ -5,7 +5,7 @@ a few micrometres at the reach of a lidar, and coordinates in one piece each: ho
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import ClassVar
 
@@ -16,6 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated
 from ..config import setting
 from ..odometry.attached import ScanPoints
+from ..work import Work
 from . import beam_gaps
 from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_by_key
 
@@ -59,6 +60,8 @@ class Clouds:
     """(p,) keyframe."""
     normal_variance: NDArray[np.floating]
     """(p,) rad^2, variance of the normal's angle by scatter about its line."""
+    work: Work = field(default_factory=Work, repr=False)
+    """To which the operations on these clouds, and on all that are made from them, are added; see work.py."""
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -76,7 +79,8 @@ class Clouds:
     def chosen(self, which: Ints) -> "Clouds":
         """Return some clouds (s,), in this order."""
         runs = np.split(which, np.flatnonzero(np.diff(which) != 1) + 1) if len(which) else []
-        return joined([self._run(int(run[0]), int(run[-1]) + 1) for run in runs], self.points.dtype.type)
+        parts = [self._run(int(run[0]), int(run[-1]) + 1) for run in runs]
+        return replace(joined(parts, self.points.dtype.type), work=self.work)
 
     def _run(self, first: int, end: int) -> "Clouds":
         """Return the clouds from one to another, without copying their points."""
@@ -88,7 +92,8 @@ class Clouds:
         """Return the clouds with some of their points (p,) alone."""
         counts = np.bincount(self.owner[kept], minlength=len(self))
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
-        return Clouds(offsets, self.points[kept], self.normals[kept], self.owner[kept], self.normal_variance[kept])
+        arrays = (self.points[kept], self.normals[kept], self.owner[kept], self.normal_variance[kept])
+        return Clouds(offsets, *arrays, self.work)
 
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
@@ -134,7 +139,9 @@ def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clo
     return whole
 
 
-def make_cloud(points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25) -> Clouds:
+def make_cloud(
+    points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25, work: Work | None = None
+) -> Clouds:
     """Return one cloud of single points: a line is fitted to the surroundings of each.
 
     Parameters
@@ -152,7 +159,8 @@ def make_cloud(points: Floats, viewpoints: Floats | None = None, normal_radius: 
         away = np.einsum("ni,ni->n", viewpoints - points, normals) < 0.0
         normals = np.where(away[:, None], -normals, normals)
     variance = np.where(straight, lines.normal_variance, 0.0)
-    return Clouds(np.array([0, len(points)]), lines.centers, normals, np.zeros(len(points), dtype=np.int32), variance)
+    arrays = (lines.centers, normals, np.zeros(len(points), dtype=np.int32), variance)
+    return Clouds(np.array([0, len(points)]), *arrays, Work() if work is None else work)
 
 
 _STRAIGHT = 0.6

@@ -19,6 +19,7 @@ from scipy import fft
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
+from ..work import SCORES
 from .cloud_rasters import rasterize, surface_field
 from .clouds import Clouds
 
@@ -118,6 +119,7 @@ def score_grid(
             product = np.conj(fft.fft2(image)) * spectrum
             product *= np.complex64(np.exp(-1j * heading))
             rows = fft.ifft(product, axis=0)[shift_y]
+            target.work[SCORES] += image.size
             scores[k] = fft.ifft(rows, axis=1)[:, shift_x].real
         scores /= len(source.points)
     return scores, headings, shift_x, shift_y

@@ -168,14 +168,15 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     used, one, other = renumbered(first, second)
     profile = np.nan_to_num(scans.ranges[used, ::every].astype(np.float64), nan=reach, posinf=reach)
     profile = np.where(profile < scans.range_min, reach, np.minimum(profile, reach))
-    before = _seen_from(profile[one], angles, shift, reach)
-    after = profile[other]
+    # Pairs last: each beam of all pairs lies in one piece.
+    both = _seen_from(profile[one], angles, shift, reach), profile[other]
+    before, after = (np.ascontiguousarray(seen.T, np.float32) for seen in both)
     beams, most = len(angles), int(0.4 * len(angles))
     turns = range(-most, most + 1)
     cost = np.empty((len(first), len(turns)))
     for column, turn in enumerate(turns):
         low, high = max(0, -turn), min(beams, beams - turn)
-        cost[:, column] = np.abs(after[:, low:high] - before[:, low + turn : high + turn]).mean(axis=1)
+        cost[:, column] = np.abs(after[low:high] - before[low + turn : high + turn]).mean(axis=0)
     best = np.clip(np.argmin(cost, axis=1), 1, len(turns) - 2)
     rows = np.arange(len(first))
     left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]

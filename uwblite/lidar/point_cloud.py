@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from ..arrays import WIDE, Bools, Floats, Ints, Wides
-from ..validation import as_array, require_finite, require_shape
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, as_array, require_finite, require_shape
 
 
 def make_tree(points: Floats) -> cKDTree:

@@ -8,10 +8,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Floats
-from ..config import setting
-from ..field_docs import documented
-from ..validation import as_array, require_finite, require_shape
+from ..arrays import Floats, as_array, require_finite, require_shape
+from ..config import documented, setting
 from .point_cloud import as_points, make_tree
 
 

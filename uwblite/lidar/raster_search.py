@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..work import SCORES
 from .cloud_rasters import CloudRasters, surface_field
 from .clouds import Clouds
 
@@ -57,6 +58,7 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
     points = clouds.points[rows].astype(np.float64)
     normals = (clouds.normals[rows, 0] - 1j * clouds.normals[rows, 1]).astype(np.complex64)
     scores = np.empty((len(headings), len(shift), len(shift)), np.float32)
+    raster.work[SCORES] += scores.size * len(rows)
     for n, heading in enumerate(headings):
         laid = se2.transform(np.array([guess[0], guess[1], heading]), points)
         cell = np.floor((laid - raster.origin[0]) / raster.cell).astype(np.intp)

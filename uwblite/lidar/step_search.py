@@ -156,5 +156,5 @@ def _sub_map_and_next(clouds: Clouds, views: Ints, poses: Floats, following: int
     variance = np.concatenate([clouds.normal_variance[rows], clouds.normal_variance[last]])
     size = rows.stop - rows.start
     owner = np.repeat(np.arange(2, dtype=np.int32), [size, len(points) - size])
-    pair = Clouds(np.array([0, size, len(points)]), points, normals, owner, variance)
+    pair = Clouds(np.array([0, size, len(points)]), points, normals, owner, variance, clouds.work)
     return pair.only(np.abs(points).max(axis=1) < _SPAN)

@@ -138,7 +138,7 @@ def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: In
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
             inner = np.flatnonzero(kept[a:b]) + a
             kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
-    return Clouds(offsets, points, normals, number, scatter).only(kept)
+    return Clouds(offsets, points, normals, number, scatter, clouds.work).only(kept)
 
 
 def _merge(

@@ -14,13 +14,13 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..lidar.degeneracy import measured_part
-from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA
+from ..radio.range_errors import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
 
 POSE, WHEELS = slice(0, 3), slice(3, 6)
 """Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
 PATTERN = slice(6, 6 + 2 * HARMONICS)
-"""Of the state: m, range error as a function of the anchor's direction in the robot's frame (tag_pattern.pattern_waves): the
+"""Of the state: m, range error as a function of the anchor's direction in the robot's frame (range_errors.pattern_waves): the
 tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
 LASER = PATTERN.stop
 """Of the state: rad, heading of the laser on the base against the mounting that the map's robot showed."""

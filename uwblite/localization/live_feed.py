@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import DataError
-from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan, Measured
+from ..io.carmen_live import LiveReader, Measured
 from ..sensor_log import SensorMounting
 from .known_map import KnownMap
 from .localizer import UNSEEN_SPEED, Localizer
@@ -65,7 +65,7 @@ class LiveFeed:
                 continue
             self._early.append(measured)
             # The log contains the mounting before the first scan; or no scan comes for so long.
-            if isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR:
+            if measured.sensor == "lidar" or measured.order - self._early[0].order > _NO_LIDAR:
                 yield from self._begin()
 
     def wait(self, quiet: float) -> Iterator[LocalizerState]:
@@ -107,28 +107,28 @@ class LiveFeed:
                 self._note(f"left out: {error}")
 
     def _used(self, localizer: Localizer, measured: Measured) -> Iterator[LocalizerState]:
-        if isinstance(measured, LiveOdometry):
-            yield self._aged(localizer.add_odometry(measured.stamp, *measured.pose.tolist()))
-        elif isinstance(measured, LiveGyro):
-            localizer.add_gyro(measured.stamp, measured.heading)
-        elif isinstance(measured, LiveRange):
-            yield self._aged(localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag))
-        elif isinstance(measured, LiveScan):
+        if measured.sensor == "odometry":
+            yield self._aged(localizer.add_odometry(measured.stamp, *measured.value.tolist()))
+        elif measured.sensor == "gyro":
+            localizer.add_gyro(measured.stamp, measured.value)
+        elif measured.sensor == "uwb":
+            yield self._aged(localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.value], measured.tag))
+        else:
             if not self._sees and localizer.scanner is None and "lidar" in self._reported:
                 # It comes late: only now the log has said where the laser sits.
                 self._localizer = localizer = Localizer(self._known, self._mounting(self._reader.mounting))
             self._sees = True
-            s = measured.scans
+            s = measured.value
             scanner = Scanner(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
             yield self._aged(localizer.add_scan(measured.stamp, s.ranges[0], scanner))
 
     def _watch(self, measured: Measured) -> None:
         """Report once when a sensor that was there, or should be, becomes silent, and when it is back."""
-        kind = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}.get(type(measured), "lidar")
         if self._stopped:
             self._stopped = False
             self._note("data come again")
-        self.silence.hear(kind, measured.order if self._localizer is None else self._localizer.on_time(measured.order))
+        order = measured.order if self._localizer is None else self._localizer.on_time(measured.order)
+        self.silence.hear(measured.sensor, order)
         silent = self.silence.silent()
         for name in sorted(self._reported - set(silent)):
             self._note(f"{name} is back")

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, as_array, require_shape, require_type
 from ..clocks.sensor_clock import JUMP, SensorClock
 from ..errors import DataError
-from ..odometry.gyro_turns import GyroTurns
+from ..odometry.gyro import GyroTurns
 from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
-from ..validation import as_array, require_shape, require_type
 from .known_map import KnownMap
 from .pose_estimator import PoseEstimator
 from .range_update import RangeFacts

@@ -7,8 +7,7 @@ from scipy.special import ndtr
 
 from .. import se2
 from ..arrays import Floats
-from ..radio.range_errors import RangeErrors
-from ..radio.tag_pattern import pattern_waves
+from ..radio.range_errors import RangeErrors, pattern_waves
 from .hypotheses import FIRST_ANCHOR, PATTERN, Hypotheses, symmetric
 
 _TAIL, _DETOUR, _WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0

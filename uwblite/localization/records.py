@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arrays import Floats
-from ..field_docs import documented
+from ..config import documented
 
 
 @documented

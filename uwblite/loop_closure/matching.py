@@ -20,6 +20,7 @@ from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import match, pair_points
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import violates_free_space
+from ..work import Work
 from .candidates import Candidates
 from .closures import LoopClosureConfig
 from .parallel import in_order
@@ -75,8 +76,9 @@ def fit(
     free : observed free space of each sub-map; None = not tested.
     """
     total, done, parts = len(candidates.target), 0, []
-    for part in in_order(_fit, _batches(candidates, submaps, config, search_config, free), executor):
+    for part, spent in in_order(_fit, _batches(candidates, submaps, config, search_config, free), executor):
         parts.append(part)
+        submaps.clouds.work.update(spent)
         done += len(part.found)
         if progress is not None:
             progress(done, total)
@@ -91,12 +93,12 @@ def _batches(
         part = candidates.rows(slice(first, first + _AT_ONCE))
         used, target, source = renumbered(part.target, part.source)
         spaces = None if free is None else [free[k] for k in used.tolist()]
-        clouds = submaps.clouds.chosen(used)
+        clouds = replace(submaps.clouds.chosen(used), work=Work())
         yield _Batch(part.renumbered(target, source), clouds, submaps.spacing, spaces, config, search_config)
 
 
-def _fit(batch: _Batch) -> ClosureMatches:
-    """Fit one batch; runs in a worker."""
+def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
+    """Fit one batch, and return the work of that; runs in a worker."""
     candidates, clouds, config = batch.candidates, batch.clouds, batch.config
     raster = rasterize(clouds, 0.1, 0.5)
     row, guess = _guesses(batch)
@@ -116,7 +118,7 @@ def _fit(batch: _Batch) -> ClosureMatches:
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
     through = _free_space_violations(batch, best, _promising(best, net, config))
-    return ClosureMatches(best, found, second, through, net)
+    return ClosureMatches(best, found, second, through, net), clouds.work
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
@@ -185,7 +187,7 @@ def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
     """Return one sub-map's cloud ready for the search; its normals point to the side of the laser."""
     if k not in prepared:
         points, normals = clouds.cloud(k)
-        prepared[k] = make_cloud(points, points + normals)
+        prepared[k] = make_cloud(points, points + normals, work=clouds.work)
     return prepared[k]
 
 

@@ -21,9 +21,10 @@ from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
 from ..problem.parts import at_given_poses
-from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
+from ..radio.prior_selection import with_alike_heights
 from ..radio.range_noise import RangeNoiseConfig
+from ..work import RAYS
 from .estimate import Estimate, Task
 from .map_frame import cropped
 from .progress import Stage
@@ -166,6 +167,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
 
     reporter = stages.reporter("occupancy grid")
     grid = from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
+    stages.work[RAYS] += sum(own.scans.ranges.size for own in sweeps)
     if grid.scans_astray:
         stages.note("scans-astray", scans=grid.scans_astray, used=grid.scans_used)
     if grid.geometry.resolution > config.grid.resolution:

@@ -91,7 +91,8 @@ def _one_graph(
         placed = estimate.placed
         anchors[own[placed]] = se2.transform(motion, estimate.graph.anchors[placed])
     unplaced = np.zeros(len(ids), dtype=bool) if joined is None else ~joined.placed
-    graph = Graph(poses, anchors, (priors,), block, fixed_anchors=unplaced, fixed_calibration=fixed)
+    work = estimates[0].graph.work
+    graph = Graph(poses, anchors, (priors,), block, fixed_anchors=unplaced, fixed_calibration=fixed, work=work)
     return replace(
         estimates[0], graph=graph, odometry=_one_odometry([e.odometry for e in estimates], at, recordings),
         ranges=_one_ranges([e.ranges for e in estimates], at, place, recordings), bootstrap=joined, anchor_ids=ids,

@@ -20,7 +20,7 @@ from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..problem.solution import rough, with_nonnegative_heights
-from ..radio.tag_pattern import without_pattern
+from ..radio.range_errors import without_pattern
 from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
@@ -31,7 +31,7 @@ from .recordings import denser, later
 
 def make_clouds(estimate: Estimate, task: Task) -> Estimate:
     """Make a cloud for each keyframe, and free the laser's mounting and clock, or where it turns."""
-    scans = scan_clouds.make(task.recordings, task.config, 0.0)
+    scans = scan_clouds.make(task.recordings, task.config, 0.0, task.stages.work)
     task.stages.end("clouds", points=len(scans.clouds.points))
     # Wheels that turn about another point of the base look like a laser elsewhere on it: one of the two is known.
     kinds = LASER if estimate.graph.calibration.of_kinds(*LASER[:2]).any() else (*LASER, TURNING)
@@ -122,7 +122,8 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
     """Return the estimate with keyframes later by `late` s and clouds made for a lidar whose clock is late by `delay` s."""
     before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
-    estimate = replace(estimate, scans=scan_clouds.make(task.following(estimate).recordings, task.config, delay))
+    task = task.following(estimate)
+    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
     return estimate
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ..config import documented
 from ..errors import ConfigError
-from ..field_docs import documented
 from ..graph.calibration import CalibrationConfig
 from ..graph.robust import SQUARED
 from ..graph.solver import SolverConfig

@@ -6,6 +6,7 @@ from ..errors import Cancelled
 from ..findings import DOUBT, WARNING, Fact, Finding, of_severity
 from ..graph.solver import SolverSummary
 from ..map_result import StageSummary
+from ..work import KINDS, Work
 
 
 class Stage(str):
@@ -36,6 +37,8 @@ class Stages:
         self._progress, self._clock = progress, clock
         self._since = clock() if clock else 0.0
         self.done: list[StageSummary] = []
+        self.work = Work()
+        """Operations since the last stage ended."""
         self.facts: list[Fact] = []
         self.findings: list[Finding] = []
 
@@ -62,8 +65,9 @@ class Stages:
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
         now = self._clock() if self._clock else 0.0
-        self.done.append(StageSummary(stage, now - self._since, figures))
+        self.done.append(StageSummary(stage, now - self._since, figures, {kind: n for kind in KINDS if (n := self.work[kind])}))
         self._since = now
+        self.work.clear()
         self.report(stage, 1, 1)
 
     @property

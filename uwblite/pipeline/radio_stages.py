@@ -25,6 +25,7 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
+from ..work import Work
 from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -36,7 +37,7 @@ def first_optimisation(task: Task) -> Estimate:
     """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
     recordings = task.recordings
     task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
-    estimates = [dead_reckoning(recording, task.config) for recording in recordings.each]
+    estimates = [dead_reckoning(recording, task.config, task.stages.work) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
@@ -46,13 +47,13 @@ def first_optimisation(task: Task) -> Estimate:
     return anchor_heights.with_likelier_heights(joined, task.config)
 
 
-def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
+def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | None = None) -> Estimate:
     """Return a recording's graph by dead reckoning, with its calibration priors, odometry edges and range edges."""
     log, frames, ids = recording.log, recording.frames, recording.anchor_ids
     priors, noise = gyro.settings(log, sideways_priors(log.odometry, config.calibration), config.odometry)
     listed = calibration.unknowns(priors, ids, heights_given(recording), rises=tag_rises(recording))
     block = calibration.block(listed)
-    graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
+    graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block, work=Work() if work is None else work)
     graph = graph.with_edges(calibration.prior_edges(listed))
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
     graph = with_free(graph, *ODOMETRY, *OMNI, BIAS, RANGE_SCALE)

@@ -8,6 +8,7 @@ from ..arrays import Bools, Ints
 from ..lidar import cloud_rasters, clouds
 from ..lidar.clouds import Clouds
 from ..odometry.attached import choose_scans, scan_points
+from ..work import POINTS, Work
 from .estimate import ScanClouds
 from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings
@@ -16,10 +17,10 @@ _BLOCK = 32
 """Keyframes whose rays are in memory at once."""
 
 
-def make(recordings: Recordings, config: MappingConfig, delay: float) -> ScanClouds:
-    """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s."""
+def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
+    """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
     parts = [part for r in recordings.each for part in _blocks(r, np.arange(len(r.frames)), config, delay)]
-    return _with_raster(clouds.joined(parts), config, delay)
+    return _with_raster(replace(clouds.joined(parts), work=work), config, delay)
 
 
 def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
@@ -28,9 +29,9 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     former = np.concatenate([_former(a, b, config, old.delay) for a, b in pairs])
     changed = [np.flatnonzero(former[b.rows] < 0) for b in after.each]
     parts = [p for r, which in zip(after.each, changed, strict=True) for p in _blocks(r, which, config, old.delay)]
-    new = _with_raster(clouds.joined(parts), config, old.delay)
+    new = _with_raster(replace(clouds.joined(parts), work=old.clouds.work), config, old.delay)
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
-    both = clouds.joined([old.clouds, new.clouds]).chosen(place)
+    both = replace(clouds.joined([old.clouds, new.clouds]), work=old.clouds.work).chosen(place)
     return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay)
 
 
@@ -40,6 +41,7 @@ def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
 
 
 def _with_raster(built: Clouds, config: MappingConfig, delay: float) -> ScanClouds:
+    built.work[POINTS] += len(built.points)
     raster = cloud_rasters.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
     return ScanClouds(built, raster, delay)
 

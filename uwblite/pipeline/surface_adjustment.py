@@ -31,6 +31,7 @@ from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.ray_noise import RayNoise
 from ..lidar.surface_rays import MeasuredSurfaces, Surfaces, points_on
 from ..odometry import floor as floors
+from ..work import RAYS
 from .estimate import Estimate, ScanClouds, Task
 from .surface_search import find_surfaces, with_round_columns
 
@@ -155,6 +156,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, subtrees=True, like=normal)
+        task.stages.work[RAYS] += len(found.rays.keyframe)
         kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
         sums = weighted_sums(found, lidar.sensors, poses, kernel)
         certainty, rays = sums.poses, _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)

@@ -24,7 +24,9 @@ def stretch(graph: Graph, first: int, last: int) -> Graph:
             inside.append(replace(rows, i=rows.i - first, j=rows.j - first))
     fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(*LASER, *ODOMETRY, *OMNI, TURNING)
     priors = graph.calibration_priors
-    alone = Graph(graph.poses[first:last], edges=priors, calibration=graph.calibration, fixed_calibration=fixed)
+    alone = Graph(
+        graph.poses[first:last], edges=priors, calibration=graph.calibration, fixed_calibration=fixed, work=graph.work
+    )
     return alone.with_edges(*inside)
 
 

@@ -11,9 +11,13 @@ from .trilateration import TrilaterationConfig
 
 
 def bootstrap_graph(
-    graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
+    graph: Graph,
+    odometry: OdometryEdges,
+    ranges: RangeEdges,
+    path: Floats,
+    config: BootstrapConfig,
     search: TrilaterationConfig,
-) -> BootstrapResult:  # fmt: skip
+) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
     Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A

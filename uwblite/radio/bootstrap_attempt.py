@@ -277,7 +277,8 @@ class Attempt:
         which = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
         radio = self.ranges.rows(np.flatnonzero(which))
         radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
-        return Graph(self.poses[low:high], self.anchors, (), self.calibration).with_edges(wheels, radio)
+        alone = Graph(self.poses[low:high], self.anchors, (), self.calibration, work=self.graph.work)
+        return alone.with_edges(wheels, radio)
 
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:

@@ -46,8 +46,15 @@ class BatchRow:
 
 
 _COLUMNS = tuple(f.name for f in fields(BatchRow))
-_HEADINGS = {"duration": "duration, s", "travelled": "travelled, m", "anchors_ok": "anchors ok", "width": "width, m",
-             "closure_candidates": "candidates", "height": "height, m", "seconds": "took, s"}  # fmt: skip
+_HEADINGS = {
+    "duration": "duration, s",
+    "travelled": "travelled, m",
+    "anchors_ok": "anchors ok",
+    "width": "width, m",
+    "closure_candidates": "candidates",
+    "height": "height, m",
+    "seconds": "took, s",
+}
 
 
 def row_of(recording: str, folder: str, report: dict[str, Any]) -> BatchRow:

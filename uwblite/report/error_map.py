@@ -8,15 +8,13 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
-from .canvas import Canvas
+from .canvas import Canvas, rgb
 from .picture import PictureAnchor, draw_map, shaded
 from .picture_frame import FLOOR, INK
 
 _STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
 """m; bounds of the colours."""
-_COLOURS = np.array(
-    [[33, 120, 180], [86, 180, 190], [190, 225, 170], [250, 220, 120], [240, 150, 70], [200, 60, 60]], dtype=np.uint8
-)
+_COLOURS = np.array([rgb(code) for code in ["2178b4", "56b4be", "bee1aa", "fadc78", "f09646", "c83c3c"]], dtype=np.uint8)
 """From better than the first bound to worse than the last; distinct in grey as well (dark, light, dark with a legend)."""
 
 

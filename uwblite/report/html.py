@@ -183,13 +183,28 @@ def _stage_table(result: MapResult, timings: bool) -> str:
 
 
 _FIGURES = {
-    "keyframes": "{} keyframes", "travelled": "{:.1f} m", "odometry": "{} steps of odometry", "ranges": "{} ranges",
-    "placed": "{} anchors placed", "points": "{} points", "pairs": "{} pairs of scans", "used": "{} of them used",
-    "submaps": "{} sub-maps", "candidates": "{} candidates", "accepted": "{} accepted", "walls": "{} walls",
-    "columns": "{} columns", "rays": "{} rays", "sigma": "scatter {:.4f} m", "range_sigma": "scatter of ranges {:.3f} m",
-    "shift": "poses moved by {:.4f} m", "visits": "{} visits of places seen before", "scans": "{} scans drawn",
-    "free_space_violation": "{:.2%} of the rays end in free space", "iterations": "{} iterations",
-}  # fmt: skip
+    "keyframes": "{} keyframes",
+    "travelled": "{:.1f} m",
+    "odometry": "{} steps of odometry",
+    "ranges": "{} ranges",
+    "placed": "{} anchors placed",
+    "points": "{} points",
+    "pairs": "{} pairs of scans",
+    "used": "{} of them used",
+    "submaps": "{} sub-maps",
+    "candidates": "{} candidates",
+    "accepted": "{} accepted",
+    "walls": "{} walls",
+    "columns": "{} columns",
+    "rays": "{} rays",
+    "sigma": "scatter {:.4f} m",
+    "range_sigma": "scatter of ranges {:.3f} m",
+    "shift": "poses moved by {:.4f} m",
+    "visits": "{} visits of places seen before",
+    "scans": "{} scans drawn",
+    "free_space_violation": "{:.2%} of the rays end in free space",
+    "iterations": "{} iterations",
+}
 """Figures of stages that are shown, and how."""
 
 _ABOUT_STAGES = (

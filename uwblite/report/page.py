@@ -1,7 +1,7 @@
 """The frame of the HTML report: page, style, and the script that zooms the map."""
 
-from . import palette
-from .palette import hexadecimal
+from . import canvas
+from .canvas import hexadecimal
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -85,10 +85,15 @@ figure{margin:.6rem 0}figcaption{font-weight:600}
 def coloured(style: str) -> str:
     """Return a style with the palette's colours in place of their names, such as @path@ and @path-dark@."""
     names = {
-        "path": palette.PATH, "doubted": palette.DOUBTED,
-        "accepted": palette.ACCEPTED, "rejected": palette.REJECTED, "anchor": palette.ANCHOR,
-        "start": palette.START, "nlos": palette.NLOS, **{f"path{k}": c for k, c in enumerate(palette.PATHS)},
-    }  # fmt: skip
+        "path": canvas.PATH,
+        "doubted": canvas.DOUBTED,
+        "accepted": canvas.ACCEPTED,
+        "rejected": canvas.REJECTED,
+        "anchor": canvas.ANCHOR,
+        "start": canvas.START,
+        "nlos": canvas.NLOS,
+        **{f"path{k}": c for k, c in enumerate(canvas.PATHS)},
+    }
     for name, colour in names.items():
         style = style.replace(f"@{name}@", hexadecimal(colour)).replace(f"@{name}-dark@", hexadecimal(colour, dark=True))
     return style

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from ..arrays import Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
-from .canvas import Canvas, Colour
-from .palette import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START
+from .canvas import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START, Canvas, Colour, rgb
 from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
 
 Image = NDArray[np.uint8]
 
-WALL: Colour = (24, 28, 36)
+WALL: Colour = rgb("181c24")
 
 _MOST_SPREAD = 2.0
 """m of an ellipse's half axes for which room is made."""

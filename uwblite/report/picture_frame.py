@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
-from .canvas import Canvas, Colour
+from .canvas import Canvas, Colour, rgb
 
-FLOOR: Colour = (255, 255, 255)
-PAPER: Colour = (226, 229, 233)
-INK: Colour = (52, 58, 68)
+FLOOR: Colour = rgb("ffffff")
+PAPER: Colour = rgb("e2e5e9")
+INK: Colour = rgb("343a44")
 
 _ROW = 44
 """Pixels of the row with scale bar and caption."""

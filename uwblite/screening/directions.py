@@ -9,11 +9,9 @@ from ..arrays import Bools, Floats
 from ..findings import Fact
 from ..lidar import laser_mounting
 from ..sensor_log import Odometry, SensorLog
-from .units import heading_agreement
+from .units import CLEARLY, heading_reading
 from .wheel_motion import Pairs
 
-_AGREEMENT, _CLEARLY = 0.7, 0.2
-"""Agreement of heading and path below which the sign is tested, and by how much the other sign must agree better."""
 _TURNS = 300
 """Least number of scan pairs from which it is decided whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
@@ -26,8 +24,8 @@ _LEAST_PAIRS = 15
 
 def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the heading's sign that agrees with the path; a lidar decides which is right."""
-    plain, varied = heading_agreement(log.odometry)
-    if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
+    reading = heading_reading(log.odometry)
+    if reading.sound or reading.mirrored < reading.plain + CLEARLY:
         return log, []
     mirrors = {"the sign of its heading": np.array([1.0, 1.0, -1.0]), "the sign of its y": np.array([1.0, -1.0, 1.0])}
     tried = {what: replace(log, odometry=_scaled(log.odometry, sign)) for what, sign in mirrors.items()}

@@ -10,9 +10,9 @@ from ..findings import Fact
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
-from .late_scans import with_late_scans_placed
-from .own_body import without_own_body
-from .shared_names import without_shared_names
+from .clocks import with_late_scans_placed
+from .range_motion import without_shared_names
+from .stuck_sensors import without_own_body
 from .wheel_motion import Pairs
 
 _GAP = 2.0

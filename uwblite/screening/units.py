@@ -1,5 +1,7 @@
 """Units that are clearly wrong, reported before anything is computed with them."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..arrays import Floats
@@ -40,7 +42,7 @@ _SAME_LENGTH = 2.0
 """Sensors of one recording last equally long to this factor."""
 _AGREEMENT = 0.7
 """Agreement of heading and direction of motion below which the heading is not the path's."""
-_CLEARLY = 0.2
+CLEARLY = 0.2
 """Another interpretation of the heading must agree better by so much."""
 
 
@@ -116,6 +118,26 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     return float(np.abs(np.sum(weight * np.exp(2j * (direction - factor * half)))) / np.sum(weight)), bool(varied)
 
 
+class HeadingReading(NamedTuple):
+    """How well the heading agrees with the direction of motion, see heading_agreement."""
+
+    plain: float
+    mirrored: float
+    """With the other sign."""
+    degrees: float
+    """As degrees, wrapped or not."""
+    sound: bool
+    """Whether the path does not turn enough to tell, or the heading is the path's as it stands."""
+
+
+def heading_reading(odometry: Odometry) -> HeadingReading:
+    """Return how the heading agrees with the path as it stands, with the other sign, and as degrees."""
+    plain, varied = heading_agreement(odometry)
+    mirrored, radians = heading_agreement(odometry, -1.0)[0], np.radians(odometry.poses[:, 2])
+    degrees = heading_agreement(Odometry(odometry.stamps, np.column_stack([odometry.poses[:, :2], radians])))[0]
+    return HeadingReading(plain, mirrored, degrees, not varied or plain >= _AGREEMENT)
+
+
 def _odometry_stamps(odometry: Odometry) -> str:
     """Return the words on stamps with which neither the time between readings nor the speed is a robot's."""
     if text := _seldom_stamps(odometry):
@@ -142,9 +164,15 @@ def _seldom_stamps(odometry: Odometry) -> str:
         return ""
     turns = np.minimum(steps[:, 2] % (2.0 * np.pi), -steps[:, 2] % (2.0 * np.pi))
     speed, spin = float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / span, float(turns.sum()) / span
-    found = [(abs(np.log(speed / unit / _USUAL_SPEED)), name, unit) for name, unit in _LONG_TIMES.items()
-             if speed > FASTEST and (spin > _SPIN or period < _RAPID) and spin / unit < _SPIN
-             and _PERIODS[0] <= period * unit <= _PERIODS[1] and _SPEEDS[0] <= speed / unit <= _SPEEDS[1]]  # fmt: skip
+    found = [
+        (abs(np.log(speed / unit / _USUAL_SPEED)), name, unit)
+        for name, unit in _LONG_TIMES.items()
+        if speed > FASTEST
+        and (spin > _SPIN or period < _RAPID)
+        and spin / unit < _SPIN
+        and _PERIODS[0] <= period * unit <= _PERIODS[1]
+        and _SPEEDS[0] <= speed / unit <= _SPEEDS[1]
+    ]
     return _other_time(*min(found)[1:], period, speed) if found else ""
 
 
@@ -217,25 +245,17 @@ def _other_unit(what: str, usual: str, unit: str, option: str) -> str:
 
 
 def _heading(odometry: Odometry) -> str:
-    plain, varied = heading_agreement(odometry)
-    degrees, _ = _degrees(odometry)
-    mirrored, _ = heading_agreement(odometry, -1.0)
+    reading = heading_reading(odometry)
     turn, span = np.abs(np.diff(odometry.poses[:, 2])), np.diff(odometry.stamps)
     turning = (turn > 1e-6) & (span > 0)
     rate = float(np.median(turn[turning] / span[turning])) if turning.sum() >= _ENOUGH else 0.0
     large = rate > _FAST_TURN or float(np.ptp(odometry.poses[:, 2])) > _MORE_THAN_A_TURN
-    if varied and large and plain < _AGREEMENT and degrees > max(plain, mirrored) + _CLEARLY:
+    if large and not reading.sound and reading.degrees > max(reading.plain, reading.mirrored) + CLEARLY:
         return (
-            f"the odometry's heading looks like degrees (as such it agrees with the path to {degrees:.2f} of 1, as radians to "
-            f"{plain:.2f}); write radians into the log (`angle_unit=0.0174533`)"
+            f"the odometry's heading looks like degrees (as such it agrees with the path to {reading.degrees:.2f} of 1, as "
+            f"radians to {reading.plain:.2f}); write radians into the log (`angle_unit=0.0174533`)"
         )
     return ""
-
-
-def _degrees(odometry: Odometry) -> tuple[float, bool]:
-    """Return the agreement of the heading taken as degrees, wrapped or not."""
-    radians = np.radians(odometry.poses[:, 2])
-    return heading_agreement(Odometry(odometry.stamps, np.column_stack([odometry.poses[:, :2], radians])))
 
 
 def _of_ranges(log: SensorLog) -> str:

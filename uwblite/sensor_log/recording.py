@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ..arrays import require_finite, require_index, require_type
+from ..config import documented
 from ..errors import DataError
-from ..field_docs import documented
-from ..validation import require_finite, require_index, require_type
 from .notes import LogNotes, Screening
 from .sensors import Gyro, LaserScans, Odometry, SensorMounting, UwbRanges
 

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import Bools, Floats, Ints, Table, settle
+from ..config import documented
 from ..errors import DataError
-from ..field_docs import documented
-from ..validation import settle
 
 
 @documented

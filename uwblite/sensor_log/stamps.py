@@ -1,4 +1,4 @@
-"""Stamps: whether they are times of measurement, or of receipt in bursts."""
+"""Stamps: whether they are times of measurement, of receipt in bursts, or stand still."""
 
 import numpy as np
 
@@ -13,6 +13,8 @@ _READINGS, _STEPS = 4, 100
 """Least number of steps within a window, and of such steps in all, that show how regular stamps are."""
 _ARM = 0.3
 """Distance from the middle of a robot at which a turn counts as way, m."""
+_FEW_STAMPS = 20
+"""Stamps that may be equal by chance."""
 _ANYWHERE = 0.5
 """Share of the time between two readings by which each may be displaced before their order means nothing."""
 
@@ -51,3 +53,27 @@ def odometry_in_bursts(odometry: Odometry) -> bool:
     steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
     advance = np.hypot(steps[:, 0], steps[:, 1]) + _ARM * np.abs(steps[:, 2])
     return in_bursts(odometry.stamps) and in_bursts(odometry.stamps, np.concatenate([[0.0], np.cumsum(advance)]))
+
+
+def stand_still(stamps: Floats, travelled: Floats) -> bool:
+    """Return whether stamps (n,), s, in the order of the readings, stand still while the robot drives.
+
+    Readings that waited in a buffer share a stamp as well, and then a robot drives no farther within one than it does while a
+    buffer fills.
+
+    Parameters
+    ----------
+    travelled : (n,) m, distance driven until each reading.
+    """
+    if len(stamps) < _FEW_STAMPS or travelled[-1] - travelled[0] <= 0.0:
+        return False
+    way = np.diff(travelled)
+    group = np.concatenate([[0], np.cumsum(np.diff(stamps) != 0.0)])
+    within = np.where(group[1:] == group[:-1], way, 0.0)
+    far = np.bincount(group[1:], within) > min(_BUFFERED, _HALF * float(way.sum()))
+    return float(within[far[group[1:]]].sum()) > _HALF * float(way.sum())
+
+
+_BUFFERED = 10.0
+"""m; more than a robot drives while readings wait in a buffer: a few seconds at 3 m/s at most."""
+_HALF = 0.5

@@ -10,7 +10,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..constraints import Constraints
-from ..io.log_tail import LogTail, Sensor
+from ..io.carmen_live import LogTail, Sensor
 from ..io.stored_result import StoredResult
 from .advice import SensorState, advice, silent_after
 from .feed import Feed

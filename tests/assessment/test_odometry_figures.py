@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.assessment.rhythm import check_equal_stamps, check_silences, rhythm
+from uwblite.assessment.odometry_figures import check_equal_stamps, check_silences, rhythm
 
 
 @pytest.mark.parametrize(
