@@ -42,8 +42,9 @@ class RayCounter:
     def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY) -> None:
         self.geometry = geometry
         self._weak = round(clear_weight * WEIGHT_UNIT)
-        self.hits: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.uint16 if most < _MANY else np.int32)
-        self.misses: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
+        shape = (geometry.rows, geometry.cols)
+        self.hits: Counts = np.zeros(shape, np.uint16) if most < _MANY else np.zeros(shape, np.int32)
+        self.misses: Counts = np.zeros(shape, dtype=np.int32)
         self._scratch = np.zeros(0, dtype=np.uint8)
 
     def insert_rays(self, origins: Floats, endpoints: Floats, scan: Ints | None = None, walls: Bools | None = None) -> None:
