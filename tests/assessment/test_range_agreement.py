@@ -7,11 +7,10 @@ import pytest
 
 from uwblite.assessment.range_agreement import (
     check_sustained_outliers,
-    check_unit,
     check_wheels_against_lidar,
     outlier_stretches,
 )
-from uwblite.findings import Fact, warning
+from uwblite.findings import Fact
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import OdometryBreaks, Screening
 
@@ -34,29 +33,6 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
     stamps = np.arange(400.0)
     agrees = (np.arange(400) % 10 < agreeing) | (stamps < 100) | (stamps >= 200)
     assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
-
-
-@pytest.mark.parametrize(
-    ("have_scans", "kinds", "names", "doubted"),
-    [
-        (False, ["odometry-unit"], ["A", "B"], False),
-        (False, ["odometry-unit", "sustained-outliers"], ["A", "B"], True),
-        (False, ["odometry-unit"], ["A", "B", "C", "bad D"], True),
-        (False, ["odometry-unit"], ["A", "B", "C", "D", "bad E"], False),
-        (False, ["odometry-unit"], ["A", "A@2"], True),
-        (True, ["odometry-unit", "sustained-outliers"], ["A", "A@2"], False),
-        (False, ["sustained-outliers"], ["A", "A@2"], False),
-    ],
-)
-def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_other(have_scans, kinds, names, doubted):
-    stages = Stages(None, None)
-    for kind in kinds:
-        stages.findings.append(warning(kind, "warned of before"))
-    anchors = [SimpleNamespace(id=n.split()[-1], status="distrusted" if "bad" in n else "ok") for n in names]
-    stages.findings.extend(
-        check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
-    )
-    assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 
 def recordings_from(*starts, scans=True):

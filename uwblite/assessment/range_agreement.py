@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
-from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, of_severity, warning
+from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 from ..sensor_log.anchor_names import first_place, name_and_number
@@ -58,22 +58,6 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
                 "path: the others may be too few; map the parts before and after separately, or give the anchors' places"
             )
             yield doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
-
-
-def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
-    """Doubt another unit of the wheels where only ranges support it, and these contradict each other."""
-    said = kinds(of_severity(task.stages.findings, WARNING))
-    if task.recordings.have_scans or "odometry-unit" not in said:
-        return
-    statuses = [anchor.status for anchor in anchors]
-    few = "distrusted" in statuses and sum(status not in ("distrusted", "unplaced") for status in statuses) <= _ENOUGH
-    if few or "sustained-outliers" in said or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
-        text = (
-            "the odometry was rescaled by the ranges alone, and "
-            + ("an anchor is distrusted: too few are left to check it" if few else "an anchor was moved or disagrees for long")
-            + "; give the anchors' places, or the distance between two of them"
-        )
-        yield doubt("odometry-unit", text)
 
 
 def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
