@@ -70,6 +70,7 @@ def prior_sigma(graph: Graph) -> Floats:
 
 def with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
     """Return the graph with other prior standard deviations (c,) of its calibration values."""
+
     def changed(edges: object) -> bool:
         return isinstance(edges, PriorEdges) and edges.block == "calibration"
 
