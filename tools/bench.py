@@ -248,7 +248,7 @@ def bench_map(logs: list[str], repeats: int, options: list[str], trees: list[str
 def one_map(path: str, tree: str, options: list[str]) -> tuple[float, float, float, float]:
     """Return how long was recorded, the wall and the processor time of its map, s, and the peak RSS, MB."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
+        command = [sys.executable, "-P", "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
         began = time.perf_counter()
         quiet = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
         child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": tree}, file_actions=quiet)
