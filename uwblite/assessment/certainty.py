@@ -27,8 +27,13 @@ def check_certainty(estimate: Estimate, sigma: float, task: Task) -> Iterator[Fi
 
 
 def allowed_error(estimate: Estimate) -> float:
-    """Return the expected error of places, m, above which a map is doubted."""
-    return min(_UNCERTAIN, _UNCERTAIN_SHARE * _extent(estimate))
+    """Return the expected error of places, m, above which a map is doubted.
+
+    Ranges hold every place to the same error; without, that of a chain of steps grows with the root of its length.
+    """
+    extent, room = _extent(estimate), _UNCERTAIN / _UNCERTAIN_SHARE
+    larger = np.sqrt(max(extent / room, 1.0)) if estimate.ranges is None else 1.0
+    return min(_UNCERTAIN * larger, _UNCERTAIN_SHARE * extent)
 
 
 def _extent(estimate: Estimate) -> float:
