@@ -42,7 +42,7 @@ def test_scans_between_two_oblique_walls_say_nothing_along_them_and_a_third_wall
         ends = readings[seen, None] * np.stack([np.cos(angles[seen]), np.sin(angles[seen])], axis=1)
         bank = hypotheses.started(pose[None], np.diag(sigma**2)[None], np.full(1, 0.1))
         for _ in range(40):
-            bank = hypotheses.matched(bank, walls, Rays(ends, np.zeros_like(ends), np.ones(len(ends), bool)), 1.0, found=True)
+            bank = hypotheses.matched(bank, walls, Rays(ends, np.zeros_like(ends), np.ones(len(ends), bool)), 1.0)
         along = se2.rotate(turn, np.eye(2))
         return np.sqrt(np.diag(along @ bank.pose_covariances[0, :2, :2] @ along.T))
 

@@ -1,63 +1,59 @@
-"""How far a robot drives between two searches that agree, by what each kind of measurement says."""
+"""When a place is certain: what each kind of measurement says for it, and what agreement of searches does."""
 
 import numpy as np
 import pytest
 
 from uwblite.localization import hypotheses
-from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way, doubt, nowhere
+from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, doubt, map_odds, nowhere
 
-CLEAR = RangeFit(8, 1.0, 4)
-TWO_ANCHORS, ONE_ANCHOR = RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
-
-
-def test_scans_and_ranges_that_are_clear_confirm_each_other():
-    assert confirming_way(-0.1, ENOUGH_ENDS, CLEAR, proven=False) == 0.0
+MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4), RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
+ENDS, RAYS = 3.0 * FEW_ENDS, 30.0
 
 
-def test_what_is_known_by_one_kind_alone_takes_longest_and_people_half_of_it():
-    alone = confirming_way(-0.1, 0.0, CLEAR, proven=False)
-    assert alone == confirming_way(-0.1, ENOUGH_ENDS, ONE_ANCHOR, proven=False)
-    assert confirming_way(-0.4, ENOUGH_ENDS, CLEAR, proven=False) == 0.5 * alone
+def a_bank(rival=-20.0):
+    bank = hypotheses.started(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), np.tile(0.001 * np.eye(3), (2, 1, 1)), np.zeros(0))
+    return hypotheses.reweighted(bank, np.array([0.0, rival]))
 
 
-def test_ranges_of_which_one_in_four_disagrees_confirm_no_scans():
-    # Beside scans of another building three anchors of four, or half of the ranges, agree by chance.
+def test_scans_and_ranges_that_fit_are_certain_at_once():
+    odds = map_odds(-0.1, ENDS, RAYS, -2.0, MANY, 0.0)
+    assert odds.total > CERTAIN
+    assert doubt(a_bank(), 0, True, odds, MANY) == ""
+
+
+@pytest.mark.parametrize(("ends", "fitting"), [(0.0, MANY), (ENDS, ONE_ANCHOR)])
+def test_what_one_kind_alone_says_needs_two_metres_of_the_same_place(ends, fitting):
+    for agreed, certain in ((0.0, False), (1.9, False), (2.1, True)):
+        odds = map_odds(-0.1, ends, RAYS, -0.2, fitting, agreed)
+        assert (doubt(a_bank(), 0, True, odds, fitting) == "") is certain
+
+
+def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agree_for_long():
+    few = RangeFit(12, 0.7, 3)
+    for agreed in (0.0, 1.0):
+        assert "scans" in nowhere(map_odds(-0.6, ENDS, RAYS, -6.0, few, agreed), few)
+        assert "ranges" in nowhere(map_odds(-0.3, ENDS, RAYS, -20.0, few, agreed), few)
+    odds = map_odds(-0.45, ENDS, RAYS, -6.0, few, 3.0)
+    assert nowhere(odds, few) == ""
+    assert doubt(a_bank(), 0, True, odds, few) == ""
+
+
+def test_neither_scans_nor_agreement_outweigh_ranges_that_contradict():
+    # An aisle that looks like the robot's own, which is not in the map.
+    half = RangeFit(16, 0.4, 2)
+    assert "ranges" in nowhere(map_odds(-0.07, ENDS, 75.0, -35.0, half, 6.0), half)
+
+
+def test_ranges_alone_of_which_one_in_four_disagrees_are_of_another_building():
     odd = RangeFit(20, 0.75, 3)
-    assert confirming_way(-0.1, ENOUGH_ENDS, odd, proven=False) == confirming_way(-0.1, ENOUGH_ENDS, ONE_ANCHOR, proven=False)
-    assert nowhere(-0.1, ENOUGH_ENDS, odd) == ""
-    assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(29, 0.52, 3))
+    assert "ranges" in nowhere(map_odds(0.0, 0.0, 0.0, -6.0, odd, 5.0), odd)
 
 
-def test_in_a_map_in_which_the_robot_was_tracked_half_of_the_ranges_beside_scans_may_have_detours():
-    half, fewer = RangeFit(10, 0.5, 4), RangeFit(10, 0.4, 4)
-    assert "ranges" in nowhere(-0.1, 0.0, half, proven=True)
-    for ends in (0.5 * ENOUGH_ENDS, ENOUGH_ENDS):
-        assert nowhere(-0.1, ends, half, proven=True) == ""
-        assert "ranges" in nowhere(-0.1, ends, half)
-        assert "ranges" in nowhere(-0.1, ends, fewer, proven=True)
-    assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(10, 0.5, 1), proven=True)
-
-
-def test_people_beside_a_few_ranges_contradict_no_place_in_a_map_that_is_the_right_one():
-    assert "scans" in nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS)
-    assert nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS, proven=True) == ""
-    assert "scans" in nowhere(-0.4, ENOUGH_ENDS, ONE_ANCHOR, proven=True)
-    assert "scans" in nowhere(-0.6, ENOUGH_ENDS, TWO_ANCHORS, proven=True)
-
-
-@pytest.mark.parametrize("fit", [-0.1, -0.4])
-@pytest.mark.parametrize("ends", [0.0, ENOUGH_ENDS])
-def test_in_a_map_in_which_the_robot_was_tracked_ranges_to_two_anchors_need_no_second_search(fit, ends):
-    assert confirming_way(fit, ends, TWO_ANCHORS, proven=True) < 0.0
-
-
-def test_ranges_to_one_anchor_confirm_nothing_in_any_map():
-    for fit, ends in ((-0.1, 0.0), (-0.1, ENOUGH_ENDS), (-0.4, ENOUGH_ENDS)):
-        assert confirming_way(fit, ends, ONE_ANCHOR, proven=True) == confirming_way(fit, ends, ONE_ANCHOR, proven=False)
+def test_scans_alone_must_fit_better_than_beside_ranges():
+    assert map_odds(-0.3, ENDS, RAYS, 0.0, ONE_ANCHOR, 0.0).scans < 0.0 < map_odds(-0.3, ENDS, RAYS, 0.0, FEW, 0.0).scans
 
 
 def test_a_rival_a_hundred_times_less_likely_is_none_in_a_map_in_which_the_robot_was_tracked():
-    bank = hypotheses.started(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), np.tile(0.01 * np.eye(3), (2, 1, 1)), np.zeros(0))
-    bank = hypotheses.reweighted(bank, np.array([0.0, -5.0]))
-    for fitting, proven, certain in ((CLEAR, True, True), (CLEAR, False, False), (ONE_ANCHOR, True, False)):
-        assert (doubt(bank, 0, True, -0.1, ENOUGH_ENDS, fitting, proven) == "") is certain
+    for fitting, proven, certain in ((MANY, True, True), (MANY, False, False), (ONE_ANCHOR, True, False)):
+        odds = map_odds(-0.1, ENDS, RAYS, -0.5, fitting, 3.0)
+        assert (doubt(a_bank(-5.0), 0, True, odds, fitting, proven) == "") is certain

@@ -11,7 +11,7 @@ from . import hypotheses, likelihood_field, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .sensing import TRACK_RAYS
-from .walls import PER_FACTOR, PER_RAY, Rays
+from .walls import PER_FACTOR, PER_RAY, Rays, Walls
 from .window import Ranges, Window
 
 INDEPENDENT_RAYS = 15.0
@@ -20,8 +20,6 @@ LOOK_BACK = 4.0
 """m driven; places are compared by the scans of this distance."""
 _SEARCH_LOOKS = 2.5
 """m driven; the search makes one cloud of the scans of this distance."""
-_SIGMA_SCAN = (0.2, 0.2, 0.06)
-"""m, m, rad; of a place that the search found by scans."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
 _AT_ONCE, _MATCHED_AT_ONCE = 8, 16
@@ -51,6 +49,10 @@ class Comparison:
     looks: int
     """Number of their scans."""
     ranges: Ranges
+    by_ranges: Floats
+    """(h,) the ranges' part of the log-likelihood."""
+    independent: float
+    """Rays that count as independent."""
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -137,18 +139,20 @@ class PlaceSearch:
             yield hypotheses.MATCHES * PER_FACTOR * len(parts[-1]) * min(len(recent.hit), TRACK_RAYS)
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        weight = range_likelihood.range_likelihood(poses, ranges)
+        by_ranges = range_likelihood.range_likelihood(poses, ranges)
         fit, known = np.zeros((2, len(poses)))
+        independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for start in range(0, len(poses), _AT_ONCE):
                 part = slice(start, start + _AT_ONCE)
                 agreement = self.walls.agreement(poses[part], rays)
                 fit[part], known[part] = agreement.log_likelihood, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
-            weight += INDEPENDENT_RAYS * (1.0 + float(ago.max())) * fit
+        weight = by_ranges + independent * fit
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])
-        return Comparison(places, found.complete, weight[new], fit[new], known[new], rays, looks, ranges)
+        parts_of = (weight[new], fit[new], known[new], rays, looks, ranges, by_ranges[new], independent)
+        return Comparison(places, found.complete, *parts_of)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:
         """Return a comparison in the present frame of the robot, with the present hypotheses as they are now first."""
@@ -160,17 +164,31 @@ class PlaceSearch:
 
     def _started(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return hypotheses at poses (c, 3) that a search found."""
-        scans = self.walls is not None and rays.hit.sum() >= verdict.FEW_ENDS
-        covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
+        few = rays.spread(TRACK_RAYS)
+        walls = self.walls if few.hit.sum() >= verdict.FEW_BESIDE else None
+        if walls is not None:
+            poses = _refined(walls, poses, ranges, few)
+        hessian, _ = range_likelihood.range_factors(poses, ranges)
+        covariances = np.linalg.inv(hessian + range_likelihood.POOR) + np.diag(np.square(_SIGMA_FLOOR))
+        effect = range_likelihood.bias_effect(poses, ranges, len(self._biases))
         fresh = hypotheses.started(poses, covariances, self._biases, self._slow)
-        if not scans:
-            hessian, _ = range_likelihood.range_factors(poses, ranges)
-            covariances = np.linalg.inv(hessian + range_likelihood.POOR) + np.diag(np.square(_SIGMA_FLOOR))
-            effect = range_likelihood.bias_effect(poses, ranges, len(self._biases))
-            fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
-        if self.walls is not None and rays.hit.sum() >= verdict.FEW_BESIDE:
-            fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0, found=False)
-        return fresh
+        fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
+        return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
+
+
+def _refined(walls: Walls, poses: Floats, ranges: Ranges, rays: Rays) -> Floats:
+    """Return poses (c, 3) moved to where scans and ranges together agree best nearby.
+
+    Along a wall scans measure nothing, and the ranges alone say where the robot is: all poses along it become one place.
+    """
+    poses = poses.copy()
+    for gate, width in hypotheses.GATES:
+        information, gradient = range_likelihood.range_factors(poses, ranges)
+        seen, slope = hypotheses.scan_factors(walls, poses, rays, gate, width)
+        total = information + seen + range_likelihood.POOR
+        poses -= np.linalg.solve(total, (gradient + slope)[:, :, None])[:, :, 0]
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    return poses
 
 
 def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:

@@ -48,9 +48,9 @@ _FLIMSY = 0.03
 """m; standard deviation of a point about its wall: half a cell of 0.05 m and the lidar's noise at 3 m."""
 _INDEPENDENT = 20.0
 """Points of a scan whose errors are independent: those of one wall share the cells' rounding."""
-_GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
+GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 """m; gate and kernel width of each iteration of a scan's match."""
-MATCHES = len(_GATES)
+MATCHES = len(GATES)
 """Iterations."""
 
 
@@ -159,21 +159,30 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
-def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: bool) -> Hypotheses:
+def scan_factors(walls: Walls, poses: Floats, rays: Rays, gate: float, width: float) -> tuple[Floats, Floats]:
+    """Return the information (h, 3, 3) and gradient (h, 3) of a scan at poses (h, 3), of what it measures alone.
+
+    Along an aisle H comes from the scatter of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would
+    seem to measure a direction that none has measured.
+    """
+    hessian, spurious, gradient, weight = walls.factors(poses, rays, gate, width)
+    hessian, gradient = measured_part(hessian, spurious, gradient)
+    share = np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
+    return hessian * share[:, None, None], gradient * share[:, None]
+
+
+def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypotheses:
     """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
 
     Parameters
     ----------
     rays : in the present frame of the base. fresh : 0..1, how far the scan's error is independent of the one before: walls
-        are seen with the same cells' rounding until the robot has moved. found : whether the pose is certain.
+        are seen with the same cells' rounding until the robot has moved.
 
     Notes
     -----
     The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
-    information I and the scan's H and gradient, and transferred to the state by its covariance with it. Along an aisle H comes
-    from the scatter of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would seem to measure a
-    direction that none has measured. Until the pose is certain it is kept, since a search has compared the places along the
-    aisle and another one must agree before any is accepted; without it a robot beside a single wall is found late.
+    information I and the scan's H and gradient, and transferred to the state by its covariance with it.
     """
     if not len(bank):
         return bank
@@ -185,12 +194,8 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: 
     start = bank.poses + np.multiply.outer(bank.mean[:, LASER], (0.0, 0.0, 1.0))
     away = np.zeros_like(start)
     hessian = np.zeros_like(prior)
-    for gate, scale in _GATES:
-        hessian, spurious, gradient, weight = walls.factors(start + away, rays, gate, scale)
-        if found:
-            hessian, gradient = measured_part(hessian, spurious, gradient)
-        share = fresh * np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
-        hessian, gradient = hessian * share[:, None, None], gradient * share[:, None]
+    for gate, width in GATES:
+        hessian, gradient = (fresh * part for part in scan_factors(walls, start + away, rays, gate, width))
         gradient += np.einsum("hij,hj->hi", information, away)
         away -= np.linalg.solve(information + hessian, gradient[:, :, None])[:, :, 0]
     posterior = np.linalg.inv(information + hessian)

@@ -2,8 +2,8 @@
 
 The start is unknown. While the robot drives, the whole map is searched with the last metres' ranges and scans
 (search); the resulting poses become hypotheses, each an extended Kalman filter (hypotheses), and are weighted again
-with every search. Only when one explains the measurements, twice in a row, and every other place is a few hundred times
-less likely, the pose counts as found. From then on that filter tracks, at a millisecond a scan; where measurements
+with every search. Only when one is a few hundred times likelier than every other place, and than a place in another
+building, the pose counts as found (verdict). From then on that filter tracks, at a millisecond a scan; where measurements
 contradict the map, the pose counts as lost, and the search begins again with the measurements since then.
 """
 
@@ -60,6 +60,8 @@ class PoseEstimator:
         self._places = PlaceSearch(known)
         self._searched = Window()
         """Measurements of the running search."""
+        self._searched_ranges = 0
+        """Ranges that had come when it began."""
         self._window = Window()
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
@@ -118,7 +120,7 @@ class PoseEstimator:
         least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
         before = self._bank
         fresh = float(np.clip(driven / _FRESH_WAY, least, 1.0))
-        self._bank = hypotheses.matched(before, walls, rays, fresh, found=self._certain)
+        self._bank = hypotheses.matched(before, walls, rays, fresh)
         some = turned.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         self.work += len(before) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
@@ -144,6 +146,10 @@ class PoseEstimator:
         elif not self._certain and self._running.jumped():
             self._lose("the ranges do not fit what was measured before; was the robot carried?")
         odom = self._odometer.pose
+        if not self._certain and len(self._window.ranges) > 2 * self._searched_ranges:
+            # The new ones leave far fewer places to compare: sooner done than what is under way.
+            self._places.drop()
+            self._search_stamp = -np.inf
         if free and not self._places.idle:
             compared, done = self._places.advance(self._bank, odom)
             self.work += done
@@ -157,6 +163,7 @@ class PoseEstimator:
             # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
             # wrong place by chance.
             self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
+            self._searched_ranges = len(self._window.ranges)
             self._places.begin(self._searched, odom, self._way)
 
     def state(self, wheels: Floats) -> LocalizerState:
@@ -233,7 +240,7 @@ class PoseEstimator:
             return
         self._bank = found.hypotheses
         best, proven = int(np.argmax(self._bank.log_weight)), self._compared >= _PROVEN
-        fit, known, ranges = float(found.fit[best]), float(found.known[best]), found.ranges
+        known, ranges = float(found.known[best]), found.ranges
         fitting = verdict.agreeing(self._bank.poses[best], ranges)
         if known < (verdict.FEW_BESIDE if proven and fitting.anchors >= 3 else verdict.FEW_ENDS) and len(ranges):
             self.work += MOMENTS
@@ -242,12 +249,24 @@ class PoseEstimator:
             self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)
             fitting = verdict.agreeing(self._bank.poses[best], ranges)
         pose = self._bank.poses[best].copy()
-        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting, proven) or verdict.other_unit(
+        fit, likelihood, agreed = float(found.fit[best]), float(found.by_ranges[best]), self._agreed(pose)
+        odds = verdict.map_odds(fit, known, found.independent, likelihood, fitting, agreed)
+        self._reason = verdict.doubt(self._bank, best, found.complete, odds, fitting, proven) or verdict.other_unit(
             self.known.walls, pose, found.rays, found.looks, ranges, not proven
         )
-        self._trim(bool(verdict.nowhere(fit, known, fitting, proven)))
+        self._trim(bool(verdict.nowhere(odds, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, verdict.confirming_way(fit, known, fitting, proven))
+        if not self._reason:
+            self._certain = True
+            self._bank = hypotheses.pruned(self._bank, 1, -1.0)
+            self._running.restart(self._sees())
+
+    def _agreed(self, pose: Floats) -> float:
+        """Return over how many metres of driving all searches found the same place, the one of a pose (3,) now."""
+        odom, first = self._odometer.pose, self._confirmed
+        if first is None or hypotheses.apart(pose, se2.compose(first[1], odom)[None])[0]:
+            self._confirmed = first = (self._way, se2.compose(pose, se2.inverse(odom)))
+        return self._way - first[0]
 
     def _trim(self, nowhere: bool) -> None:
         """Choose the part of the window for the next search.
@@ -258,22 +277,3 @@ class PoseEstimator:
         if self._parts > 1 and not self._reason:
             self._window = self._searched
         self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
-
-    def _decide(self, pose: Floats, confirm: float) -> None:
-        """Accept the best hypothesis where two searches, so many metres apart, found it without a doubt.
-
-        0 m: a second search of a standing robot is enough; below 0 the first one is.
-        """
-        if self._reason:
-            self._confirmed = None
-            return
-        self._reason = "found; a little more driving will confirm it"
-        odom, confirmed = self._odometer.pose, self._confirmed
-        if confirmed is None or hypotheses.apart(pose, se2.compose(confirmed[1], odom)[None])[0]:
-            self._confirmed = confirmed = (self._way, se2.compose(pose, se2.inverse(odom)))
-            if confirm >= 0.0:
-                return
-        if self._way - confirmed[0] >= confirm:
-            self._certain = True
-            self._bank = hypotheses.pruned(self._bank, 1, -1.0)
-            self._running.restart(self._sees())

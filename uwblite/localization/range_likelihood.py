@@ -4,9 +4,10 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from .range_update import gross_share
 from .window import Ranges
 
-_INDEPENDENT = 0.5
+INDEPENDENT_RANGES = 0.5
 """Share of the window's ranges that count as independent: they are a quarter of a metre apart, and a part of their errors is
 correlated over 1.5 m."""
 PER_RANGE = 25
@@ -40,7 +41,7 @@ def _misfits(poses: Floats, ranges: Ranges) -> Floats:
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
 
-    Errors of ranges to one anchor are correlated, see _INDEPENDENT.
+    Errors of ranges to one anchor are correlated, see INDEPENDENT_RANGES.
 
     Parameters
     ----------
@@ -49,11 +50,11 @@ def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Float
     if not len(ranges):
         return np.zeros(len(poses))
     # Single precision, and the normal distribution by a tanh (Page, Applied Statistics 1977; off by 2e-4): a third of the time.
-    error, sigma = _misfits(poses, ranges).astype(np.float32), (ranges.sigma + wider).astype(np.float32)
-    z = error / sigma
+    error, sigma = _misfits(poses, ranges).astype(np.float32), ranges.sigma + wider
+    gross, z = gross_share(sigma).astype(np.float32), error / sigma.astype(np.float32)
     square = z * z
     late = 0.15 * np.exp(-2.0 * np.maximum(error, 0.0)) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
-    return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * square) + late + 0.02).sum(axis=1, dtype=np.float64)
+    return INDEPENDENT_RANGES * np.log(0.7 * np.exp(-0.5 * square) + late + gross).sum(axis=1, dtype=np.float64)
 
 
 def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
@@ -112,5 +113,5 @@ def _linear(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
     distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 0.05)
     unit = offset / distance[..., None]
     jacobian = np.concatenate([unit, (unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1])[..., None]], axis=-1)
-    weight = _INDEPENDENT / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+    weight = INDEPENDENT_RANGES / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
     return jacobian, jacobian * weight[..., None], error

@@ -107,6 +107,10 @@ def _judged(error: Floats, sigma: Floats) -> tuple[Floats, Floats]:
     core = (1.0 - _TAIL - _WILD) * np.exp(-0.5 * z**2)
     ratio = sigma / _DETOUR
     late = _TAIL * ratio * np.sqrt(2.0 * np.pi) * np.exp(np.minimum(0.5 * ratio**2 - error / _DETOUR, 50.0)) * ndtr(z - ratio)
-    wild = _WILD * sigma * np.sqrt(2.0 * np.pi) / _WIDTH
-    total = core + late + wild
+    total = core + late + gross_share(sigma)
     return core / total, np.log(total)
+
+
+def gross_share(sigma: Floats) -> Floats:
+    """Return the density (...) of gross errors, that of a normal error of 0 with standard deviations (...), m, being 1."""
+    return np.asarray(_WILD * np.sqrt(2.0 * np.pi) / _WIDTH * sigma)

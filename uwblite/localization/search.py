@@ -29,7 +29,7 @@ _HEADING = 0.05
 _POINTS = 72
 """Points of the scans that are matched."""
 _MOST_NODES = 60_000
-"""Most nodes of a level that are expanded; where more are equally good, the search is not complete."""
+"""Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
 _FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
@@ -106,12 +106,12 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     complete, least = True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
     for level in range(LEVELS, 0, -1):
-        least = max(least, _RIVAL * (yield from _dive(field, level, offsets, nodes, scores)))
+        best, found = yield from _dive(field, level, offsets, nodes, scores)
+        least = max(least, _RIVAL * found.max(initial=0.0))
         kept = np.flatnonzero(scores >= least)
         if len(kept) > _MOST_NODES:
-            complete = False
-            kept = kept[np.argpartition(-scores[kept], _MOST_NODES)[:_MOST_NODES]]
-            yield from _pause(len(scores))
+            complete, nodes, scores = False, best, found
+            break
         nodes = _children(nodes[kept], 2 ** (level - 1))
         yield from _pause(len(nodes))
         scores = yield from _scored(field, level - 1, offsets, nodes)
@@ -179,16 +179,20 @@ _AT_ONCE = 4096
 """Nodes scored at once, a unit of work of 2 ms, so that they fit into the processor's cache."""
 
 
-def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats) -> Generator[int, None, float]:
-    """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
-    best = nodes[_highest(scores)]
+def _dive(
+    field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats
+) -> Generator[int, None, tuple[NDArray[np.int32], Floats]]:
+    """Return good poses as nodes (n, 3), found by following the best ones down, and their scores (n,): the highest is a lower
+    bound of the best pose's.
+    """
+    best, found = nodes[_highest(scores)], np.zeros(0)
     yield from _pause(len(scores))
-    found = np.zeros(0)
     for below in range(level - 1, -1, -1):
         best = _children(best, 2**below)
         found = yield from _scored(field, below, offsets, best)
-        best = best[_highest(found)]
-    return float(found.max(initial=0.0))
+        order = _highest(found)
+        best, found = best[order], found[order]
+    return best, found
 
 
 def _pause(count: int) -> Generator[int, None, None]:
