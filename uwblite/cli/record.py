@@ -3,6 +3,7 @@
 import argparse
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,8 @@ def run(args: argparse.Namespace) -> int:
     lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
     mounting = Mounting(lasers[0], tuple(mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
     watching = _Watching(args) if args.watch else None
-    recorder = Recorder(
-        links, log, monotonic=time.monotonic, wall_offset=offset, host=host_name(), mounting=mounting,
-        on_note=show_note, wall=time.time,
-    )  # fmt: skip
+    timed = partial(Recorder, monotonic=time.monotonic, wall_offset=offset, wall=time.time)
+    recorder = timed(links, log, host=host_name(), mounting=mounting, on_note=show_note)
     with stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stopped:
         try:
             recorder.begin(_head(args, remark))
