@@ -5,6 +5,7 @@
     python tools/bench.py graphs --repeats 21               pose graphs, against GTSAM (pip install gtsam)
     python tools/bench.py icp                               registration, against small_gicp and Open3D
     python tools/bench.py map --log hall=recordings/hall/run.log  whole runs of `uwblite map`; --log may be repeated
+    python tools/bench.py map --log hall=run.log --tree ../before --tree .    the same by two versions, alternately
     python tools/bench.py start                             import and --help above bare python
     python tools/bench.py hundred                           75,000 poses, incrementally from their odometry: minutes
 
@@ -229,29 +230,34 @@ def bench_start(repeats: int) -> None:
         show(name, spent, spent - done[0][0])
 
 
-def bench_map(logs: list[str], repeats: int, options: list[str]) -> None:
-    """Run `uwblite map` on recordings: wall time, real-time factor, peak memory."""
-    columns = ("recording", "MB", "recorded, s", "wall, s", "processor, s", "real-time factor", "peak RSS, MB")
+def bench_map(logs: list[str], repeats: int, options: list[str], trees: list[str]) -> None:
+    """Run `uwblite map` on recordings, alternately by each tree of the sources: time and peak memory."""
+    columns = ("recording", "sources", "recorded, s", "wall, s", "processor, s", "real-time factor", "peak RSS, MB")
     head("Whole runs of `uwblite map`", *columns)
     for entry in logs:
         name, _, path = entry.rpartition("=")
-        walls, busy, peak, recorded = [], [], 0.0, float("nan")
-        for _ in range(repeats):
-            with tempfile.TemporaryDirectory() as folder:
-                command = [sys.executable, "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
-                began = time.perf_counter()
-                quiet = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-                child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": str(ROOT)}, file_actions=quiet)
-                _, status, used = os.wait4(child, 0)
-                walls.append(time.perf_counter() - began)
-                busy.append(used.ru_utime + used.ru_stime)
-                if os.waitstatus_to_exitcode(status) not in (0, 3):
-                    raise SystemExit(f"uwblite map failed on {path}")
-                peak = max(peak, used.ru_maxrss / 1024.0)
-                stamps = [float(line.split()[0]) for line in (Path(folder) / "map" / "trajectory.tum").open() if line[0] != "#"]
-                recorded = stamps[-1] - stamps[0]
-        wall, processor = sorted(walls)[len(walls) // 2], sorted(busy)[len(busy) // 2]
-        show(name or Path(path).name, os.path.getsize(path) / 1e6, recorded, wall, processor, recorded / processor, peak)
+        runs = {tree: [one_map(path, tree, options)] for tree in trees}
+        for _ in range(repeats - 1):
+            for tree, done in runs.items():
+                done.append(one_map(path, tree, options))
+        for tree, done in runs.items():
+            recorded, wall, processor, peak = (sorted(column)[len(done) // 2] for column in zip(*done, strict=True))
+            show(name or Path(path).name, Path(tree).name, recorded, wall, processor, recorded / processor, peak)
+
+
+def one_map(path: str, tree: str, options: list[str]) -> tuple[float, float, float, float]:
+    """Return how long was recorded, the wall and the processor time of its map, s, and the peak RSS, MB."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
+        began = time.perf_counter()
+        quiet = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+        child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": tree}, file_actions=quiet)
+        _, status, used = os.wait4(child, 0)
+        wall = time.perf_counter() - began
+        if os.waitstatus_to_exitcode(status) not in (0, 3):
+            raise SystemExit(f"uwblite map failed on {path}")
+        stamps = [float(line.split()[0]) for line in (Path(folder) / "map" / "trajectory.tum").open() if line[0] != "#"]
+    return stamps[-1] - stamps[0], wall, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
 
 
 def main() -> int:
@@ -260,6 +266,7 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS), default=[])
     parser.add_argument("--repeats", type=int, default=9, help="timed calls of each function (9)")
     parser.add_argument("--log", action="append", default=[], metavar="NAME=FILE", help="recording for the part map")
+    parser.add_argument("--tree", action="append", default=[], help="sources to map with, alternately; may be repeated (these)")
     parser.add_argument("--map-option", action="append", default=[], help="passed on to uwblite map")
     parser.add_argument("--cores", type=int, default=1, help="cores the process may use (1)")
     args = parser.parse_args()
@@ -277,7 +284,7 @@ def main() -> int:
         "icp": lambda: bench_icp(args.repeats),
         "start": lambda: bench_start(args.repeats),
         "hundred": bench_hundred,
-        "map": lambda: bench_map(args.log, max(1, args.repeats // 3), args.map_option),
+        "map": lambda: bench_map(args.log, max(1, args.repeats // 3), args.map_option, args.tree or [str(ROOT)]),
     }
     for part in parts:
         runs[part]()

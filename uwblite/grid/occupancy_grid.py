@@ -109,9 +109,9 @@ class OccupancyGrid:
         return self.geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
 
 
-def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
-    """Return the map that counted hits and misses make: additive log-odds, clamped."""
-    log_odds = np.zeros(counter.hits.shape, dtype=np.float32)
+def from_counts(counter: RayCounter, config: GridConfig, *, spent: bool = False) -> OccupancyGrid:
+    """Return the map that counted hits and misses make: additive log-odds, clamped; spent: in the memory of the misses."""
+    log_odds = counter.misses.view(np.float32) if spent else np.zeros(counter.hits.shape, dtype=np.float32)
     for rows in counter.geometry.strips():
         log_odds[rows] = _log_odds(counter, rows, config)
     return OccupancyGrid(counter.geometry, log_odds)
@@ -121,7 +121,7 @@ def _log_odds(counter: RayCounter, rows: slice, config: GridConfig) -> NDArray[n
     """Return the log-odds of some rows: the products in double precision would otherwise be the largest arrays."""
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
-    return np.clip(counter.hits[rows] * per_hit + counter.misses[rows] * per_miss, -config.clamp, config.clamp)
+    return np.clip(counter.hits[rows].astype(np.int32) * per_hit + counter.misses[rows] * per_miss, -config.clamp, config.clamp)
 
 
 def walls_of(counter: RayCounter, config: GridConfig) -> Bools:

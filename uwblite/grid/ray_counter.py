@@ -10,7 +10,7 @@ from ..errors import DataError
 from .bresenham import mark_rays
 from .geometry import GridGeometry
 
-Counts = NDArray[np.int32]
+Counts = NDArray[np.int32] | NDArray[np.uint16]
 _Marks = NDArray[np.uint8] | NDArray[np.uint16]
 
 WEIGHT_UNIT = 16
@@ -26,6 +26,9 @@ _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
 
 
+_MANY = 1 << 16
+
+
 class RayCounter:
     """Counts hits and misses of rays in the cells of one grid; the counts of two counters of one grid add up.
 
@@ -33,13 +36,15 @@ class RayCounter:
     ----------
     geometry : the grid; rays may leave it.
     clear_weight : weight of a ray without a hit against one with a hit, 0..1, rounded to 1 / WEIGHT_UNIT.
+    most : scans at most; of fewer than 65,536, hits are of 16 bits.
     """
 
-    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5) -> None:
+    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY) -> None:
         self.geometry = geometry
         self._weak = round(clear_weight * WEIGHT_UNIT)
-        self.hits: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
-        self.misses: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
+        shape = (geometry.rows, geometry.cols)
+        self.hits: Counts = np.zeros(shape, np.uint16) if most < _MANY else np.zeros(shape, np.int32)
+        self.misses: Counts = np.zeros(shape, dtype=np.int32)
         self._scratch = np.zeros(0, dtype=np.uint8)
 
     def insert_rays(self, origins: Floats, endpoints: Floats, scan: Ints | None = None, walls: Bools | None = None) -> None:
@@ -154,5 +159,5 @@ class RayCounter:
 
     def add(self, hits: Counts, misses: Counts) -> None:
         """Add the counts of other scans in the same grid."""
-        self.hits += hits
+        np.add(self.hits, hits, out=self.hits, casting="unsafe")
         self.misses += misses

@@ -83,10 +83,10 @@ def from_sweeps(
     grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
         announce(grid)
-    counter = RayCounter(grid, config.clear_weight)
+    counter = RayCounter(grid, config.clear_weight, most=count)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
-    def trace(walls: Bools | None, before: int) -> None:
+    def trace(counter: RayCounter, walls: Bools | None, before: int) -> None:
         for task in tasks:
             _trace(task, counter, walls, executor, reporter(before))
             before += len(task.chosen)
@@ -94,10 +94,11 @@ def from_sweeps(
     def reporter(before: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(before + done, count * (2 if clears else 1))
 
-    trace(None, 0)
+    trace(counter, None, 0)
     if clears:
-        trace(walls_of(counter, config), count)
-    drawn = from_counts(counter if geometry else counter.cropped(), config)
+        trace(counter, walls_of(counter, config), count)
+    drawn = from_counts(counter if geometry else counter.cropped(), config, spent=True)
+    del counter
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)
 

@@ -7,6 +7,7 @@ score it shares (after Olson, Real-time correlative scan matching, ICRA 2009).
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from .. import se2
@@ -51,9 +52,11 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
     """
     if not len(rows) or not raster.shape[0].prod():
         return np.zeros((0, 3))
-    field, (wide, high) = surface_field(clouds, raster, window.spread), raster.shape[0].tolist()
+    field = surface_field(clouds, raster, window.spread).reshape(raster.shape[0])
     turns, half = int(np.ceil(window.angle / window.angle_step)), int(np.ceil(window.distance / raster.cell))
-    shift = np.arange(-half, half + 1)
+    shift, many = np.arange(-half, half + 1), 2 * half + 1
+    # What all shifts of a point meet is a window of the field: there is nothing around it.
+    windows = sliding_window_view(np.pad(field, many), (many, many))
     headings = guess[2] + np.arange(-turns, turns + 1) * window.angle_step
     points = clouds.points[rows].astype(np.float64)
     normals = (clouds.normals[rows, 0] - 1j * clouds.normals[rows, 1]).astype(np.complex64)
@@ -62,9 +65,8 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
     for n, heading in enumerate(headings):
         laid = se2.transform(np.array([guess[0], guess[1], heading]), points)
         cell = np.floor((laid - raster.origin[0]) / raster.cell).astype(np.intp)
-        # The rim of the raster names no point: what lies outside is put there.
-        x, y = np.clip(cell[:, 0, None] + shift, 0, wide - 1), np.clip(cell[:, 1, None] + shift, 0, high - 1)
-        seen = field.take((x * high)[:, :, None] + y[:, None, :]).reshape(len(rows), -1)
+        x, y = np.clip(cell + (many - half), 0, np.subtract(windows.shape[:2], 1)).T
+        seen = windows[x, y].reshape(len(rows), -1)
         scores[n] = ((normals * np.complex64(np.exp(-1j * heading))) @ seen).real.reshape(scores.shape[1:])
     best = _maxima(scores, count)
     return np.column_stack([guess[:2] + shift[best[:, 1:]] * raster.cell, headings[best[:, 0]]])

@@ -5,7 +5,7 @@
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -107,7 +107,7 @@ def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference:
     parts = []
     for rows in _together(first, last):
         parts.append(_built(clouds, poses, first[rows], last[rows], reference[rows], config))
-    return Submaps(first, last, reference, joined(parts), config.voxel)
+    return Submaps(first, last, reference, replace(joined(parts), work=clouds.work), config.voxel)
 
 
 def _together(first: Ints, last: Ints) -> Iterator[slice]:

@@ -24,6 +24,8 @@ gate of the final matching. Each begins in the middle of the one before."""
 _WIDER = 2.0
 """Factor on the standard deviations of a chain of steps: a bias that following steps share, a robot that tilts, floors that
 give way, adds up along the way, and the covariance contains none (twice the stated heading in a hospital)."""
+_NEVER = 1e-4
+"""Probability of an overlap up to which pairs are not tried; the covariance may be too small, but not by so much."""
 _AT_ONCE, _PART = 40, 8
 """Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
 
@@ -68,7 +70,9 @@ def uncertain_pairs(
     wide = _wide(config)
     found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, beyond)
     found = replace(found, long=True)
-    return found.rows(np.argsort(-overlap_probability(found.guess, found.covariance, wide.reach), kind="stable"))
+    chance = overlap_probability(found.guess, found.covariance, wide.reach)
+    order = np.argsort(-chance, kind="stable")
+    return found.rows(order[chance[order] > _NEVER])
 
 
 def first_of(candidates: Candidates, pieces: Submaps) -> Candidates:

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from ..arrays import Floats
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
@@ -21,9 +23,10 @@ def bootstrap_graph(
     """Estimate poses and anchor positions without any guess of the anchors.
 
     Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A
-    hypothesis that begins like an earlier attempt would continue like it, and is dropped. In the order of their misfit, each is
-    continued as long as the ranges agree; the first that reaches the end is taken. Where none does, the best of them is
-    continued if it began clearly better than the uncorrected heading, and is taken if it also ends better.
+    hypothesis that begins like an earlier attempt would continue like it, and is dropped. Where the first began well, one that
+    begins as well is continued at once, as long as the ranges agree, then the others in the order of their misfit; the first
+    that reaches the end is taken. Where none does, the best of them is continued if it began clearly better than the
+    uncorrected heading, and is taken if it also ends better.
 
     Parameters
     ----------
@@ -39,20 +42,26 @@ def bootstrap_graph(
     )
     first.run(config.enough)
     begun = first.misfit()
-    first.run()
+    # Where it has a jump, it is completed only if nothing else agrees.
+    first.run(torn=not others)
     if first.misfit() < config.agreement or not others:
         return first.estimate()
-    tried = [first]
+    tried, misfits = [first], [np.inf]
     for attempt in others:
         attempt.run(0.0)
-        if not any(attempt.began_like(other) for other in tried):
-            attempt.run(config.enough, torn=False)
-            tried.append(attempt)
-    others = sorted(tried[1:], key=Attempt.misfit)
-    hopeful = others[0] if others and others[0].misfit() < 0.8 * begun else first
-    for attempt in others:
-        if attempt.agrees_to_the_end():
+        if any(attempt.began_like(other) for other in tried):
+            continue
+        attempt.run(config.enough, torn=False)
+        tried.append(attempt)
+        misfits.append(attempt.misfit())
+        if misfits[-1] <= begun < config.agreement and attempt.agrees_to_the_end():
             return attempt.estimate()
+    order = np.argsort(misfits, kind="stable")[: len(tried) - 1].tolist()
+    for number in order:
+        if tried[number].agrees_to_the_end():
+            return tried[number].estimate()
+    hopeful = tried[order[0]] if order and misfits[order[0]] < 0.8 * begun else first
+    first.run()
     hopeful.run()
     return (hopeful if hopeful.misfit() < 0.8 * first.misfit() else first).estimate()
 
