@@ -72,5 +72,5 @@ def test_the_tests_that_continuous_integration_names_exist():
     names = set(re.findall(r"\b(test_[a-z0-9_]+\.py|[a-z]+/test_[a-z0-9_]+\.py)", text))
     for start, stems in re.findall(r"((?:[a-z]+/)*test_)\{([a-z0-9_,]+)\}\.py", text):
         names |= {f"{start.removeprefix('tests/')}{stem}.py" for stem in stems.split(",")}
-    assert len(names) > 15
+    assert len(names) >= 15
     assert [name for name in sorted(names) if not (ROOT / "tests" / name).is_file()] == []
