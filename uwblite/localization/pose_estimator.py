@@ -26,6 +26,8 @@ _FRESH_WAY = 0.1
 """m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
+_UNFELT = 0.1
+"""m and rad; motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _UNIT_WAY = 1.0
@@ -124,6 +126,15 @@ class PoseEstimator:
         some = turned.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         self.work += len(before) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
+        if self._certain and driven <= 1e-3:
+            # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
+            slack = hypotheses.moved(self._bank, np.zeros(3), _UNFELT, self.known.anchors.slow_sigma)
+            pushed = hypotheses.matched(slack, walls, rays, 1.0)
+            there = walls.agreement(pushed.poses, some)
+            self.work += hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit)
+            if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
+                self.wander(_UNFELT)
+                self._bank, found = pushed, there
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
