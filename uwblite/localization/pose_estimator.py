@@ -73,7 +73,7 @@ class PoseEstimator:
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
-        """Odometer and T_map_odom of the first of the searches that agree."""
+        """Odometer and T_map_odom at the first of the searches that agree."""
         self._compared = 0
         """Comparisons of the unit that the map has passed, one after the other."""
         self._running = full_agreement(len(known.anchors.ids))
@@ -260,11 +260,16 @@ class PoseEstimator:
             self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)
             fitting = verdict.agreeing(self._bank.poses[best], ranges)
         pose = self._bank.poses[best].copy()
-        fit, likelihood, agreed = float(found.fit[best]), float(found.by_ranges[best]), self._agreed(pose)
+        certain = verdict.needed(fitting, proven)
+        undecided = verdict.undecided(self._bank, best, found.complete, certain)
+        agreed = self._agreed(None if undecided else pose)
+        fit, likelihood = float(found.fit[best]), float(found.by_ranges[best])
         odds = verdict.map_odds(fit, known, found.independent, likelihood, fitting, agreed)
-        self._reason = verdict.doubt(self._bank, best, found.complete, odds, fitting, proven) or verdict.other_unit(
+        self._reason = undecided or verdict.nowhere(odds, fitting) or verdict.other_unit(
             self.known.walls, pose, found.rays, found.looks, ranges, not proven
-        )
+        )  # fmt: skip
+        if not self._reason and odds.total < certain:
+            self._reason = "found; a little more driving will confirm it"
         self._trim(bool(verdict.nowhere(odds, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
@@ -272,9 +277,12 @@ class PoseEstimator:
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
             self._running.restart(self._sees())
 
-    def _agreed(self, pose: Floats) -> float:
-        """Return over how many metres of driving all searches found the same place, the one of a pose (3,) now."""
+    def _agreed(self, pose: Floats | None) -> float:
+        """Return over how many metres driven searches found the same place alone, that of a pose (3,) now; None = none."""
         odom, first = self._odometer.pose, self._confirmed
+        if pose is None:
+            self._confirmed = None
+            return 0.0
         if first is None or hypotheses.apart(pose, se2.compose(first[1], odom)[None])[0]:
             self._confirmed = first = (self._way, se2.compose(pose, se2.inverse(odom)))
         return self._way - first[0]

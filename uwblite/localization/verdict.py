@@ -40,27 +40,28 @@ _UNIT_CLEAR = 0.01
 """The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
 
 
-def doubt(bank: Hypotheses, best: int, complete: bool, odds: "MapOdds", fitting: "RangeFit", proven: bool = False) -> str:
-    """Return why the best hypothesis is not certain yet; "" = it is.
+def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> str:
+    """Return why another place than the best one, or none in particular, may be right; "" = none may.
 
     Parameters
     ----------
-    complete : the search left no place out. odds : of the best hypothesis. fitting : how the ranges agree there.
-    proven : the map is the right one.
+    complete : the search left no place out. certain : log-likelihood by which it must be better than any other.
     """
-    certain = _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
-    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     if not complete:
         return "too many places are as likely; drive on"
-    if why := nowhere(odds, fitting):
-        return why
-    if len(rivals) and rivals.max() > -certain:
+    if rivals.max(initial=-np.inf) > -certain:
         count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
         return "place or heading is not sure yet; drive on"
-    return "found; a little more driving will confirm it" if odds.total < certain else ""
+    return ""
+
+
+def needed(fitting: "RangeFit", proven: bool) -> float:
+    """Return the log-likelihood of certainty; proven : the map is the right one, as a pose was tracked in it."""
+    return _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ class MapOdds:
     scans: float
     ranges: float
     agreed: float
-    """m driven over which all searches found it."""
+    """m driven over which all searches found it and no other place."""
     alone: bool
     """There are scans or ranges alone."""
 
@@ -86,7 +87,7 @@ def map_odds(fit: float, ends: float, rays: float, likelihood: float, fitting: "
     Parameters
     ----------
     fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
-    likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven with all searches the same.
+    likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven over which searches agree.
     """
     ranges = likelihood - INDEPENDENT_RANGES * fitting.count * ELSEWHERE[1]
     sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
