@@ -32,6 +32,13 @@ def pytest_addoption(parser):
     parser.addoption("--once", action="store_true", help=text)
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Files without slow tests need not be imported where nothing else is asked for."""
+    if config.getoption("-m") == "slow" and collection_path.suffix == ".py":
+        return "mark.slow" not in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
 def pytest_collection_modifyitems(config, items):
     chosen = [item for item in items if config.getoption("--slow") or "slow" not in item.keywords]
     if config.getoption("--once"):

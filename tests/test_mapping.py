@@ -404,9 +404,9 @@ def test_wheels_in_another_unit_are_reported_by_the_radio(shared_data):
 
 @pytest.mark.slow
 def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
-    """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three recordings."""
+    """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over two recordings."""
     fused, alone = [], []
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=5.0, speed=0.4)
         alone.append(ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth))
         fused.append(ate(build_map(log), truth))

@@ -20,7 +20,7 @@ USUAL = {
         "look-ups": 1_359_270, "rays": 749_078,
     },
     "no lidar": {
-        "factorisations": 172, "factor entries": 1_177_816, "products": 4_574_055,
+        "factorisations": 53, "factor entries": 585_376, "products": 2_364_275,
     },
     "no ranges": {
         "points": 177_265, "products": 1_127_053, "look-ups": 1_578_450, "factorisations": 41,

@@ -142,6 +142,15 @@ def test_of_several_recordings_the_program_counts_once(log):
     assert one["seconds"] < two["seconds"] < 2 * one["seconds"]
 
 
+def test_a_map_that_takes_long_says_so_beforehand(short_log, monkeypatch, capsys):
+    assert cost.long_wait(599.0) is None
+    monkeypatch.setattr(cost, "_LONG", 0.1)
+    assert main(["map", str(short_log), "--dry-run"]) == 0
+    said = capsys.readouterr().err
+    assert "minutes of a desktop computer" in said
+    assert "keyframes.distance" in said
+
+
 LIMITED = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]) * 1_000_000,) * 2)

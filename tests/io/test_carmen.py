@@ -264,18 +264,22 @@ def flaser(ranges, stamp):
 
 
 def test_scans_of_another_number_of_beams_are_resampled(tmp_path):
-    """180 and 181 beams of one SICK: beam k points the same way, and the last one is unknown or left out."""
-    reach = 2.0 + 0.01 * np.arange(181)
-    most, few = [flaser(reach[:180], k) for k in (0, 2, 4)], [flaser(reach, k) for k in (1, 3)]
+    """A SICK that interlaces sends 181 and 180 beams: these lie between those, as a wall shows."""
+
+    def wall(beams, first):
+        return 3.0 / np.cos(np.radians(first + np.arange(beams)) / 3.0)
+
+    most, few = [flaser(wall(180, -89.5), k) for k in (0, 2, 4)], [flaser(wall(181, -90.0), k) for k in (1, 3)]
     log = read(tmp_path, odometry() + most[0] + few[0] + most[1] + few[1] + most[2])
     assert log.scans.stamps.tolist() == [0, 1, 2, 3, 4]
-    np.testing.assert_allclose(log.scans.ranges, np.tile(reach[:180], (5, 1)), atol=1e-6)
+    assert np.degrees(log.scans.angles[[0, -1]]) == pytest.approx([-89.5, 89.5])
+    np.testing.assert_allclose(log.scans.ranges, np.tile(wall(180, -89.5), (5, 1)), atol=2e-3)
     assert any("2 of 5 scans have other beams than most; they were resampled to 180" in w for w in log.notes.warnings)
     assert not log.notes.set_back
     assert not any("out of time order" in w for w in log.notes.warnings)
     log = read(tmp_path, odometry() + few[0] + most[0] + few[1])
     assert log.scans.ranges.shape == (3, 181)
-    assert np.isnan(log.scans.ranges[:, 180]).tolist() == [True, False, False]
+    np.testing.assert_allclose(log.scans.ranges[1, 1:-1], wall(181, -90.0)[1:-1], atol=2e-3)
 
 
 def test_an_increment_of_one_beam_too_few_is_reported(tmp_path):

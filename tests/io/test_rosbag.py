@@ -1,6 +1,5 @@
 """Bags: round trips through both storages, a real one against its published log, messages of all kinds, broken files."""
 
-import contextlib
 import dataclasses
 import sqlite3
 from dataclasses import replace
@@ -189,22 +188,6 @@ def test_a_missing_bag_and_an_empty_folder(tmp_path):
         read_bag(tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_damaged_bytes_never_do_worse_than_an_error(tmp_path, storage):
-    write_bag(tmp_path / "bag", recording(), storage=storage)
-    file = next(p for p in (tmp_path / "bag").iterdir() if p.suffix != ".yaml")
-    whole = file.read_bytes()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        damaged = bytearray(whole)
-        for place in rng.integers(0, len(whole), 12):
-            damaged[place] = rng.integers(256)
-        file.write_bytes(bytes(damaged[: rng.integers(1, len(whole))] if rng.uniform() < 0.3 else damaged))
-        with contextlib.suppress(UwbliteError):
-            read_bag(tmp_path / "bag")
-
-
 def test_mappings_are_read_strictly():
     text = '[[uwb]]\ntopic = "/beacon_raw"\nreadings = "sensed_data"\nunit = 0.001\nonly = { tagId = 3 }\n'
     (mapping,) = parse_mappings(text)
@@ -237,7 +220,8 @@ def test_the_real_bag_gives_the_map_of_its_log(shared_data):
     from uwblite.mapping import build_map
 
     folder = shared_data / "kasdorf_2017-11-17-12-31-28"
-    bag, log = build_map(read_bag(folder / "record.bag")), build_map(read_log(folder / "run.log.gz"))
+    both = read_bag(folder / "record.bag"), read_log(folder / "run.log.gz")
+    bag, log = (build_map(one.crop(end=float(one.odometry.stamps[0]) + 120.0)) for one in both)
     poses = se2.interpolate_trajectory(bag.stamps - bag.stamps[0], bag.trajectory, log.stamps)
     # The log leaves out the time within a sweep: at 0.2 m/s a sweep of 50 ms is a centimetre.
     assert np.sqrt(np.mean(np.sum((poses - log.trajectory)[:, :2] ** 2, axis=1))) < 0.02

@@ -1,5 +1,7 @@
 """Loops whose ends are known to many metres: closed where long stretches fit at one place only, left open elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.laser_walks import returned
@@ -40,7 +42,7 @@ def looked_for(walls):
     covariance = JointCovariance(graph, pieces.reference)
     few = propose(graph, covariance, pieces, recording, set(), set(), False, CONFIG)
     assert np.all(few.spread <= CONFIG.search_limit)
-    return truth, pieces, uncertain_pairs(graph, covariance, pieces, recording, set(), False, CONFIG)
+    return truth, pieces, uncertain_pairs(graph, covariance, pieces, recording, set(), False, CONFIG, CONFIG.direct)
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +60,18 @@ def test_each_stretch_overlaps_the_next_of_its_recording_by_half():
     assert not np.any((pieces.first < 75) & (pieces.last > 75))
 
 
-def test_only_pairs_beyond_a_search_of_sub_maps_are_listed_the_likeliest_first(unlike):
+def test_pairs_that_need_a_search_are_listed_the_likeliest_first(unlike):
+    """Without ranges, the window is twice as wide as the covariance says: biases of steps are not in it."""
     _, pieces, pairs = unlike
     assert len(pairs.target)
-    assert np.all(pairs.spread > CONFIG.search_limit)
+    assert pairs.long
+    assert np.all(pairs.spread > CONFIG.direct)
     assert np.all(np.diff(overlap_probability(pairs.guess, pairs.covariance, 15.0)) <= 0.0)
-    assert len(first_of(pairs, pieces).target) == min(40, len(pairs.target))
+    for constrained, wider in ((False, 2.0), (True, 1.0)):
+        first = first_of(replace(pairs, constrained=constrained), pieces)
+        assert len(first.target) == min(40, len(pairs.target))
+        np.testing.assert_allclose(first.spread, wider * pairs.spread[: len(first.target)])
+        np.testing.assert_allclose(first.covariance, wider**2 * pairs.covariance[: len(first.target)])
 
 
 @pytest.mark.parametrize(("far", "expected"), [(1.0, False), (4.0, True)])

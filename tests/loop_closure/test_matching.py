@@ -1,5 +1,6 @@
 """What of a match is handed on: free space is asked only for promising matches, with the points of both sub-maps."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,18 +38,18 @@ def test_free_space_is_asked_with_the_points_of_both_sub_maps(monkeypatch):
 
 
 def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypatch):
-    """Where the uncertainty is wider than a search of sub-maps; others by the share of all points."""
+    """Sub-maps by the share of all points."""
     truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
     clouds, config = scanned(truth, HALL), LoopClosureConfig()
     ends, guess = np.array([0, 0]), np.tile(se2.between(truth[0], truth[1]), (2, 1))
-    spread = config.search_limit * np.array([1.01, 0.99])
-    candidates = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), spread, False)
+    stretches = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), np.ones(2), False, long=True)
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
     monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[3]), 13.7))
-    found, _ = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
-    assert found.net.tolist() == [13.7, np.inf]
-    np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
-    assert found.found.all()
+    for candidates, net in ((stretches, 13.7), (replace(stretches, long=False), np.inf)):
+        found, _ = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
+        assert found.net.tolist() == [net, net]
+        np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
+        assert found.found.all()
 
 
 def test_of_a_wide_search_the_net_overlap_is_enough():
@@ -71,19 +72,20 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
     monkeypatch.setattr(matching, "search", search)
     monkeypatch.setattr(matching, "_prepare", lambda clouds, k, prepared: k)
     monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
-    spread = np.array([config.direct, 1.0, 2.0, config.search_limit + 1.0])
-    sigma = np.array([1.0, 0.01, 0.1, 9.0])
+    spread, sigma = np.array([config.direct, 1.0, 2.0, 9.0]), np.array([1.0, 0.01, 0.1, 9.0])
     candidates = SimpleNamespace(
         spread=spread, covariance=np.eye(3) * sigma[:, None, None] ** 2, guess=np.arange(12.0).reshape(4, 3),
         target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
     )  # fmt: skip
-    rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
-    far = config.search_limit + 1.0
-    assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), (3, 7, far, far, config.search_angle)]
     fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
-    assert steps == [fine, fine, coarse]
-    assert rows.tolist() == [0] + [1] * config.places + [2] * config.places + [3] * matching._MANY_PLACES
-    np.testing.assert_array_equal(guesses, candidates.guess[rows])
+    for candidates.long, places, step in ((False, config.places, fine), (True, matching._MANY_PLACES, coarse)):
+        asked.clear(), steps.clear()
+        rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
+        wide = (3, 7, 9.0, 9.0, config.search_angle)
+        assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), wide]
+        assert steps == [step] * 3
+        assert rows.tolist() == [0] + [1] * places + [2] * places + [3] * places
+        np.testing.assert_array_equal(guesses, candidates.guess[rows])
 
 
 @pytest.mark.parametrize("guess", [(0.0, 0.0, 0.2), (35.0, -80.0, 1.0), (-4.0, 15.0, 0.0)])

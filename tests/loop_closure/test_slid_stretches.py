@@ -104,6 +104,26 @@ def test_many_closures_of_a_place_that_looks_alike_are_overruled_by_the_odometry
     assert len(left.edges) == len(true_records)
 
 
+def test_closures_at_the_end_of_a_long_drift_have_weight_from_the_start():
+    """A way of 400 m out and back whose turns are biased by a tenth of a sigma: closures are off by hundreds of sigmas."""
+    out = np.column_stack([np.arange(500) * 0.8, np.zeros(500), np.zeros(500)])
+    truth = np.concatenate([out, np.add(out[::-1], [0.0, 0.2, np.pi])])
+    wheels = chained(truth, np.array([0.02, 0.02, 0.003]))
+    object.__setattr__(wheels, "kernel", OdometryNoiseConfig().kernel)
+    wheels.motion[:, 2] += 0.0003
+    poses = [truth[0]]
+    for step in wheels.motion:
+        poses.append(se2.compose(poses[-1], step))
+    true, records = closures([(k, 999 - k) for k in (0, 4, 8, 30)], truth, np.zeros(3))
+    false, false_records = closures([(60, 930)], truth, np.array([0.0, 5.0, 0.3]))
+    columns = ("i", "j", "T_i_j", "sqrt_information")
+    edges = RelativePoseEdges(*(np.concatenate([getattr(true, n), getattr(false, n)]) for n in columns))
+    graph = Graph(np.array(poses), edges=(wheels,))
+    assert np.linalg.norm(true.residuals(graph), axis=1).min() > 300.0
+    _, left = reconcile(graph, Closures(edges, records + false_records), LoopClosureConfig(), SolverConfig())
+    assert [c.outcome for c in left.candidates] == ["accepted"] * 4 + ["contradicts-closures"]
+
+
 @pytest.mark.parametrize(("left", "slides"), [(0.28, True), (0.32, False)])
 def test_the_jump_back_leaves_less_than_a_third(left, slides):
     """Part of the first jump that is left behind the second; the size stated is the first jump's."""

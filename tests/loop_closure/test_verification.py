@@ -110,7 +110,7 @@ def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
 
 
 GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "net": np.inf, "spread": 7.0, "off": 0.0,
-        "constrained": True, "along": 1e4, "strength": 1e4}  # fmt: skip
+        "constrained": True, "long": False, "along": 1e4, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
 
@@ -128,7 +128,7 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
     ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
     ({"net": CONFIG.net_overlap - 0.001, "spread": 20.0}, "few-matches"),
-    ({"net": CONFIG.net_overlap + 0.001, "share": 0.2, "spread": 20.0}, "accepted"),
+    ({"net": CONFIG.net_overlap + 0.001, "share": 0.2, "spread": 20.0, "long": True}, "accepted"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
     ({"off": 5.0, "constrained": False}, "accepted"),
@@ -139,7 +139,8 @@ def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
     fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "net")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
-    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["constrained"])
+    spread = np.array([f["spread"]])
+    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, spread, f["constrained"], f["long"])
     root = np.sqrt(np.diag([f["along"], f["strength"], 1e4]))[None]
     ((found, reason),) = _judge(candidates, fits, np.zeros((1, 3)), root, CONFIG)
     assert found == outcome

@@ -1,5 +1,6 @@
 """Trajectories caught on the wrong side of a line of anchors, and when another side is a doubt."""
 
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from helpers.planted import NOMINAL, drive, odometry, ranges
 
 from uwblite import se2
 from uwblite.arrays import rms_length
+from uwblite.assessment.certainty import check_other_side
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
@@ -70,3 +72,17 @@ def test_anchors_on_both_sides_leave_no_other_side():
     assert not line_sides.mirrored_tails(graph, estimate.placed)
     assert [each.graph for each in line_sides.sides(graph, estimate.placed, task.config.solver)] == [graph]
     assert estimate.other_side is None
+
+
+@pytest.mark.parametrize("caught", [False, True])
+def test_a_map_is_doubted_where_another_side_fits_about_as_well(caught):
+    """So is one that is caught on the wrong side, and not the one on the side for which there is very strong evidence."""
+    task, _ = there_and_back(0.0)
+    estimate = radio_stages.first_optimisation(task)
+    estimate = replace(estimate, graph=estimate.graph.with_edges(*estimate.odometry_and_ranges))
+    if caught:
+        start = estimate.graph.with_estimates_of(estimate.other_side)
+        estimate = replace(estimate, graph=optimize(start, task.config.solver)[0])
+    found = list(check_other_side(estimate, task))
+    assert [finding.kind for finding in found] == ["other-side"] * caught
+    assert all(finding.figures["apart"] > line_sides.LinePolicy.elsewhere for finding in found)

@@ -4,6 +4,7 @@ Each rule yields findings; docs/findings.md describes their kinds.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,50 +40,54 @@ _POOR_FIT = 4.0
 """chi2 per degree of freedom beyond which errors are twice the assumed noise: the model is not valid."""
 
 
-def judge(
-    estimate: Estimate,
-    anchors: Sequence[AnchorEstimate],
-    calibrated: Sequence[CalibrationEstimate],
-    usual: Mapping[UnknownKey, Unknown],
-    table: dict[str, Floats],
-    grid: OccupancyGrid | None,
-    sigma: float,
-    task: Task,
-) -> None:
-    """Add the findings that the recordings, the stages and the finished estimate give rise to, causes before consequences.
+@dataclass(frozen=True, slots=True, eq=False)
+class ResultView:
+    """What the rules about a result look at."""
 
-    Parameters
-    ----------
-    anchors, calibrated, grid : see MapResult. table : MapResult.range_table.
-    usual : unknowns with their prior standard deviations. sigma : m, see check_certainty.
-    """
-    residuals = table["residual"] if table else np.zeros(0)
-    # A rule may look at what those before it found.
-    rules: tuple[Callable[[], Iterable[Finding]], ...] = (
-        lambda: say(task.stages.facts, RULES),
-        lambda: check_repairs(task),
-        lambda: check_certainty(estimate, sigma, task),
-        lambda: check_anchors(anchors, task),
-        lambda: check_moved_together(anchors, table, task),
-        lambda: check_sensors(grid, task),
-        lambda: check_closures(estimate, grid),
-        lambda: check_calibration(calibrated, usual, task),
-        lambda: check_sustained_outliers(table, estimate.anchor_ids, task) if table else (),
-        lambda: check_residuals(estimate, residuals, grid, task),
-        lambda: check_unit(anchors, task),
-        lambda: check_short_ranges(anchors, estimate, sigma, task),
-        lambda: check_drifts(estimate, task),
-        lambda: check_untied_parts(estimate, task),
-        lambda: check_untied_recordings(estimate, task),
-        lambda: check_other_side(estimate, task),
-        lambda: check_handedness(estimate, task),
-        lambda: check_turn_scales(estimate, task),
-        lambda: check_fit(task),
-        lambda: check_wheels_against_lidar(table, anchors, task),
-    )
-    for rule in rules:
-        task.stages.findings.extend(rule())
-    task.stages.findings[:] = explained(task.stages.findings)
+    task: Task
+    estimate: Estimate
+    anchors: Sequence[AnchorEstimate]
+    calibrated: Sequence[CalibrationEstimate]
+    usual: Mapping[UnknownKey, Unknown]
+    """Unknowns with their prior standard deviations."""
+    table: dict[str, Floats]
+    """MapResult.range_table."""
+    grid: OccupancyGrid | None
+    sigma: float
+    """m, see check_certainty."""
+
+
+RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
+    lambda view: say(view.task.stages.facts, RULES),
+    lambda view: check_repairs(view.task),
+    lambda view: check_certainty(view.estimate, view.sigma, view.task),
+    lambda view: check_anchors(view.anchors, view.task),
+    lambda view: check_moved_together(view.anchors, view.table, view.task),
+    lambda view: check_sensors(view.grid, view.task),
+    lambda view: check_closures(view.estimate, view.grid),
+    lambda view: check_calibration(view.calibrated, view.usual, view.task),
+    lambda view: check_sustained_outliers(view.table, view.estimate.anchor_ids, view.task) if view.table else (),
+    lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
+    lambda view: check_unit(view.anchors, view.task),
+    lambda view: check_short_ranges(view.anchors, view.estimate, view.sigma, view.task),
+    lambda view: check_drifts(view.estimate, view.task),
+    lambda view: check_untied_parts(view.estimate, view.task),
+    lambda view: check_untied_recordings(view.estimate, view.task),
+    lambda view: check_other_side(view.estimate, view.task),
+    lambda view: check_handedness(view.estimate, view.task),
+    lambda view: check_turn_scales(view.estimate, view.task),
+    lambda view: check_fit(view.task),
+    lambda view: check_wheels_against_lidar(view.table, view.anchors, view.task),
+)
+"""In this order: a rule may look at what those before it found."""
+
+
+def judge(view: ResultView) -> None:
+    """Add the findings that the recordings, the stages and the finished estimate give rise to, causes before consequences."""
+    findings = view.task.stages.findings
+    for rule in RESULT_RULES:
+        findings.extend(rule(view))
+    findings[:] = explained(findings)
 
 
 def check_repairs(task: Task) -> list[Finding]:

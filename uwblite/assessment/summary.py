@@ -61,7 +61,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     )
     table = {} if ranges is None else _range_table(ranges, graph, residuals, weights, np.abs(residuals) < limit, recordings)
     shape = shape_error(graph.poses[covariance.chosen], covariance.among)
-    plausibility.judge(estimate, anchors, calibrated, listed, table, grid, shape, task)
+    plausibility.judge(plausibility.ResultView(task, estimate, anchors, calibrated, listed, table, grid, shape))
     anchors = _distrusted(anchors, stages.doubts)
     stages.end("summary", passes=round(stages.passes, 3))
     stamps = [recording.trajectory_stamps for recording in recordings.each]

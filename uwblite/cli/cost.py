@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
-_SECONDS_PER_METRE = 0.06
+_SECONDS_PER_METRE = 0.045
 """Of driving, with lidar: matching of clouds, graph."""
 _SECONDS_PER_METRE_WITHOUT_LIDAR = 0.0005
-_SECONDS_PER_RANGE, _SECONDS_PER_RANGE_WITHOUT_LIDAR = 3e-4, 8e-4
+_SECONDS_PER_RANGE, _SECONDS_PER_RANGE_WITHOUT_LIDAR = 1.5e-4, 8e-4
 """Without lidar ranges alone hold the trajectory, and an optimisation takes more steps."""
 _SECONDS_PER_READING = 2e-7
 """Of the laser: parsing and tracing."""
@@ -79,6 +79,18 @@ def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict
         "map height m": round(float(size[1]), 1) if cells else 0.0,
         "map cells": cells,
     }
+
+
+def long_wait(seconds: float) -> str | None:
+    """Return what to say beforehand of a map that takes more than ten minutes, s; None of others."""
+    if seconds <= _LONG:
+        return None
+    cure = "a part of it (uwblite convert --start --end) or a larger --set keyframes.distance=METRES takes less"
+    return f"this map will take about {seconds / 60.0:.0f} minutes of a desktop computer, more of a small one: {cure}"
+
+
+_LONG = 600.0
+"""s; a user who is not told of it takes a longer run for one that hangs."""
 
 
 def together(costs: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +12,12 @@ from ..io.bag_topics import BagTopics
 from ..io.log_parts import each_once
 from ..io.source import read_settings
 from ..io.uwb_mapping import UwbMapping, parse_mappings
-from ..pipeline.mapping_config import MappingConfig, preset
 from ..sensor_log import SensorLog, SensorMounting
 from . import console
 from .formats import read_recording
+
+if TYPE_CHECKING:
+    from ..pipeline.mapping_config import MappingConfig
 
 
 def name_recordings_once(args: argparse.Namespace) -> None:
@@ -26,13 +29,15 @@ def name_recordings_once(args: argparse.Namespace) -> None:
     args.logs = logs
 
 
-def effective_config(args: argparse.Namespace) -> MappingConfig:
+def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """Return the settings that --preset, --config and --set amount to.
 
     Raises
     ------
     UsageError : a preset or setting does not exist, or has a value that it cannot have.
     """
+    from ..pipeline.mapping_config import MappingConfig, preset  # a check of a recording does without the pipeline
+
     # The user's mounting of the laser overrides what the scans show.
     given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
     text = read_settings(args.config) if args.config else ""

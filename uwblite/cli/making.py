@@ -25,7 +25,7 @@ from ..mapping import MappingConfig, Progress, Stage, build_map
 from ..pipeline.mapping_config import preset
 from ..pipeline.scan_selection import prepared
 from ..sensor_log import SensorLog
-from .cost import expected_cost, together
+from .cost import expected_cost, long_wait, together
 from .formats import read_recording
 from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
 from .memory import FreedMemory, shortage
@@ -82,7 +82,7 @@ def make(
 
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
-    _check_memory(kept, config, args.ignore_memory, note, maps)
+    _check_cost(kept, config, args.ignore_memory, note, maps)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
     result = replace(result, findings=findings_with_options(result.findings))
@@ -103,17 +103,17 @@ def make(
     return Made(kept, result, names, reading + time.perf_counter() - began)
 
 
-def _check_memory(
+def _check_cost(
     logs: list[SensorLog], config: MappingConfig, ignore: bool, note: Callable[[str], None] | None, maps: int
 ) -> None:
-    """Refuse a map that will not fit in memory, or note that it may not."""
-    found = shortage(together([expected_cost(log, config) for log in logs])["megabytes"], maps)
-    if found is None:
-        return
-    if found.hopeless and not ignore:
+    """Refuse a map that will not fit in memory; note what may not, and what will take long."""
+    whole = together([expected_cost(log, config) for log in logs])
+    found = shortage(whole["megabytes"], maps)
+    if found is not None and found.hopeless and not ignore:
         raise ConfigError(f"{found.text}; --ignore-memory tries all the same")
-    if note is not None:
-        note(f"uwblite: {found.text}")
+    for text in (found and found.text, long_wait(whole["seconds"])):
+        if text and note is not None:
+            note(f"uwblite: {text}")
 
 
 def config_text(config: MappingConfig) -> str:

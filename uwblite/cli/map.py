@@ -19,7 +19,7 @@ from ..report.printable import duration
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from . import console
-from .cost import expected_cost, together
+from .cost import expected_cost, long_wait, together
 from .formats import format_of
 from .inputs import name_recordings_once
 from .making import Made, make, peak_memory, read_logs, settings
@@ -105,8 +105,10 @@ def _dry_run(args: argparse.Namespace) -> int:
     summary = {"recordings": rows, "expected cost of map": whole, "exit_code": 0}
     lines = [_cost_line(log, cost) for log, cost in zip(args.logs, costs, strict=True)]
     console.report(args.json, summary, [*lines, _cost_line("all together", whole)] if len(lines) > 1 else lines)
-    if found := shortage(whole["megabytes"]):
-        console.note(f"uwblite: {found.text}")
+    found = shortage(whole["megabytes"])
+    for text in (found and found.text, long_wait(whole["seconds"])):
+        if text:
+            console.note(f"uwblite: {text}")
     return 0
 
 

@@ -111,18 +111,23 @@ class OccupancyGrid:
 
 def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
     """Return the map that counted hits and misses make: additive log-odds, clamped."""
-    per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
-    per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
     log_odds = np.zeros(counter.hits.shape, dtype=np.float32)
-    # In strips: the products in double precision would otherwise be the largest arrays.
     for rows in counter.geometry.strips():
-        part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
-        log_odds[rows] = np.clip(part, -config.clamp, config.clamp)
+        log_odds[rows] = _log_odds(counter, rows, config)
     return OccupancyGrid(counter.geometry, log_odds)
 
 
-def walls_of(grid: OccupancyGrid) -> Bools:
+def _log_odds(counter: RayCounter, rows: slice, config: GridConfig) -> NDArray[np.floating]:
+    """Return the log-odds of some rows: the products in double precision would otherwise be the largest arrays."""
+    per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
+    per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
+    return np.clip(counter.hits[rows] * per_hit + counter.misses[rows] * per_miss, -config.clamp, config.clamp)
+
+
+def walls_of(counter: RayCounter, config: GridConfig) -> Bools:
     """Return which cells (rows, cols) are occupied or next to an occupied one: walls without holes of two cells."""
-    occupied = np.pad(grid.log_odds > math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE)), 1)
+    occupied, least = np.zeros(np.add(counter.hits.shape, 2), dtype=bool), math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE))
+    for rows in counter.geometry.strips():
+        occupied[1:-1, 1:-1][rows] = _log_odds(counter, rows, config).astype(np.float32) > least
     beside = occupied[:-2] | occupied[1:-1] | occupied[2:]
     return beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]

@@ -11,14 +11,17 @@ from .bresenham import mark_rays
 from .geometry import GridGeometry
 
 Counts = NDArray[np.int32]
+_Marks = NDArray[np.uint8] | NDArray[np.uint16]
 
 WEIGHT_UNIT = 16
 """Misses are counted in sixteenths, so that weak ones stay integers."""
-_SCRATCH_CELLS = 1 << 22
+_SCRATCH_CELLS = 1 << 24
 """Cells of working memory: scans are traced in batches whose windows fit into it, and so does the area around all of these."""
 _HIT = 128
 """Mark of a cell in which a ray of a scan ended, 1 = through which one passed; those of up to _MOST_SCANS add up in 16 bits."""
 _MOST_SCANS = _HIT - 1
+_SPARSE = 0.1
+"""Share of the cells of a window up to which they are added one by one, in as much time for each as ten in a row take."""
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
 
@@ -100,20 +103,32 @@ class RayCounter:
         if walls is None:
             marks[start + rows * width + cols] = _HIT
         first = low.min(axis=0)
-        total = np.zeros((low + size).max(axis=0) - first, dtype=np.uint16)
-        places = zip(marks.reshape(-1, height, width), (low - first).tolist(), size.tolist(), strict=True)
-        for marked, (row, col), (tall, wide) in places:
-            total[row : row + tall, col : col + wide] += marked[:tall, :wide]
+        total: _Marks = marks[:window].reshape(height, width)
+        if len(low) > 1:
+            total = np.zeros((low + size).max(axis=0) - first, dtype=np.uint16)
+            places = zip(marks.reshape(-1, height, width), (low - first).tolist(), size.tolist(), strict=True)
+            for marked, (row, col), (tall, wide) in places:
+                total[row : row + tall, col : col + wide] += marked[:tall, :wide]
         row, col = first.tolist()
         self._add_window(total, row, col, WEIGHT_UNIT if walls is None else self._weak)
 
-    def _add_window(self, total: NDArray[np.uint16], row: int, col: int, weight: int) -> None:
+    def _add_window(self, total: _Marks, row: int, col: int, weight: int) -> None:
         """Add hits and misses in a window whose first cell is (row, col); cells outside the grid are dropped."""
         top, left = max(-row, 0), max(-col, 0)
         part = total[top : max(self.geometry.rows - row, 0), left : max(self.geometry.cols - col, 0)]
         window = slice(row + top, row + top + part.shape[0]), slice(col + left, col + left + part.shape[1])
-        self.hits[window] += part // _HIT
-        self.misses[window] += part % _HIT * weight
+        met = part != 0
+        if np.count_nonzero(met) < _SPARSE * part.size:
+            # A few long rays: memory of cells that none of them meets is not touched.
+            some = np.flatnonzero(met)
+            marks = part.reshape(-1)[some].astype(np.uint16)
+            down, across = np.divmod(some, part.shape[1])
+            place = (row + top + down) * self.geometry.cols + (col + left) + across
+            self.hits.reshape(-1)[place] += marks // _HIT
+            self.misses.reshape(-1)[place] += marks % _HIT * weight
+        else:
+            self.hits[window] += part // _HIT
+            self.misses[window] += (part & (_HIT - 1)).astype(np.uint16) * weight
 
     def _windows_of(self, cells: Bools, low: Ints, height: int, width: int) -> Bools:
         """Return the scans' windows (flat) onto a grid of flags; outside the grid nothing is set."""

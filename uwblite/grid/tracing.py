@@ -96,7 +96,7 @@ def from_sweeps(
 
     trace(None, 0)
     if clears:
-        trace(walls_of(from_counts(counter, config)), count)
+        trace(walls_of(counter, config), count)
     drawn = from_counts(counter if geometry else counter.cropped(), config)
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)

@@ -52,6 +52,8 @@ class LaserMessages:
         self._counts = dict.fromkeys(RANK, 0)
         self._layouts: dict[bytes, Layout] = {}
         self._scans: dict[Layout, _Scans] = {}
+        self._counted = set[Layout]()
+        """All layouts of the scans."""
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
         self._pose_lines = array("q")
@@ -146,6 +148,7 @@ class LaserMessages:
         for name, count in self._counts.items():
             if count and name != self._kind:
                 skipped[name.decode()] = count
+        self._counted = set(self._scans)
         kept = max(self._scans, key=lambda layout: self._scans[layout].seen, default=None)
         if kept is None or not len(self._scans[kept].stamps):
             return None, None
@@ -168,9 +171,15 @@ class LaserMessages:
         return laser, self._mounting(what, warnings)
 
     def _geometry(self, layout: Layout, params: Params) -> ScanGeometry:
-        """Return where the beams of messages of a layout point."""
-        stated = (layout.angle_min, layout.angle_increment)
-        return ScanGeometry(*(stated if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
+        """Return where the beams of messages of a layout point.
+
+        A SICK that interlaces sends scans of one beam fewer, too, and their beams lie between those of the others.
+        """
+        if self._kind != b"FLASER":
+            return ScanGeometry(layout.angle_min, layout.angle_increment, layout.beams)
+        first, step = params.guess_scanner(layout.beams)
+        interlaced = Layout(layout.beams + 1) in self._counted
+        return ScanGeometry(first + (0.5 * step if interlaced else 0.0), step, layout.beams)
 
     def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""

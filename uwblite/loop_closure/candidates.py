@@ -34,6 +34,8 @@ class Candidates(Table):
     """(c,) 3 sigma of its position, m."""
     constrained: bool = True
     """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
+    long: bool = False
+    """The sub-maps are long stretches, of which a part may overlap."""
 
     def renumbered(self, target: Ints, source: Ints) -> "Candidates":
         """Return them with other numbers of sub-maps."""

@@ -1,8 +1,9 @@
 """Loop closure where the pose after a loop is uncertain by many metres: long stretches of the path are matched.
 
-A search narrower than the uncertainty may miss the true place, and a search over all of it finds many places at which one
-sub-map of a corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
-(net_overlap). The likeliest pairs come first: each closed loop reduces the uncertainty of the others.
+Where any pair is as uncertain, all that need a search are compared so: one closed loop may make the others more certain than
+they are. A search narrower than the uncertainty may miss the true place, and a search over all of it finds many places at
+which one sub-map of a corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well
+as walls do (net_overlap). The likeliest pairs come first: each closed loop reduces the uncertainty of the others.
 """
 
 from dataclasses import replace
@@ -20,6 +21,9 @@ from .closures import LoopClosureConfig
 _LENGTH = 30.0
 """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays within the
 gate of the final matching. Each begins in the middle of the one before."""
+_WIDER = 2.0
+"""Factor on the standard deviations of a chain of steps: a bias that following steps share, a robot that tilts, floors that
+give way, adds up along the way, and the covariance contains none (twice the stated heading in a hospital)."""
 _AT_ONCE, _PART = 40, 8
 """Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
 
@@ -55,20 +59,23 @@ def _wide(config: LoopClosureConfig) -> LoopClosureConfig:
 
 def uncertain_pairs(
     graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
-    constrained: bool, config: LoopClosureConfig,
+    constrained: bool, config: LoopClosureConfig, beyond: float,
 ) -> Candidates:
-    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the likeliest first.
+    """Return pairs of stretches that may overlap and are less certain than to a limit (3 sigma), m, the likeliest first.
 
     For the parameters see candidates.propose.
     """
     wide = _wide(config)
-    found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, config.search_limit)
+    found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, beyond)
+    found = replace(found, long=True)
     return found.rows(np.argsort(-overlap_probability(found.guess, found.covariance, wide.reach), kind="stable"))
 
 
 def first_of(candidates: Candidates, pieces: Submaps) -> Candidates:
-    """Return the candidates that are tried before the graph is solved again."""
-    return candidates.rows(slice(0, max(_AT_ONCE, len(pieces) // _PART)))
+    """Return the candidates that are tried before the graph is solved again, as uncertain as a chain of steps may be."""
+    first = candidates.rows(slice(0, max(_AT_ONCE, len(pieces) // _PART)))
+    wider = 1.0 if candidates.constrained else _WIDER
+    return replace(first, covariance=wider**2 * first.covariance, spread=wider * first.spread)
 
 
 def likely(candidates: Candidates) -> Candidates:

@@ -104,7 +104,7 @@ def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     row, guess = _guesses(batch)
     points = pair_points(clouds, candidates.source[row], config.points)
     tries = align_pairs(clouds, raster, candidates.target[row], guess, points, 0.5, config.gate)
-    wide = candidates.spread > config.search_limit
+    wide = np.full(len(candidates.target), candidates.long)
     score, some = tries.share, np.flatnonzero(wide[row])
     target, source = candidates.target[row[some]], candidates.source[row[some]]
     poses = tries.pose[some]
@@ -130,8 +130,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
         poses = candidates.guess[k : k + 1]
         if searched:
             half_width = float(candidates.spread[k])
-            wide = half_width > config.search_limit
-            search_config, places = (_coarse(batch.search), _MANY_PLACES) if wide else (batch.search, config.places)
+            search_config, places = (_coarse(batch.search), _MANY_PLACES) if candidates.long else (batch.search, config.places)
             turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
             target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], half_width, turn, target, source)

@@ -57,7 +57,7 @@ def _judge(
     candidates: Candidates, fits: ClosureMatches, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
 ) -> list[tuple[str, str]]:
     """Return the outcome of each candidate so far, one of map_result.OUTCOMES, and its reason in words."""
-    result, searched, wide = fits.best, candidates.spread > config.direct, candidates.spread > config.search_limit
+    result, searched = fits.best, candidates.spread > config.direct
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
     seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
@@ -77,7 +77,7 @@ def _judge(
         elif fits.net[k] < config.net_overlap:
             text = f"only {fits.net[k]:.1f} m of surface speak for it in one direction (least {config.net_overlap:g} m)"
             verdict = "few-matches", text
-        elif share[k] < least and not wide[k]:
+        elif share[k] < least and not candidates.long:
             verdict = "few-matches", f"only {share[k]:.0%} of its points match (least {least:.0%})"
         elif rms[k] > config.sigma:
             verdict = "far-matches", f"matches lie {rms[k]:.3f} m apart (most {config.sigma:g} m)"
@@ -138,7 +138,11 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     if not len(closures.edges):
         return graph, closures
     quick = replace(solver, relative_decrease=1e-4)
-    solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], (30.0, 10.0, 4.0), quick)
+    worst = float(np.linalg.norm(closures.edges.residuals(graph), axis=1).max())
+    # The first scale contains every closure: one that ends a long drift would else be rejected before it has any weight.
+    steps = int(np.ceil(np.log(max(worst / _LAST, 1.0)) / np.log(_TIGHTER)))
+    scales = [_LAST * _TIGHTER**k for k in range(steps, -1, -1)]
+    solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
@@ -146,3 +150,7 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     reasons = [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared]
     left = closures.without(kept, "contradicts-closures", reasons)
     return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", 3.0)))
+
+
+_LAST, _TIGHTER = 4.0, 3.0
+"""Last scale of the kernel, standard deviations, and the ratio of each to the next."""

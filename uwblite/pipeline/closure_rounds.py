@@ -106,7 +106,7 @@ def _with_long_stretches_tied(
     accepted = 0
     for _ in range(_WIDE_ROUNDS):
         pairs = long_stretches.uncertain_pairs(
-            base, covariance, pieces, recordings.of_keyframe, tried, estimate.ranges is not None, rules
+            base, covariance, pieces, recordings.of_keyframe, tried, estimate.ranges is not None, rules, rules.direct
         )
         if not len(pairs.target):
             break
@@ -129,7 +129,7 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
     recordings, rules = task.recordings, task.config.loop_closure
     covariance = JointCovariance(base.with_edges(found.edges), stretches.reference)
     left = long_stretches.likely(long_stretches.uncertain_pairs(
-        base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules
+        base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules, rules.search_limit
     ))  # fmt: skip
     if not len(left.target):
         return
