@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization import hypotheses
-from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, map_odds, needed, nowhere, undecided
+from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, map_odds, needed, nowhere, undecided, vague
 
 MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4), RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
 ENDS, RAYS = 3.0 * FEW_ENDS, 30.0
@@ -69,3 +69,11 @@ def test_a_search_that_left_places_out_and_a_pose_that_is_not_sure_decide_nothin
     assert "too many" in undecided(a_bank(), 0, False, CERTAIN)
     wide = hypotheses.started(np.zeros((1, 3)), np.diag([0.1, 0.001, 0.001])[None], np.zeros(0))
     assert "not sure" in undecided(wide, 0, True, CERTAIN)
+
+
+def test_a_pose_is_known_while_its_longest_axis_is_short_in_any_frame():
+    for turn in np.linspace(0.0, np.pi, 7):
+        c, t = np.cos(turn), np.sin(turn)
+        axes = np.array([[c, -t, 0.0], [t, c, 0.0], [0.0, 0.0, 1.0]])
+        assert vague(axes @ np.diag([0.39**2, 0.01, 0.2**2]) @ axes.T) == ""
+        assert "0.5 m" in vague(axes @ np.diag([0.48**2, 0.01, 0.2**2]) @ axes.T)

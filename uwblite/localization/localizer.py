@@ -87,6 +87,11 @@ class Localizer:
         return self._estimator.work
 
     @property
+    def tracks(self) -> bool:
+        """Whether one place is tracked, however vague the pose has become."""
+        return self._estimator.tracks
+
+    @property
     def ends(self) -> Floats:
         """(2,) numbers of rays on walls, and in known space, while the pose was known."""
         return self._estimator.ends.copy()

@@ -79,6 +79,11 @@ class PoseEstimator:
         self._running = full_agreement(len(known.anchors.ids))
         self._reason = "nothing has been measured yet"
 
+    @property
+    def tracks(self) -> bool:
+        """Whether one place is tracked, however vague the pose has become."""
+        return self._certain
+
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
         self._bank = hypotheses.moved(self._bank, step, 0.0, self.known.anchors.slow_sigma)
@@ -190,9 +195,9 @@ class PoseEstimator:
         share, covariance = hypotheses.mixture(bank, best)
         fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
-        reason = "" if self._certain else self._reason
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
-        return LocalizerState(stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], far)
+        reason = verdict.vague(covariance) if self._certain else self._reason
+        return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
 
     def _laser_turn(self) -> Floats:
         """Return the pose (3,) of the base as the laser's stated mounting shows it, in its own frame; m, m, rad."""

@@ -18,6 +18,8 @@ _CERTAIN_AGAIN = 4.6
 """The same in a map that is the right one, as a pose was tracked in it: 100 : 1."""
 SIGMA_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less certain is not found yet."""
+_VAGUE = (0.4, 0.25)
+"""m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
 ELSEWHERE = (-0.35, -1.2)
 """Log-likelihood of a ray, and of an independent range, at the best place of a building that is not the map's. In 770 searches
 in three of them the odds against that were never 400 : 1; in the right building they are after 0.7 to 1.4 m (median)."""
@@ -62,6 +64,14 @@ def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> st
 def needed(fitting: "RangeFit", proven: bool) -> float:
     """Return the log-likelihood of certainty; proven : the map is the right one, as a pose was tracked in it."""
     return _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
+
+
+def vague(covariance: Floats) -> str:
+    """Return why a pose that is tracked is not known, by its covariance (3, 3), m and rad; "" = it is known."""
+    place, heading = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
+    if place <= _VAGUE[0] and heading <= _VAGUE[1]:
+        return ""
+    return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
 
 
 @dataclass(frozen=True, slots=True)
