@@ -35,9 +35,9 @@ ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 _AGREED = 3.0
 """Log-likelihood, 20 : 1, of a metre of driving over which all searches found the same place: in another building the best
 place leaps. By scans or ranges alone, with nothing independent beside them, it is all that counts: two metres."""
-_UNIT_KNOWN = 0.04
-"""Standard deviation of the map's unit from which another one would have been noticed; a start also needs the unit itself to be
-within what data sheets allow."""
+_UNIT_KNOWN = 0.7
+"""Standard deviation of the map's unit, as a share of what data sheets allow, from which another one would have been noticed; a
+start also needs the unit itself to be within that."""
 _UNIT_CLEAR = 0.01
 """The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
 
@@ -137,7 +137,7 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges
         if not start and scale.sigma < _UNIT_CLEAR:
             break
     sigma, error, limit = min(((s.sigma, abs(s.error), limit) for _, s, limit in compared), default=(0.0, 0.0, 0.0))
-    if start and (sigma > _UNIT_KNOWN or error > limit):
+    if start and (sigma > _UNIT_KNOWN * limit or error > limit):
         return "whether the map has the sensors' unit is not known yet; drive on"
     return ""
 
