@@ -270,9 +270,11 @@ class PoseEstimator:
         agreed = self._agreed(None if undecided else pose)
         fit, likelihood = float(found.fit[best]), float(found.by_ranges[best])
         odds = verdict.map_odds(fit, known, found.independent, likelihood, fitting, agreed)
-        self._reason = undecided or verdict.nowhere(odds, fitting) or verdict.other_unit(
-            self.known.walls, pose, found.rays, found.looks, ranges, not proven
-        )  # fmt: skip
+        self._reason = (
+            undecided
+            or verdict.nowhere(odds, fitting)
+            or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
+        )
         if not self._reason and odds.total < certain:
             self._reason = "found; a little more driving will confirm it"
         self._trim(bool(verdict.nowhere(odds, fitting)))

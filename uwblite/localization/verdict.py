@@ -153,13 +153,9 @@ class RangeFit:
     """Anchors whose ranges agree."""
 
     @property
-    def share_of_needed(self) -> float:
-        """Ranges to two anchors or more that agree, as a share of what a start needs."""
-        return self.share * self.count / ENOUGH_RANGES if self.anchors >= 2 else 0.0
-
-    @property
     def enough(self) -> bool:
-        return self.share_of_needed >= 1.0
+        """Whether those that agree, to two anchors or more, are as many as ranges alone need."""
+        return self.anchors >= 2 and self.share * self.count >= ENOUGH_RANGES
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:

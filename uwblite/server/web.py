@@ -172,9 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: the page itself shows what went wrong."""
 
 
-def server_for(
-    page: Page, port: int = 0, host: str = LOOPBACK, names: tuple[str, ...] = ()
-) -> ThreadingHTTPServer:  # fmt: skip
+def server_for(page: Page, port: int = 0, host: str = LOOPBACK, names: tuple[str, ...] = ()) -> ThreadingHTTPServer:
     """Return a server that answers for a page; `serve_forever` runs it.
 
     Parameters
