@@ -1,5 +1,6 @@
 """Starting values from nothing: attempts with several errors of the heading, the first of which agrees with the ranges."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ..arrays import Floats
@@ -23,7 +24,9 @@ def bootstrap_graph(
     Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A
     hypothesis that begins like an earlier attempt would continue like it, and is dropped. In the order of their misfit, each is
     continued as long as the ranges agree; the first that reaches the end is taken. Where none does, the best of them is
-    continued if it began clearly better than the uncorrected heading, and is taken if it also ends better.
+    continued if it began clearly better than the uncorrected heading, and is taken if it also ends better. Wheels that slip are
+    the other explanation: they are sought from several first stretches, and of the attempts that agree the one of greatest
+    evidence is taken.
 
     Parameters
     ----------
@@ -40,8 +43,28 @@ def bootstrap_graph(
     first.run(config.enough)
     begun = first.misfit()
     first.run()
-    if first.misfit() < config.agreement or not others:
+    if first.misfit() < config.agreement:
         return first.estimate()
+    tried, slipping = [_likeliest_heading(first, begun, others, config)] if others else [first], list[Attempt]()
+    while len(slipping) <= _STARTS and (not slipping or slipping[-1].slips.any()):
+        # The wheels may have slipped in the first stretch as well.
+        slipping.append(Attempt(graph, odometry, ranges, path, config, search, [each.first for each in slipping]))
+        slipping[-1].run()
+    agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
+    return max([*tried, *agreeing], key=Attempt.evidence).estimate()
+
+
+_STARTS = 3
+"""Further stretches that are tried as the first one where the wheels slip."""
+
+
+def _likeliest_heading(first: Attempt, begun: float, others: Sequence[Attempt], config: BootstrapConfig) -> Attempt:
+    """Return the first attempt, or another one with a gross error of the heading whose ranges agree better.
+
+    Parameters
+    ----------
+    begun : misfit with which the first one began.
+    """
     tried = [first]
     for attempt in others:
         attempt.run(0.0)
@@ -52,9 +75,9 @@ def bootstrap_graph(
     hopeful = others[0] if others and others[0].misfit() < 0.8 * begun else first
     for attempt in others:
         if attempt.agrees_to_the_end():
-            return attempt.estimate()
+            return attempt
     hopeful.run()
-    return (hopeful if hopeful.misfit() < 0.8 * first.misfit() else first).estimate()
+    return hopeful if hopeful.misfit() < 0.8 * first.misfit() else first
 
 
 def _with_heading_scale(calibration: Calibration, value: float) -> Calibration | None:
