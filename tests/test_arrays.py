@@ -14,6 +14,7 @@ from uwblite.arrays import (
     as_array,
     concatenated,
     renumbered,
+    require_finite,
     require_index,
     require_shape,
     rms_length,
@@ -271,3 +272,11 @@ def test_indices_wider_than_addresses_are_narrowed_where_they_fit():
     assert as_array(wide.astype(np.int16), "pose", np.int32).dtype == np.int16
     with pytest.raises(DataError, match="pose holds 8589934592, which does not fit into int32"):
         as_array(wide + (1 << 33), "pose", np.int32)
+
+
+@pytest.mark.parametrize(("value", "most", "words"), [(np.nan, np.inf, "is not finite"), (1e9, 1e6, r"is beyond 1e\+06")])
+def test_the_row_of_a_table_that_is_no_measurement_is_named(value, most, words):
+    table = np.zeros((5, 3))
+    table[3, 1:] = value
+    with pytest.raises(DataError, match=rf"^poses\[3\] {words} \(1 such rows\)"):
+        require_finite(table, "poses", most)

@@ -24,7 +24,7 @@ from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Task
-from uwblite.problem.parts import at_given_poses
+from uwblite.problem.solution import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import Odometry, UwbRanges

@@ -67,3 +67,12 @@ def test_figures_are_rounded_to_what_they_are_worth():
     figures, _ = checked(poses, 10.0)
     for name, digits in (("path m", 3), ("turned rad", 3), ("speed m/s", 4), ("width of the path by its length", 4)):
         assert figures[name] == round(figures[name], digits) != round(figures[name], digits - 1)
+
+
+def test_the_usual_speed_is_that_of_a_robot_that_drives():
+    """It stands for two thirds of the time, and one reading has the stamp of the one before."""
+    poses = np.zeros((91, 3))
+    poses[61:, 0] = 0.05 * np.arange(1, 31)
+    stamps = 0.1 * np.arange(91)
+    stamps[80] = stamps[79]
+    assert odometry_figures(Odometry(stamps, poses))["speed m/s"] == pytest.approx(0.5, abs=1e-3)

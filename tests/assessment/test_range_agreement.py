@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from uwblite.assessment.range_agreement import (
-    check_short_ranges,
     check_sustained_outliers,
-    check_unit,
     check_wheels_against_lidar,
     outlier_stretches,
 )
-from uwblite.findings import Fact, warning
-from uwblite.map_result import AnchorEstimate
+from uwblite.findings import Fact
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import OdometryBreaks, Screening
 
@@ -36,29 +33,6 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
     stamps = np.arange(400.0)
     agrees = (np.arange(400) % 10 < agreeing) | (stamps < 100) | (stamps >= 200)
     assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
-
-
-@pytest.mark.parametrize(
-    ("have_scans", "kinds", "names", "doubted"),
-    [
-        (False, ["odometry-unit"], ["A", "B"], False),
-        (False, ["odometry-unit", "sustained-outliers"], ["A", "B"], True),
-        (False, ["odometry-unit"], ["A", "B", "C", "bad D"], True),
-        (False, ["odometry-unit"], ["A", "B", "C", "D", "bad E"], False),
-        (False, ["odometry-unit"], ["A", "A@2"], True),
-        (True, ["odometry-unit", "sustained-outliers"], ["A", "A@2"], False),
-        (False, ["sustained-outliers"], ["A", "A@2"], False),
-    ],
-)
-def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_other(have_scans, kinds, names, doubted):
-    stages = Stages(None, None)
-    for kind in kinds:
-        stages.findings.append(warning(kind, "warned of before"))
-    anchors = [SimpleNamespace(id=n.split()[-1], status="distrusted" if "bad" in n else "ok") for n in names]
-    stages.findings.extend(
-        check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
-    )
-    assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 
 def recordings_from(*starts, scans=True):
@@ -174,20 +148,3 @@ def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
 def test_too_few_ranges_that_agree_decide_nothing(residual, options):
     stages = against(residual, **options)
     assert ([n.kind for n in stages.doubts], stages.warnings) == (["wheels-against-lidar"], [])
-
-
-@pytest.mark.parametrize(
-    ("short", "alone", "sigma", "doubted"),
-    [(78, True, 0.33, True), (22, True, 0.33, False), (78, False, 0.33, False), (78, True, 0.12, False)],
-)
-def test_ranges_that_are_too_short_are_a_doubt_where_they_alone_and_poorly_determine_the_path(short, alone, sigma, doubted):
-    """One in twenty of one anchor's and more: with a lidar, or other anchors around, it was elsewhere, and the map is right."""
-    anchors = [
-        AnchorEstimate(name, np.zeros(2), np.eye(2), 458, 1.0, 0.0, 0.1, 0.1, "ok", short=n)
-        for name, n in (("A", short), ("B", 1))
-    ]
-    stages, poses = Stages(None, None), np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 0.0]])
-    estimate = SimpleNamespace(rests_on_ranges=alone, graph=SimpleNamespace(poses=poses))
-    stages.findings.extend(check_short_ranges(anchors, estimate, sigma, SimpleNamespace(stages=stages)))
-    assert [n.kind for n in stages.doubts] == ["short-ranges"] * doubted
-    assert not doubted or str(stages.doubts[0]).startswith("78 of 458 ranges to A ")

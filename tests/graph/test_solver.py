@@ -7,13 +7,12 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph.descent_rules import as_much_again, extrapolated, relaxed
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights, linearize
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import ALL_WORK_DONE, SolverConfig, _step, optimize
+from uwblite.graph.solver import ALL_WORK_DONE, SolverConfig, _step, as_much_again, extrapolated, optimize, relaxed
 from uwblite.graph.unknowns import cheaper_move, moved, moved_along
 from uwblite.io.g2o import read_g2o
 

@@ -82,3 +82,11 @@ def test_the_stated_odometry_remains_that_of_the_wheels():
         localizer.add_gyro(stamp, float(np.unwrap(truth[: k + 1, 2])[-1]) if k else float(truth[0, 2]))
         state = localizer.add_odometry(stamp, *pose)
         np.testing.assert_array_equal(state.odometry, pose)
+
+
+@pytest.mark.parametrize("begin", [0.0, 2.0**20])
+def test_until_a_gyro_has_been_compared_for_15_s_the_wheels_turn(begin):
+    """At any time of day."""
+    stamps, truth, wheels = drive(seconds=30.0)
+    early = stamps - stamps[0] < 14.0
+    np.testing.assert_allclose(along(stamps + begin, truth, wheels, 2.0)[early], wheels[early], atol=1e-9)

@@ -18,7 +18,7 @@ from uwblite.pipeline import final_stages
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.final_stages import _sweeps
 from uwblite.pipeline.recordings import gather
-from uwblite.problem.parts import at_given_poses
+from uwblite.problem.solution import at_given_poses
 
 
 @pytest.fixture(scope="module")

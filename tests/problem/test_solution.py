@@ -4,12 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import every_kind, loop
 
-from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, range_indices, unknowns
+from uwblite.graph.calibration import (
+    LASER,
+    ODOMETRY,
+    OMNI,
+    TURNING,
+    CalibrationConfig,
+    block,
+    prior_edges,
+    range_indices,
+    unknowns,
+)
 from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import OdometryEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.problem.solution import comparable, rough, solve, with_nonnegative_heights
+from uwblite.problem.solution import comparable, rough, solve, stretch, with_nonnegative_heights
 
 IDS = ("1E05", "5C0B", "91A3")
 GIVEN = np.array([False, True, False])
@@ -76,3 +88,33 @@ def test_a_rough_search_and_a_comparable_one_are_no_finer_than_the_settings():
     assert rough(usual).max_iterations < usual.max_iterations
     assert usual.relative_decrease < comparable(usual).relative_decrease < rough(usual).relative_decrease
     assert rough(coarse) == comparable(coarse) == coarse
+
+
+def test_a_stretch_has_the_edges_within_it_and_their_residuals():
+    graph, kinds = every_kind(3)
+    graph = graph.with_edges(*kinds.values())
+    part = stretch(graph, 2, 5)
+    assert len(part.poses) == 3
+    assert part.fixed_poses.tolist() == [True, False, False]
+    whole = [e for e in graph.edges if isinstance(e, (OdometryEdges, ScanEdges))]
+    for edges in whole:
+        inside = np.flatnonzero((np.minimum(edges.i, edges.j) >= 2) & (np.maximum(edges.i, edges.j) < 5))
+        own = [e for e in part.edges if type(e) is type(edges)]
+        assert sum(map(len, own)) == len(inside)
+        if len(inside):
+            np.testing.assert_allclose(own[0].residuals(part), edges.residuals(graph)[inside])
+    assert part.calibration_priors == graph.calibration_priors
+
+
+def test_calibration_that_it_does_not_show_and_what_was_fixed_stay_fixed():
+    calibration = block(unknowns(CalibrationConfig(), ("A",), np.zeros(1, dtype=bool)))
+    kinds = [key.kind for key in calibration.keys]
+    graph = Graph(np.zeros((5, 3)), calibration=calibration, fixed_calibration=np.array([k == "laser_y" for k in kinds]))
+    part = stretch(graph, 1, 4)
+    free = {kind for kind, fixed in zip(kinds, part.fixed_calibration, strict=True) if not fixed}
+    assert free == {*LASER, *ODOMETRY, *OMNI, TURNING} - {"laser_y"}
+
+
+def test_a_graph_without_wheels_and_lidar_has_empty_parts():
+    part = stretch(loop()[0], 0, 9)
+    assert (part.edges, len(part.anchors), len(part.poses)) == ((), 0, 9)

@@ -60,6 +60,13 @@ def test_single_points_are_no_surface_and_nothing_seen_blocks_nothing():
     assert blocked(tags[:0], anchors[:0], np.zeros((3, 2))).shape == (0,)
 
 
+@pytest.mark.parametrize(("count", "wall"), [(2, False), (3, True)])
+def test_three_points_in_a_cell_are_a_surface(count, wall):
+    """The points of a cell 0.2 m wide in the middle of the way; the map ends elsewhere."""
+    points = np.concatenate([np.full((count, 2), 0.05), [[-5.0, -5.0]]])
+    assert blocked(np.array([[0.05, -4.0]]), np.array([[0.05, 4.0]]), points).tolist() == [wall]
+
+
 def test_a_tag_at_the_anchor_is_not_blocked():
     here = np.array([[1.0, 1.0]])
     assert not blocked(here, here, seen([0.0, 0.0], [2.0, 2.0])).any()

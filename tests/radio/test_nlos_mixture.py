@@ -1,5 +1,7 @@
 """Errors of ranges: core, detours and nonsense separated; late errors pull less than early ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -51,6 +53,16 @@ def test_the_density_is_that_of_its_three_parts(mixture):
     errors = mixture.centre + mixture.sigma * np.array([-200.0, -5.0, -1.0, 0.0, 2.0, 9.0, 400.0])
     np.testing.assert_allclose(mixture.density(errors), density(mixture, errors), rtol=1e-6, atol=1e-290)
     assert mixture.density(errors[:1])[0] == pytest.approx(mixture.wild / mixture.width, abs=1e-290)
+
+
+@given(shapes)
+def test_no_error_is_impossible(mixture):
+    """However far from the core: of any number of ranges, one may be a gross error."""
+    far = mixture.centre + mixture.sigma * np.array([-1000.0, -60.0])
+    least = np.log(max(mixture.wild, 1e-3) / mixture.width)
+    np.testing.assert_allclose(mixture.log_density(far), least, atol=1e-6)
+    errors, floored = mixture.centre + mixture.sigma * np.linspace(-4.0, 9.0, 9), replace(mixture, wild=max(mixture.wild, 1e-3))
+    np.testing.assert_allclose(mixture.log_density(errors), np.log(density(floored, errors)), atol=1e-6)
 
 
 @given(st.floats(0.02, 0.5), st.floats(0.1, 5.0), st.floats(-6.0, 30.0))

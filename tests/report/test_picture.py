@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
+from uwblite.report import picture
 from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATH, PATHS, PROPOSED, START, WIDTH, Canvas, text_mask
 from uwblite.report.error_map import draw_errors
 from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
@@ -259,3 +260,11 @@ def test_the_picture_of_errors_says_what_it_shows():
     changed = np.flatnonzero(np.any(one != other, axis=(1, 2)))
     assert len(changed)
     assert changed.max() < 40
+
+
+@pytest.mark.parametrize(
+    ("at", "corner"), [((50.0, 50.0), (64.0, 41.0)), ((170.0, 50.0), (96.0, 41.0)), ((100.0, 3.0), (70.0, 15.0))]
+)
+def test_a_name_stands_right_of_its_mark_where_it_is_inside_the_picture(at, corner):
+    """Else to the left, or below; on a bright picture 200 pixels wide, the name 60 pixels wide and 14 high."""
+    assert picture._room_for(np.full((120, 200, 3), 255, dtype=np.uint8), *at, 60, 14) == corner

@@ -15,7 +15,7 @@ LIDAR = (
     "odometry-alone", "worse-than-parts", "path-displaced", "clock-offset",
 )  # fmt: skip
 RADIO = (
-    "range-scatter", "ranges-disagree", "short-ranges", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
+    "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
     "anchor-mirror-ambiguous", "moved-anchor", "shared-name", "repeated-ranges", "marked-ranges", "sustained-outliers",
     "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales",
 )  # fmt: skip

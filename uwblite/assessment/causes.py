@@ -21,7 +21,7 @@ _TIMES = _of("silences equal-stamps laser-delay slow-odometry odometry-gap clock
 """What stamps that are no times look like."""
 _PLACES = _of(
     "anchor-distrusted anchor-mirror-ambiguous anchor-unplaced no-anchor moved-anchor anchors-moved-together",
-    "sustained-outliers ranges-disagree short-ranges",
+    "sustained-outliers ranges-disagree",
 )
 """What anchors seem to do along a path that is wrong, or by ranges that are no distances."""
 _BY_RANGES = _of(
@@ -65,8 +65,8 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "range-scatter": _BY_RANGES - _of("range-scatter path-displaced"),
         "drift": _of(_PLACES, "odometry-slips odometry-unit unusual-calibration"),
         "odometry-slips": _of(_PLACES, "unusual-calibration odometry-unit"),
-        "anchors-moved-together": _of("moved-anchor anchor-distrusted ranges-disagree short-ranges sustained-outliers"),
-        "anchor-distrusted": _of("sustained-outliers short-ranges spikes"),
+        "anchors-moved-together": _of("moved-anchor anchor-distrusted ranges-disagree sustained-outliers"),
+        "anchor-distrusted": _of("sustained-outliers spikes"),
         "straight-path": _of("anchor-mirror-ambiguous"),
         "few-ranges": _of("anchor-unplaced"),
     }

@@ -21,7 +21,7 @@ from .causes import explained
 from .certainty import check_certainty, check_other_side
 from .decisions import RULES
 from .drift_tests import check_drifts, check_turn_scales
-from .range_agreement import check_short_ranges, check_sustained_outliers, check_unit, check_wheels_against_lidar
+from .range_agreement import check_sustained_outliers, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
 from .untied_parts import check_untied_parts, check_untied_recordings
@@ -68,8 +68,6 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: check_calibration(view.calibrated, view.usual, view.task),
     lambda view: check_sustained_outliers(view.table, view.estimate.anchor_ids, view.task) if view.table else (),
     lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
-    lambda view: check_unit(view.anchors, view.task),
-    lambda view: check_short_ranges(view.anchors, view.estimate, view.sigma, view.task),
     lambda view: check_drifts(view.estimate, view.task),
     lambda view: check_untied_parts(view.estimate, view.task),
     lambda view: check_untied_recordings(view.estimate, view.task),

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
-from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, of_severity, warning
+from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
-from ..pipeline.estimate import Estimate, Task
+from ..pipeline.estimate import Task
 from ..sensor_log.anchor_names import first_place, name_and_number
-from .certainty import allowed_error
 from .repairs import check_recordings
 
 
@@ -61,22 +60,6 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
             yield doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
 
 
-def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
-    """Doubt another unit of the wheels where only ranges support it, and these contradict each other."""
-    said = kinds(of_severity(task.stages.findings, WARNING))
-    if task.recordings.have_scans or "odometry-unit" not in said:
-        return
-    statuses = [anchor.status for anchor in anchors]
-    few = "distrusted" in statuses and sum(status not in ("distrusted", "unplaced") for status in statuses) <= _ENOUGH
-    if few or "sustained-outliers" in said or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
-        text = (
-            "the odometry was rescaled by the ranges alone, and "
-            + ("an anchor is distrusted: too few are left to check it" if few else "an anchor was moved or disagrees for long")
-            + "; give the anchors' places, or the distance between two of them"
-        )
-        yield doubt("odometry-unit", text)
-
-
 def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
     """Doubt a map whose wheels and lidar contradict each other; a warning where the ranges decide for the lidar.
 
@@ -113,34 +96,3 @@ half a metre off is not so near to three distances."""
 _MOST_NEAR, _MANY_NEAR = 0.85, 0.6
 """Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
 0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
-
-
-def check_short_ranges(anchors: Sequence[AnchorEstimate], estimate: Estimate, sigma: float, task: Task) -> Iterator[Finding]:
-    """Doubt a map that rests on ranges of which many to one anchor are shorter than the distance.
-
-    Obstacles and radios make ranges longer. Where the lidar determines the trajectory, or other anchors do so well, the anchor
-    stood elsewhere for a time; where ranges determine it poorly, a wrong trajectory may have pulled its place along.
-
-    Parameters
-    ----------
-    sigma : m, expected error of the places, see check_certainty.
-    """
-    short = [a for a in anchors if many_short(a.short, a.ranges)]
-    if not short or not estimate.rests_on_ranges or sigma < 0.5 * allowed_error(estimate):
-        return
-    names, count, measured = ", ".join(a.id for a in short), sum(a.short for a in short), sum(a.ranges for a in short)
-    text = (
-        f"{count} of {measured} ranges to {names} are shorter than the distance on the map, which no obstacle makes them: the "
-        "anchor stood elsewhere for a time, or the trajectory is wrong, and no lidar tells which; give the anchors' places or "
-        "heights"
-    )
-    yield doubt("short-ranges", text, short=count, ranges=measured)
-
-
-def many_short(short: int, count: int) -> bool:
-    """Return whether so many of an anchor's ranges are too short that they are no gross errors."""
-    return short > max(_FEW_SHORT, _SHARE_SHORT * count)
-
-
-_FEW_SHORT, _SHARE_SHORT = 3, 0.05
-"""Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""

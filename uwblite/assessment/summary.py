@@ -20,13 +20,14 @@ from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
 from ..sensor_log.anchor_names import name_and_number
 from . import plausibility
-from .range_agreement import many_short
 from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor")
 """Doubts that do not concern all anchors."""
 _SHORT = 0.5
 """m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
+_FEW_SHORT, _SHARE_SHORT = 3, 0.05
+"""Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _IMPLAUSIBLE_BIAS = 1.6
@@ -198,7 +199,7 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
 
 def _reason_of_short_ranges(short: int, count: int) -> str:
     """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
-    if not many_short(short, count):
+    if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
         return ""
     return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"
 

@@ -24,9 +24,9 @@ from scipy.sparse.linalg import splu
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .components import floating_components
 from .elimination import PER_COMPLEX, work_of
 from .graph import Graph
+from .problem_checks import floating_components
 from .solver import SolverConfig, optimize
 from .tangent_forms import TangentForm, outside
 from .unknowns import free_unknowns

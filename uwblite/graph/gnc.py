@@ -21,10 +21,9 @@ from ..arrays import Floats
 from .graph import Graph, Linearization, PriorEdges, linearize
 from .loop_edges import closing
 from .normal_equations import NormalEquations
-from .optimizer import Optimizer
 from .problem_checks import check
 from .robust import SQUARED, Kernel
-from .solver import Progress, SolverConfig, SolverSummary, minimise
+from .solver import Optimizer, Progress, SolverConfig, SolverSummary, minimise
 
 _MU_FACTOR = 2.0
 """Factor on mu from step to step; one linear system is solved for each."""

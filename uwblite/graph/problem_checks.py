@@ -1,10 +1,13 @@
-"""Checks of a least-squares problem: free unknowns, measurements, finite values; and its degrees of freedom."""
+"""What makes a problem solvable: finite starts, measurements, and a fixed unknown in each component, lest it move."""
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats, Ints, connected
 from ..errors import SolverError
-from .graph import Edges, EdgeTable, Graph, Linearization
+from .distance_edges import PointDistanceEdges
+from .graph import Edges, EdgeTable, Graph, Linearization, PriorEdges
+from .point_edges import LandmarkEdges
+from .range_edges import RangeEdges
 from .unknowns import free_unknowns
 
 
@@ -60,3 +63,47 @@ def _determinants(matrices: Floats) -> Floats:
     if matrices.shape[1] != 3:
         return np.asarray(np.linalg.det(matrices))
     return np.einsum("ei,ei->e", matrices[:, 0], np.cross(matrices[:, 1], matrices[:, 2]))
+
+
+def floating_components(graph: Graph) -> Ints:
+    """Return for each pose (n,) the first pose of its part, -1 where a fixed unknown or a prior fixes the part."""
+    n, nodes = len(graph.poses), len(graph.poses) + len(graph.anchors)
+    first = {"poses": 0, "anchors": n}
+    links, tied = [np.zeros((2, 0), dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
+    for edges in graph.edges:
+        ends = [first[name] + index for name, index, _ in edges.linearize(graph).blocks if name in first]
+        links += [np.stack([ends[0], end]) for end in ends[1:]]
+        tied += ends if isinstance(edges, PriorEdges) else []
+    free = free_unknowns(graph)
+    tied += [first[name] + np.flatnonzero(~free[name]) for name in first]
+    one, other = np.concatenate(links, axis=1)
+    label = connected(one, other, nodes)
+    begins = np.unique(label[:n], return_index=True)
+    start = np.full(nodes, -1)
+    start[begins[0]] = begins[1]
+    start[label[np.concatenate(tied)]] = -1
+    return np.asarray(start[label[:n]])
+
+
+def given_anchors(graph: Graph) -> Bools:
+    """Return which anchors (a,) are given: fixed, or with a prior."""
+    given = ~free_unknowns(graph)["anchors"]
+    for e in graph.edges:
+        if isinstance(e, PriorEdges) and e.block == "anchors":
+            given[e.index] = True
+    return given
+
+
+def tied_chains(graph: Graph, chains: Ints) -> Bools:
+    """Return for each pose (n,) whether ranges or landmarks connect its chain with chain 0 or with given landmarks."""
+    count = int(chains.max(initial=0)) + 1
+    given = np.flatnonzero(given_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.intp)
+    ends = [(np.zeros(len(given), dtype=np.intp), count + given)]
+    for e in graph.edges:
+        if isinstance(e, PointDistanceEdges):
+            ends.append((chains[e.i], chains[e.j]))
+        elif isinstance(e, RangeEdges | LandmarkEdges):
+            ends.append((chains[e.pose], count + e.anchor))
+    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
+    label = connected(one, other, count + len(graph.anchors))
+    return np.asarray(label[chains] == label[0], dtype=np.bool_)

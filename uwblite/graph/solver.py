@@ -48,7 +48,6 @@ from ..config import documented, setting
 from ..errors import ConfigError, SolverError
 from ..work import ENTRIES
 from .anchor_subproblem import with_anchors_solved
-from .descent_rules import as_much_again, extrapolated, relaxed
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
 from .normal_equations import NormalEquations
@@ -295,3 +294,40 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     except SolverError:
         return None, np.zeros(len(damping)), -1.0
     return factor, step, float(step @ (damping * step - normal.gradient))
+
+
+_KEPT = 0.5
+"""Share of the predicted decrease below which the cost along a step is not quadratic, so that it predicts no later steps."""
+
+
+def extrapolated(decrease: float, last: float, promised: float) -> float:
+    """Return the sum of the geometric series that the last two decreases begin, where the steps reach their predicted
+    decrease."""
+    if not np.isfinite(last) or decrease < _KEPT * promised:
+        return max(decrease, promised)
+    return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
+
+
+def relaxed(ratio: float) -> float:
+    """Return the factor of lambda after a step that decreased the cost by this ratio of the predicted decrease."""
+    return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+
+
+def as_much_again(decrease: float, last: float, promised: float) -> float:
+    """Return the remaining decrease if every step halves it, as a robust kernel's reweighting does at best."""
+    return max(decrease, promised)
+
+
+class Optimizer:
+    """Optimises graphs; of graphs that follow each other with the same unknowns and edges the pattern is analysed once."""
+
+    def __init__(self) -> None:
+        self._normal: NormalEquations | None = None
+
+    def optimize(self, graph: Graph, config: SolverConfig) -> tuple[Graph, SolverSummary]:
+        """Return the graph at the nearest minimum of its cost, and how the search went; see solver.optimize."""
+        check(graph)
+        linearized = linearize(graph)
+        if self._normal is None or not self._normal.suits(graph, linearized):
+            self._normal = NormalEquations(graph, linearized)
+        return minimise(graph, linearized, self._normal, config)

@@ -12,11 +12,11 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..graph.components import floating_components, given_anchors, tied_chains
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges, seen_anchors
 from ..graph.pose_edges import RelativePoseEdges
+from ..graph.problem_checks import floating_components, given_anchors, tied_chains
 from ..graph.range_edges import RangeEdges
 from ..graph.unknowns import free_unknowns
 from .plain_edges import ENDS, WIDTHS, Measured, root

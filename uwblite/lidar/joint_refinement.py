@@ -17,10 +17,9 @@ from ..arrays import WIDE, Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
-from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, SolverSummary
+from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .overlap import surface_cells

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..graph.calibration import HEIGHT, RADIO, CalibrationConfig, with_free
 from ..graph.graph import Graph
-from ..graph.optimizer import Optimizer
+from ..graph.solver import Optimizer
 from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, compared
 from ..problem.evidence import laplace_marginal_likelihood, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve

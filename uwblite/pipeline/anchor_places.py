@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..findings import Fact
-from ..graph.optimizer import Optimizer
+from ..graph.solver import Optimizer
 from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain

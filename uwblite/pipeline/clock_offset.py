@@ -7,10 +7,8 @@ from ..errors import SolverError
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
 from ..problem.alternatives import EvidencePolicy
-from ..problem.constancy import log_odds_of_constant, without_prior
-from ..problem.evidence import prior_sigma
-from ..problem.parts import stretch
-from ..problem.solution import rough
+from ..problem.evidence import log_odds_of_constant, prior_sigma, without_prior
+from ..problem.solution import rough, stretch
 from .estimate import Estimate, Task
 
 TOLERANCE = 0.004

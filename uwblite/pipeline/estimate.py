@@ -9,10 +9,9 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, rms_length
 from ..constraints import Constraints
 from ..graph.graph import Edges, Graph
-from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
-from ..graph.solver import SolverConfig, SolverSummary
+from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
 from ..lidar.surface_rays import MeasuredSurfaces

@@ -20,7 +20,7 @@ from ..lidar.joint_refinement import with_fewer_pairs
 from ..odometry.attached import choose_scans
 from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
-from ..problem.parts import at_given_poses
+from ..problem.solution import at_given_poses
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.prior_selection import with_alike_heights
 from ..radio.range_noise import RangeNoiseConfig

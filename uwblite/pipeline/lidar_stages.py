@@ -13,9 +13,8 @@ from ..arrays import Bools, Ints
 from ..graph.calibration import LASER, RADIO, TURNING, with_free
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
-from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
-from ..graph.solver import optimize
+from ..graph.solver import Optimizer, optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import ScanOdometry, Steps

@@ -13,9 +13,8 @@ from ..arrays import Bools, Floats, spread
 from ..graph import calibration
 from ..graph.calibration import BIAS, ODOMETRY, OMNI, RADIO, RANGE_SCALE, with_free
 from ..graph.graph import Graph, edge_cost
-from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
-from ..graph.solver import SolverSummary
+from ..graph.solver import Optimizer, SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import slipped, with_slips

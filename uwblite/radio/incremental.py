@@ -21,9 +21,8 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..graph.components import given_anchors
 from ..graph.graph import Edges, Graph
-from ..graph.problem_checks import check
+from ..graph.problem_checks import check, given_anchors
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, optimize

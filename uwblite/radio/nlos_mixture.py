@@ -11,7 +11,7 @@ weights that then make least squares the maximum-likelihood estimate of the plac
 with psi = -f' / f: positive errors get less weight than negative ones of the same size.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import erfcx, ndtr
@@ -61,10 +61,8 @@ class RangeMixture:
         return (1.0 - self.tail - self.wild) * normal / self.density(errors)
 
     def log_density(self, errors: Floats) -> Floats:
-        """Return the logarithm of the probability density (m,) of each error, 1/m."""
-        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
-        wild = max(self.wild, _LEAST_WILD)
-        return np.asarray(np.log((1.0 - self.tail - self.wild) * normal + self.tail * late + wild / self.width))
+        """Return the logarithm of the probability density (m,) of each error, 1/m; some share of gross errors is certain."""
+        return np.log(replace(self, wild=max(self.wild, _LEAST_WILD)).density(errors))
 
     def mode(self) -> float:
         """Return the likeliest error, m."""

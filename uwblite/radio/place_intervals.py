@@ -99,9 +99,7 @@ class _Search:
                 better += self._better(best, place, found, self.model.worth(best.place))
         return max(better, key=_evidence, default=None)
 
-    def _better(
-        self, best: Explanation, place: Ints, found: Sequence[AnchorHypothesis], shares: Floats
-    ) -> list[Explanation]:
+    def _better(self, best: Explanation, place: Ints, found: Sequence[AnchorHypothesis], shares: Floats) -> list[Explanation]:
         """Return an explanation by other times where it is better than the best one."""
         if np.array_equal(place, best.place):
             return []

@@ -16,8 +16,12 @@ from .trilateration import TrilaterationConfig, agreement, trilaterate_each, usa
 
 
 def range_edges(
-    attached: AttachedRanges, anchor_ids: tuple[str, ...], mounting: SensorMounting,
-    calibration: Calibration, noise: RangeNoiseConfig, search: TrilaterationConfig,
+    attached: AttachedRanges,
+    anchor_ids: tuple[str, ...],
+    mounting: SensorMounting,
+    calibration: Calibration,
+    noise: RangeNoiseConfig,
+    search: TrilaterationConfig,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 

@@ -225,6 +225,8 @@ def _mark(values: Floats | NDArray[np.float32]) -> float | None:
 _MARKS, _MARK_SHARE, _TIMES_OTHERS = 20, 0.03, 8.0
 """Readings (of a lidar: scans with readings) of one value at different places, their share of all, and how much more frequent
 than others it must be. No value of seven recorded lidars, in steps of 1 mm to 1 cm, is more than 0.7 % of their readings."""
+
+
 def _in_runs(flags: Bools, least: int) -> Bools:
     """Return which set flags stand in runs of at least so many."""
     long = np.zeros(len(flags), dtype=bool)

@@ -6,8 +6,8 @@ import numpy as np
 from helpers.planted_graphs import loop
 
 from uwblite.graph.certificate import certify
-from uwblite.graph.components import floating_components
 from uwblite.graph.graph import Graph, PriorEdges
+from uwblite.graph.problem_checks import floating_components
 from uwblite.graph.solver import optimize
 
 
