@@ -1,6 +1,7 @@
 """tools/quickstart: what it asks a new user to paste works, from any folder and with a bare environment."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -64,3 +65,12 @@ def test_every_document_that_sets_it_up_reports_how_to_go_on():
 def test_installing_it_puts_the_folder_on_the_path():
     """An import hook loses to the clone's own folder, which is a namespace package to whoever works beside it."""
     assert "--config-settings editable_mode=compat --editable" in (ROOT / "tools" / "quickstart").read_text()
+
+
+def test_the_tests_that_continuous_integration_names_exist():
+    text = (ROOT / ".ci" / "run").read_text()
+    names = set(re.findall(r"\b(test_[a-z0-9_]+\.py|[a-z]+/test_[a-z0-9_]+\.py)", text))
+    for start, stems in re.findall(r"((?:[a-z]+/)*test_)\{([a-z0-9_,]+)\}\.py", text):
+        names |= {f"{start.removeprefix('tests/')}{stem}.py" for stem in stems.split(",")}
+    assert len(names) >= 15
+    assert [name for name in sorted(names) if not (ROOT / "tests" / name).is_file()] == []

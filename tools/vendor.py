@@ -3,7 +3,8 @@
 
 examples:
   python tools/vendor.py acme/_uwblite --for map           recordings to maps: from ._uwblite.mapping import build_map
-  python tools/vendor.py acme/_solver --for solve          pose graphs with ranges, and their covariances
+  python tools/vendor.py acme/_solver --for solve          pose graphs with ranges
+  python tools/vendor.py acme/_solver --for covariances    the same and how certain the solution is
   python tools/vendor.py acme/_uwblite --for localize      where a robot is in a map, afterwards or live
   python tools/vendor.py acme/_drivers --for drivers       bytes of devices to measurements; neither numpy nor ports
   python tools/vendor.py acme/_drivers --for record        the same with ports and a log; needs pyserial
@@ -21,15 +22,15 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "uwblite"
 
+_SOLVER = ("graph.solver", "graph.pose_edges", "graph.range_edges", "graph.point_edges", "graph.distance_edges")
 PARTS = {
     "map": ("mapping", "io.carmen", "io.results", "io.settings_toml"),
-    "solve": (
-        "graph.solver", "graph.marginals", "graph.pose_edges", "graph.range_edges", "graph.point_edges", "graph.distance_edges",
-    ),
+    "solve": _SOLVER,
+    "covariances": (*_SOLVER, "graph.marginals"),
     "localize": ("localization", "localization.localize", "io.stored_result", "io.carmen"),
     "drivers": ("drivers.devices",),
     "record": ("drivers.devices", "drivers.recorder", "drivers.log_file", "drivers.link", "drivers.transport"),
-}  # fmt: skip
+}
 """The modules that a program imports for each purpose."""
 
 
@@ -112,7 +113,7 @@ def main() -> int:
         for part, modules in PARTS.items():
             files = files_for(modules)
             kilobytes = sum(f.stat().st_size for f in files) / 1e3
-            print(f"{part:<9} {len(files):4} modules, {kilobytes:6.0f} kB: {', '.join(modules)}")
+            print(f"{part:<11} {len(files):4} modules, {kilobytes:6.0f} kB: {', '.join(modules)}")
         return 0
     if args.target is None or args.part is None:
         parser.error("name a folder, and with --for what the copy is needed for")

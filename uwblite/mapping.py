@@ -29,6 +29,7 @@ from .pipeline import (
     lidar_stages,
     map_frame,
     mirror_images,
+    neighbour_matching,
     odometry_units,
     radio_stages,
     scan_selection,
@@ -118,7 +119,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     if given != Constraints():
         yield constraint_edges.apply_given
     if task.recordings.have_scans:
-        yield lidar_stages.match_scan_to_scan if config.scan_to_scan.on else lidar_stages.make_clouds
+        yield neighbour_matching.match_scan_to_scan if config.scan_to_scan.on else neighbour_matching.make_clouds
         if config.scan_to_scan.on:
             yield radio_stages.reestimate_ranges
             yield turn_checks.with_slip_in_turns

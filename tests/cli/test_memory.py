@@ -1,5 +1,6 @@
 """Memory: limits that are read, what is said beforehand, and one line where there is too little."""
 
+import os
 import subprocess
 import sys
 
@@ -189,3 +190,22 @@ def test_a_control_group_ends_a_map_by_an_error_before_the_system_kills_it(room_
     assert done.stderr.startswith("uwblite: error: out of memory; ")
     assert done.stderr.endswith("this control group allows 80 MB\n")
     assert done.stderr.count("\n") == 1
+
+
+LOADED = """
+import resource, sys
+import scipy.linalg
+from uwblite.cli import memory
+mapped = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (mapped + int(sys.argv[1]), resource.RLIM_INFINITY))
+memory._load_libraries()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the address space is limited and counted by Linux")
+@pytest.mark.parametrize(("left", "fits"), [(200_000_000, True), (60_000_000, False)])
+def test_libraries_that_are_loaded_need_room_for_their_buffers_alone(left, fits):
+    words = [sys.executable, "-c", LOADED, str(left)]
+    done = subprocess.run(words, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == fits, done.stderr
+    assert ("NoRoom" in done.stderr) != fits

@@ -278,6 +278,16 @@ def test_tag_with_rounds_missing(dropouts):
     assert not of_kind(actions, Lost)
 
 
+@pytest.mark.parametrize("seconds", [0.3, 0.6, 6.0])
+def test_tag_fixes_that_came_while_the_link_was_held_are_counted(seconds):
+    device, sent = tag(seed=3)
+    jitter = random.Random(3)
+    actions, _ = simulate(Dwm1001Driver(), device, 24.0, jitter=lambda: jitter.expovariate(1000.0), pause=(15.0, seconds))
+    stamps = [epoch.stamp for epoch in of_kind(actions, RangeEpoch)]
+    made = sum(stamps[0] - 0.01 <= time <= stamps[-1] + 0.01 for time, _ in sent)
+    assert abs(made - len(stamps) - sum(lost.count for lost in of_kind(actions, Lost))) <= 1
+
+
 def test_tag_half_a_request_of_a_dead_host_is_closed_by_the_gap():
     device, sent = tag()
     power_up = device.power_up

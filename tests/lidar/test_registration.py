@@ -7,7 +7,8 @@ from helpers.laser_walks import ROOM, scanned
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, matched_by_chance, objects, of_fallible
+from uwblite.lidar.object_likelihood import ObjectPolicy, matched_by_chance, objects
+from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, of_fallible
 from uwblite.lidar.scan_matching import PairPoints, pair_points
 from uwblite.lidar.visibility import nearest_by_bearing
 
@@ -72,7 +73,7 @@ def test_the_evidence_is_that_of_numerical_integration(room):
     shifts = grid @ np.linalg.cholesky(found.sound.covariance[0]).T
     many = np.zeros(len(grid), dtype=np.int64)
     rows = PairPoints(np.repeat(points.row, len(grid), axis=0))
-    _, judged = registration._match(many, rows, mode + shifts, RegistrationConfig.gate, np.zeros((len(grid), 3, 3)))
+    _, judged = registration.objects.match(many, rows, mode + shifts, ObjectPolicy.gate, np.zeros((len(grid), 3, 3)))
     off = mode + shifts - prior.mean
     information = np.linalg.inv(prior.covariance[0])
     log = np.concatenate([part.likelihood for part in judged]) - 0.5 * np.einsum("gi,ij,gj->g", off, information, off)
@@ -94,7 +95,7 @@ def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
     assert found.log_odds[0] < 0.0
     assert np.abs(se2.between(truth[1], found.sound.pose[0])).max() < 0.01
     one = np.array([0])
-    moving = registration.moving(one, one + 1, points, found.sound.pose, found.sound.covariance)
+    moving = registration.objects.moving(one, one + 1, points, found.sound.pose, found.sound.covariance)
     x = clouds.points[:, 0] + truth[clouds.owner, 0]
     on_thing = (clouds.owner == 1) & (np.abs(x - 1.26) < 0.05) & (np.abs(clouds.points[:, 1]) < 0.85)
     assert moving[on_thing].mean() > 0.9

@@ -378,6 +378,20 @@ def test_where_nothing_measures_how_a_robot_moves_it_is_lost_or_where_it_was_a_s
         assert state.lost or ((np.hypot(off[:, 0], off[:, 1]) < 0.15) & (off[:, 2] < 0.25)).any()
 
 
+def test_a_robot_whose_wheels_are_frozen_is_followed_by_its_scans():
+    """By its wheels it stands; a scan that fits 400 times as well a little further on says that it does not."""
+    poses = path(ROUND)
+    drive = robot(known())
+    before = drive.along(poses[:10])[-1]
+    for k, pose in enumerate(poses[10:30]):
+        stamp = before.stamp + 0.2 * (k + 1)
+        drive.localizer.add_scan(stamp, cast(pose), SCANNER)
+        state = drive.localizer.add_odometry(stamp, *before.odometry)
+        state = drive.localizer.add_odometry(stamp + 0.1, *before.odometry)
+        assert not state.lost
+        assert np.hypot(*(state.pose - pose)[:2]) < 0.25
+
+
 def test_a_map_of_large_cells_serves():
     """0.2 m: walls lie anywhere within half a cell, which the covariance holds."""
     coarse = grid_of(ODD, cell=0.2)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization import hypotheses
-from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, doubt, map_odds, nowhere
+from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, map_odds, needed, nowhere, undecided, vague
 
 MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4), RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
 ENDS, RAYS = 3.0 * FEW_ENDS, 30.0
@@ -15,17 +15,23 @@ def a_bank(rival=-20.0):
     return hypotheses.reweighted(bank, np.array([0.0, rival]))
 
 
+def is_certain(odds, fitting, bank=None, proven=False):
+    certain = needed(fitting, proven)
+    bank = a_bank() if bank is None else bank
+    return not undecided(bank, 0, True, certain) and not nowhere(odds, fitting) and odds.total >= certain
+
+
 def test_scans_and_ranges_that_fit_are_certain_at_once():
     odds = map_odds(-0.1, ENDS, RAYS, -2.0, MANY, 0.0)
     assert odds.total > CERTAIN
-    assert doubt(a_bank(), 0, True, odds, MANY) == ""
+    assert is_certain(odds, MANY)
 
 
 @pytest.mark.parametrize(("ends", "fitting"), [(0.0, MANY), (ENDS, ONE_ANCHOR)])
 def test_what_one_kind_alone_says_needs_two_metres_of_the_same_place(ends, fitting):
     for agreed, certain in ((0.0, False), (1.9, False), (2.1, True)):
         odds = map_odds(-0.1, ends, RAYS, -0.2, fitting, agreed)
-        assert (doubt(a_bank(), 0, True, odds, fitting) == "") is certain
+        assert is_certain(odds, fitting) is certain
 
 
 def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agree_for_long():
@@ -35,7 +41,7 @@ def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agr
         assert "ranges" in nowhere(map_odds(-0.3, ENDS, RAYS, -20.0, few, agreed), few)
     odds = map_odds(-0.45, ENDS, RAYS, -6.0, few, 3.0)
     assert nowhere(odds, few) == ""
-    assert doubt(a_bank(), 0, True, odds, few) == ""
+    assert is_certain(odds, few)
 
 
 def test_neither_scans_nor_agreement_outweigh_ranges_that_contradict():
@@ -56,4 +62,18 @@ def test_scans_alone_must_fit_better_than_beside_ranges():
 def test_a_rival_a_hundred_times_less_likely_is_none_in_a_map_in_which_the_robot_was_tracked():
     for fitting, proven, certain in ((MANY, True, True), (MANY, False, False), (ONE_ANCHOR, True, False)):
         odds = map_odds(-0.1, ENDS, RAYS, -0.5, fitting, 3.0)
-        assert (doubt(a_bank(-5.0), 0, True, odds, fitting, proven) == "") is certain
+        assert is_certain(odds, fitting, a_bank(-5.0), proven) is certain
+
+
+def test_a_search_that_left_places_out_and_a_pose_that_is_not_sure_decide_nothing():
+    assert "too many" in undecided(a_bank(), 0, False, CERTAIN)
+    wide = hypotheses.started(np.zeros((1, 3)), np.diag([0.1, 0.001, 0.001])[None], np.zeros(0))
+    assert "not sure" in undecided(wide, 0, True, CERTAIN)
+
+
+def test_a_pose_is_known_while_its_longest_axis_is_short_in_any_frame():
+    for turn in np.linspace(0.0, np.pi, 7):
+        c, t = np.cos(turn), np.sin(turn)
+        axes = np.array([[c, -t, 0.0], [t, c, 0.0], [0.0, 0.0, 1.0]])
+        assert vague(axes @ np.diag([0.39**2, 0.01, 0.2**2]) @ axes.T) == ""
+        assert "0.5 m" in vague(axes @ np.diag([0.48**2, 0.01, 0.2**2]) @ axes.T)

@@ -32,9 +32,9 @@ def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
         assert 0.0 <= notice.figures["first"] < notice.figures["second"] < len(truth)  # since the beginning, s
 
 
-@pytest.mark.parametrize(("far", "tried"), [(1.0, False), (6.0, True)])
-def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_were(monkeypatch, far, tried):
-    """Of a way back known to 6 m; no match holds, so all pairs are tried once and nothing moves."""
+@pytest.mark.parametrize(("far", "direct", "tried"), [(1.0, 20.0, False), (1.0, 0.5, True), (6.0, 0.5, True)])
+def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_were(monkeypatch, far, direct, tried):
+    """Wherever a search is needed; no match holds, so all pairs are tried once and nothing moves."""
     truth, graph, path, clouds = returned(CORRIDOR, far, [1.0, 0.0, 0.0])
     recording, asked = np.zeros(len(truth), dtype=np.intp), []
 
@@ -42,6 +42,7 @@ def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_w
         asked.append(pairs.names(LoopClosureConfig()))
         return no_closures()
 
+    monkeypatch.setattr(LoopClosureConfig, "direct", direct)
     monkeypatch.setattr(closure_rounds.verification, "find", find)
     stages = Stages(None, None)
     recordings = SimpleNamespace(stamps=np.arange(len(truth)), of_keyframe=recording, path=path)

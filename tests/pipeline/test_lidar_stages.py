@@ -11,7 +11,7 @@ from helpers.told import doubted
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
-from uwblite.pipeline import lidar_stages
+from uwblite.pipeline import lidar_stages, neighbour_matching
 from uwblite.pipeline.estimate import Estimate, ScanClouds
 from uwblite.pipeline.lidar_stages import check_map_consistency
 from uwblite.pipeline.mapping_config import MappingConfig
@@ -21,11 +21,11 @@ from uwblite.pipeline.progress import Stages
 def test_clouds_are_made_and_their_points_counted(monkeypatch):
     """The laser's mounting and clock are free from then on."""
     scans = ScanClouds(SimpleNamespace(points=np.zeros((7, 2))), None, 0.0)
-    monkeypatch.setattr(lidar_stages.scan_clouds, "make", lambda *_: scans)
+    monkeypatch.setattr(neighbour_matching.scan_clouds, "make", lambda *_: scans)
     calibration = Calibration((UnknownKey("laser_x"), UnknownKey("odometry_scale")), np.zeros(2))
     graph = replace(loop()[0], calibration=calibration, fixed_calibration=np.ones(2, dtype=bool))
     stages = Stages(None, None)
-    made = lidar_stages.make_clouds(
+    made = neighbour_matching.make_clouds(
         Estimate(graph, graph.edges[0], None, ()), SimpleNamespace(recordings=None, config=None, stages=stages)
     )
     assert [(s.name, s.figures) for s in stages.done] == [("clouds", {"points": 7})]
@@ -50,12 +50,12 @@ def test_a_map_whose_visits_do_not_show_the_same_place_is_doubted(torn):
 @pytest.mark.parametrize("placed", ["elsewhere", "given"])
 def test_wheels_may_turn_about_another_point_where_the_place_of_the_laser_is_given(monkeypatch, placed):
     """Both explain the same residuals."""
-    monkeypatch.setattr(lidar_stages.scan_clouds, "make", lambda *_: ScanClouds(SimpleNamespace(points=()), None, 0.0))
+    monkeypatch.setattr(neighbour_matching.scan_clouds, "make", lambda *_: ScanClouds(SimpleNamespace(points=()), None, 0.0))
     keys = ("sideways_per_turn", *(("laser_x",) if placed == "elsewhere" else ()))
     graph = replace(loop()[0], calibration=Calibration(tuple(map(UnknownKey, keys)), np.zeros(len(keys))))
     graph = replace(graph, fixed_calibration=np.ones(len(keys), dtype=bool))
     task = SimpleNamespace(recordings=None, config=None, stages=Stages(None, None))
-    made = lidar_stages.make_clouds(Estimate(graph, graph.edges[0], None, ()), task)
+    made = neighbour_matching.make_clouds(Estimate(graph, graph.edges[0], None, ()), task)
     assert made.graph.fixed_calibration.tolist() == ([True, False] if placed == "elsewhere" else [False])
 
 
@@ -69,7 +69,7 @@ def test_pairs_of_one_visit_do_not_lead_across_a_step_that_clouds_measure_falsel
         recordings=SimpleNamespace(path=None, of_keyframe=None), allowed=lambda i, j: np.ones(len(i), dtype=bool)
     )
     graph, settings = SimpleNamespace(poses=None), MappingConfig().refinement
-    kept = lidar_stages._pairs(estimate, graph, settings, task)
+    kept = lidar_stages.pairs(estimate, graph, settings, task)
     assert list(zip(*(part.tolist() for part in kept), strict=True)) == [(0, 1), (4, 5), (0, 9)]
     estimate.rejected = None
-    assert len(lidar_stages._pairs(estimate, graph, settings, task)[0]) == len(i)
+    assert len(lidar_stages.pairs(estimate, graph, settings, task)[0]) == len(i)

@@ -225,7 +225,7 @@ def test_two_recordings_through_a_simulated_hall(tmp_path):
     logs, truths, single = [], [], []
     for seed in (31, 32):
         folder = tmp_path / str(seed)
-        logfile.write(simulate(Settings(world="hall", minutes=3.0, seed=seed, scan_rate=5.0)), folder)
+        logfile.write(simulate(Settings(world="hall", minutes=2.0, seed=seed, scan_rate=4.0)), folder)
         logs.append(read_log(folder / "run.log"))
         stamps, poses = read_tum(folder / "truth.tum")
         truths.append(se2.interpolate_trajectory(stamps, poses, logs[-1].odometry.stamps))

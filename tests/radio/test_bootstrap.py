@@ -233,9 +233,10 @@ class Tried(Attempt):
     misfits: ClassVar[dict[float, tuple[float, ...]]] = {}
     known: ClassVar[dict[float, float]] = {}
 
-    def __init__(self, graph, odometry, ranges, path, config, search):
-        self.path, self.config, self.low, self.high = np.arange(401.0), config, 0, 0
-        self.heading = float(graph.calibration.values[0])
+    def __init__(self, graph, odometry, ranges, path, config, search, without=None):
+        self.first, self.known = (0, 50), type(self).known if without is None else {}
+        self.slipping, self.path, self.config, self.low, self.high = without is not None, np.arange(401.0), config, 0, 0
+        self.heading, self.slips = float(graph.calibration.values[0]), np.zeros(400)
 
     def began_like(self, other):
         return {self.heading, other.heading} == {0.4, -0.15}
@@ -249,6 +250,9 @@ class Tried(Attempt):
 
     def misfit(self):
         return self.misfits.get(self.heading, (9.0,) * 4)[(51, 101, 201, 401).index(self.high)]
+
+    def evidence(self):
+        return -1.0 if self.slipping else 0.0
 
     def estimate(self):
         return self.heading

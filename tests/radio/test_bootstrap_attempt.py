@@ -181,7 +181,8 @@ def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low
     attempt.odometry, attempt.calibration = chained(truth, np.full(3, 0.01)), attempt.graph.calibration
     attempt.low, attempt.high, attempt.poses = low, high, np.zeros((40, 3))
     attempt.poses[low:high] = truth[low:high]
-    calls = []
+    attempt.slips, calls, searched = np.zeros(39), [], []
+    attempt._with_slip = lambda first, last, motion, forward: searched.append((first, last, forward))
 
     def optimise(first, last, fixed):
         calls.append((first, last, fixed))
@@ -195,6 +196,9 @@ def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low
     if low > 0:
         asked.append((max(low - further, 0), low + 1, low))
     assert calls == asked
+    # A slip is sought in the pieces that disagree, and as far again in what is known.
+    assert [forward for *_, forward in searched] == [fixed == high - 1 for *_, fixed in asked if not answers[fixed != high - 1]]
+    assert all(max(low - further, 0) <= first < last <= min(high + further, 40) for first, last, _ in searched)
     assert agreed == all(answers[0 if fixed == high - 1 else 1] for *_, fixed in asked)
     first, last = min(c[0] for c in asked), max(c[1] for c in asked)
     assert (attempt.low, attempt.high) == (min(low, first), max(high, last))

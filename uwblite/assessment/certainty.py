@@ -17,13 +17,28 @@ def check_certainty(estimate: Estimate, sigma: float, task: Task) -> Iterator[Fi
     ----------
     sigma : m, rms of the places' expected errors after alignment, the unit of length apart.
     """
-    extent = float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
-    if sigma > min(_UNCERTAIN, _UNCERTAIN_SHARE * extent):
+    if sigma > allowed_error(estimate):
+        extent = _extent(estimate)
         text = (
             f"the shape of the path is known to {sigma:.1f} m (rms) only, in an area {extent:.0f} m across: too few ranges and "
             "scans constrain the trajectory; add anchors, or drive where the lidar sees walls"
         )
         yield doubt("uncertain", text, sigma=sigma, extent=extent)
+
+
+def allowed_error(estimate: Estimate) -> float:
+    """Return the expected error of places, m, above which a map is doubted.
+
+    Ranges hold every place to the same error; without, that of a chain of steps grows with the root of its length.
+    """
+    extent, room = _extent(estimate), _UNCERTAIN / _UNCERTAIN_SHARE
+    larger = np.sqrt(max(extent / room, 1.0)) if estimate.ranges is None else 1.0
+    return min(_UNCERTAIN * larger, _UNCERTAIN_SHARE * extent)
+
+
+def _extent(estimate: Estimate) -> float:
+    """Return the diagonal of the area that the path covers, m."""
+    return float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
 
 
 _UNCERTAIN, _UNCERTAIN_SHARE = 0.4, 0.05

@@ -4,7 +4,6 @@ import argparse
 import hashlib
 import json
 import os
-import time
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -130,10 +129,8 @@ def map_one(task: argparse.Namespace) -> Outcome:
         with warnings.catch_warnings(), sole_writer(task.out):
             warnings.simplefilter("ignore", RuntimeWarning)
             check_target(task.out, force=task.force)
-            began = time.perf_counter()
-            logs = read_logs(task)
             maps = 1 if task.scheduler else task.jobs
-            made = make(task, logs, time.perf_counter() - began, note=notes.append, maps=maps)
+            made = make(task, read_logs(task), note=notes.append, maps=maps)
     except Exception as error:
         code, text = failure(error)
         return Outcome(code, text)

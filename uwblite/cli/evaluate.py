@@ -163,10 +163,9 @@ def read_landmarks(path: str) -> tuple[Landmarks, tuple[tuple[str, str], ...] | 
 
 def _shown_trajectory(t: TrajectoryErrors, true_count: int, title: str) -> Shown:
     named = {"ate": t.ate, "heading": t.heading, "rpe_position": t.rpe_position, "rpe_heading": t.rpe_heading}
-    summary = {
-        "true_poses": true_count, "compared": len(t.matched), "rpe_delta": t.rpe_delta, "T_truth_map": t.T_truth_map.tolist(),
-        **{name: None if errors is None else _plain(errors) for name, errors in named.items()},
-    }  # fmt: skip
+    summary: dict[str, Any] = {"true_poses": true_count, "compared": len(t.matched), "rpe_delta": t.rpe_delta}
+    summary |= {"T_truth_map": t.T_truth_map.tolist()}
+    summary |= {name: None if errors is None else _plain(errors) for name, errors in named.items()}
     lines = [f"{title:<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}", _row("  position (ATE)", t.ate, "m")]
     if t.heading is not None:
         lines.append(_row("  heading", t.heading, "deg", _DEGREES))
@@ -186,10 +185,8 @@ def _row(name: str, s: ErrorStatistics, unit: str, scale: float = 1.0) -> str:
 def _shown_relations(found: RelationErrors, laser_delay: float) -> Shown:
     count, missing = len(found.answered), int((~found.answered).sum())
     t, r = found.translations, found.rotations
-    summary = {
-        "count": count, "not_answered": missing, "share_far": found.far, "laser_delay": laser_delay,
-        "translation": _plain(t), "rotation": _plain(r),
-    }  # fmt: skip
+    summary: dict[str, Any] = {"count": count, "not_answered": missing, "share_far": found.far, "laser_delay": laser_delay}
+    summary |= {"translation": _plain(t), "rotation": _plain(r)}
     return summary, [
         f"{'relations':<24}{'mean':>11}{'sd':>11}{'median':>11}{'max':>11}",
         f"{'  translation':<24}{t.mean:11.4f}{t.std:11.4f}{t.median:11.4f}{t.max:11.4f}  m",

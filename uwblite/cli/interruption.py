@@ -14,6 +14,18 @@ _SOON = 0.02
 
 
 @contextmanager
+def stopped_by(*signals: int) -> Iterator[list[int]]:
+    """Give a list to which these signals are added as they come, in place of what they would do."""
+    stopped: list[int] = []
+    before = {n: signal.signal(n, lambda k, _frame: stopped.append(k)) for n in signals}
+    try:
+        yield stopped
+    finally:
+        for n, handler in before.items():
+            signal.signal(n, handler)
+
+
+@contextmanager
 def interruptible() -> Iterator[list[int]]:
     """Let the first Ctrl-C raise KeyboardInterrupt, and a second one end the program.
 

@@ -23,6 +23,7 @@ from ..server.live import LivePage
 from ..server.pose_status import PoseStatus
 from . import console
 from .inputs import mounted
+from .interruption import stopped_by
 from .serving import serving
 
 DEVICES = ("odometry", "lidar", "uwb", "gyro")
@@ -47,9 +48,7 @@ def run_live(args: argparse.Namespace) -> int:
 
 def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
     """Follow devices or a log and return the exit code."""
-    stopped: list[int] = []
-    before = {n: signal.signal(n, lambda k, _f: stopped.append(k)) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with stopped_by(signal.SIGINT, signal.SIGTERM) as stopped:
         if devices:
             from .named_devices import record_into
 
@@ -60,9 +59,6 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
                 tracker.take(data) if data else tracker.wait()
                 if stopped:
                     break
-    finally:
-        for n, handler in before.items():
-            signal.signal(n, handler)
     return tracker.ended(signal.SIGINT in stopped)
 
 

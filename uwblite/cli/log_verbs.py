@@ -11,6 +11,7 @@ from .options import (
     add_settings_arguments,
     number,
     numbers,
+    option,
     page_address,
     place,
 )
@@ -23,9 +24,8 @@ TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti", "nav2
 
 def _check(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    text = "map it as well: scales, biases, clock offsets and the doubts of that map; takes as long as a map"
-    parser.add_argument("--map", action="store_true", help=text)
+    option(parser, "--json", "print one JSON object instead of text")
+    option(parser, "--map", "map it as well: scales, biases, clock offsets and the doubts of that map; takes as long as a map")
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
 
@@ -52,39 +52,38 @@ def _size(text: str) -> int:
 
 def _record(parser: argparse.ArgumentParser) -> None:
     devices = parser.add_argument_group("devices")
-    devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name); repeatable")
-    devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name); repeatable")
-    devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
+    option(devices, "--uwb [NAME:]PORT", "UWB tag (a DWM1001 without a name); repeatable", action="append")
+    option(devices, "--lidar [NAME:]PORT", "lidar (a Hokuyo without a name); repeatable", action="append")
+    option(devices, "--odometry NAME:PORT", "base: kobuki:PORT, line:PORT?columns=...", action="append")
     gyro = "its heading takes the place of the wheels': line:PORT?columns=t,turn_rate"
-    devices.add_argument("--gyro", metavar="NAME:PORT", action="append", help=gyro)
+    option(devices, "--gyro NAME:PORT", gyro, action="append")
     text = "begin although a port does not exist yet; a device that is lost in mid-run is waited for in any case"
-    devices.add_argument("--wait", action="store_true", help=text)
+    option(devices, "--wait", text)
     output = parser.add_argument_group("output")
-    output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
-    output.add_argument("--append", action="store_true", help="go on with a log that broke off")
-    output.add_argument("--rotate", metavar="SIZE", type=_size, default=0, help="begin a new part at this size, e.g. 500M")
-    output.add_argument("--duration", metavar="S", type=number(above=0), help="stop after so many seconds")
-    pause = "s between syncs to the disk (1; 0 = each write)"
-    output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
-    output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
+    option(output, "--out FILE", "the log; must not exist unless --append", place, required=True)
+    option(output, "--append", "go on with a log that broke off")
+    option(output, "--rotate SIZE", "begin a new part at this size, e.g. 500M", _size, 0)
+    option(output, "--duration S", "stop after so many seconds", number(above=0))
+    option(output, "--sync S", "s between syncs to the disk (1; 0 = each write)", number(least=0), 1.0)
+    option(output, "--json", "summary as one JSON object on stdout")
     page = "show the map while it grows, as uwblite watch does, in a process of its own (127.0.0.1:8000)"
-    output.add_argument("--watch", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
+    option(output, "--watch [ADDRESS:]PORT", page, page_address, nargs="?", const=LOCAL)
     laser = parser.add_argument_group("lidar")
-    laser.add_argument("--lidar-steps", metavar="A:B", help="first and last step, e.g. 128:640 (all: 44:725)")
+    option(laser, "--lidar-steps A:B", "first and last step, e.g. 128:640 (all: 44:725)")
     merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
-    laser.add_argument("--lidar-cluster", metavar="N", type=merged, help="steps merged into one reading (1)")
-    laser.add_argument("--lidar-skip", metavar="N", type=skipped, help="scans left out between two (0)")
+    option(laser, "--lidar-cluster N", "steps merged into one reading (1)", merged)
+    option(laser, "--lidar-skip N", "scans left out between two (0)", skipped)
     narrow = "2-character readings up to 4.095 m, for slow RS-232"
     laser.add_argument("--lidar-narrow", action="store_const", const=1, help=narrow)
-    laser.add_argument("--lidar-baud", metavar="N", type=number(whole=True), help="bit/s to try first on RS-232 (115200)")
+    option(laser, "--lidar-baud N", "bit/s to try first on RS-232 (115200)", number(whole=True))
     mounting = parser.add_argument_group("mounting, for the log")
     pose = "laser on the base: m, m, rad; once for each --lidar, in their order"
-    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), action="append", help=pose)
+    option(mounting, "--laser-pose X,Y,THETA", pose, numbers(3), action="append")
     flipped, which = "the laser is mounted upside down; K: the K-th lidar", number(1, MOST["lidar"], whole=True)
-    mounting.add_argument("--laser-flipped", metavar="K", nargs="?", const=1, type=which, action="append", help=flipped)
+    option(mounting, "--laser-flipped K", flipped, which, nargs="?", const=1, action="append")
     tag = "UWB tag on the base, z above the floor: m; once for each --uwb, in their order"
-    mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), action="append", help=tag)
-    mounting.add_argument("--anchor-height", metavar="H", type=number(), help="height of the anchors above the floor, m")
+    option(mounting, "--tag X,Y,Z", tag, numbers(3), action="append")
+    option(mounting, "--anchor-height H", "height of the anchors above the floor, m", number())
 
 
 RECORD = Verb(
@@ -120,10 +119,10 @@ computer's monotonic clock, s).
 
 def _watch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="LOG", help="CARMEN log that is being written, its first part where it has several")
-    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=8000, help="port (8000; 0 = any)")
-    parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="address to listen on (this computer alone)")
-    parser.add_argument("--out", metavar="DIR", type=place, help="folder for the latest map (LOG_watch)")
-    parser.add_argument("--force", action="store_true", help="replace a map that is already in --out")
+    option(parser, "--port N", "port (8000; 0 = any)", number(0, 65535, whole=True), 8000)
+    option(parser, "--host ADDRESS", "address to listen on (this computer alone)", default="127.0.0.1")
+    option(parser, "--out DIR", "folder for the latest map (LOG_watch)", place)
+    option(parser, "--force", "replace a map that is already in --out")
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
 
@@ -158,10 +157,10 @@ def _pan_id(text: str) -> int:
 
 def _devices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("ports", metavar="PORT", nargs="*", help="ports to look at (default: those of a known kind)")
-    parser.add_argument("--list", action="store_true", help="list the ports and open none")
-    parser.add_argument("--kinds", action="store_true", help="list the devices that can be recorded, with their options")
-    parser.add_argument("--pan-id", metavar="ID", type=_pan_id, help="network id that the tag should have, e.g. 0xC0DE")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    option(parser, "--list", "list the ports and open none")
+    option(parser, "--kinds", "list the devices that can be recorded, with their options")
+    option(parser, "--pan-id ID", "network id that the tag should have, e.g. 0xC0DE", _pan_id)
+    option(parser, "--json", "one JSON object on stdout")
 
 
 DEVICES = Verb(
@@ -187,21 +186,21 @@ def _convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", help="what to convert; - reads a log from standard input")
     parser.add_argument("target", type=place, nargs="?", help="what to make; its ending names the format, or --to does")
     parser.add_argument("--to", choices=TARGETS, help="format of the target where its ending names none")
-    parser.add_argument("--force", action="store_true", help="replace a file that is already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    option(parser, "--force", "replace a file that is already there")
+    option(parser, "--json", "print a summary as one JSON object instead of text")
     text = "recording that a map was made of, for its scans and odometry; repeatable, in their order"
-    parser.add_argument("--recording", metavar="LOG", action="append", default=[], help=text)
-    parser.add_argument("--list", action="store_true", help="list the topics of a bag and stop")
+    option(parser, "--recording LOG", text, action="append", default=[])
+    option(parser, "--list", "list the topics of a bag and stop")
     add_bag_arguments(parser)
     part = parser.add_argument_group("part and units")
     unit = number(above=0)
-    part.add_argument("--start", metavar="S", type=number(), help="leave out what is earlier, s after the first odometry")
-    part.add_argument("--end", metavar="S", type=number(), help="leave out what is later, s after the first odometry")
-    part.add_argument("--time-unit", metavar="S", type=unit, default=1.0, help="seconds per unit of the stamps (1)")
-    part.add_argument("--odometry-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the odometry (1)")
-    part.add_argument("--angle-unit", metavar="RAD", type=unit, default=1.0, help="radians per unit of its heading (1)")
-    part.add_argument("--range-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the ranges (1)")
-    part.add_argument("--laser-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the laser (1)")
+    option(part, "--start S", "leave out what is earlier, s after the first odometry", number())
+    option(part, "--end S", "leave out what is later, s after the first odometry", number())
+    option(part, "--time-unit S", "seconds per unit of the stamps (1)", unit, 1.0)
+    option(part, "--odometry-unit M", "metres per unit of the odometry (1)", unit, 1.0)
+    option(part, "--angle-unit RAD", "radians per unit of its heading (1)", unit, 1.0)
+    option(part, "--range-unit M", "metres per unit of the ranges (1)", unit, 1.0)
+    option(part, "--laser-unit M", "metres per unit of the laser (1)", unit, 1.0)
     add_mounting_arguments(parser)
 
 
@@ -230,21 +229,19 @@ bags need the package rosbags, in the environment of uwblite (without it the err
 
 def _optimize(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("graph", help=".g2o, TORO (.graph, .toro) or .pyfg file, plain or .gz; - reads standard input")
-    parser.add_argument("--out", type=place, metavar="FILE", help="optimised graph; .g2o or .pyfg by its name, .gz compresses")
-    parser.add_argument("--trajectory", type=place, metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
-    parser.add_argument("--from-odometry", action="store_true", help="forget the file's estimates, start from the odometry")
+    option(parser, "--out FILE", "optimised graph; .g2o or .pyfg by its name, .gz compresses", place)
+    option(parser, "--trajectory FILE", "poses as a TUM trajectory, as evo reads it", place)
+    option(parser, "--from-odometry", "forget the file's estimates, start from the odometry")
     way = parser.add_mutually_exclusive_group()
     adding = "start from the odometry and add poses in the order of time, anchors when their ranges place them"
-    way.add_argument("--incremental", action="store_true", help=adding)
+    option(way, "--incremental", adding)
     deciding = "decide which loop closures and ranges are outliers, by graduated non-convexity, and leave them out"
-    way.add_argument("--robust", action="store_true", help=deciding)
-    parser.add_argument("--kernel", metavar="NAME", default="none", help="robust kernel on edges that close loops, and ranges")
-    bend = "standard deviations where it bends (2)"
-    parser.add_argument("--kernel-scale", metavar="K", type=number(above=0), default=2.0, help=bend)
-    setting = "solver setting, e.g. max_iterations=200; repeatable"
-    parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=setting)
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    option(way, "--robust", deciding)
+    option(parser, "--kernel NAME", "robust kernel on edges that close loops, and ranges", default="none")
+    option(parser, "--kernel-scale K", "standard deviations where it bends (2)", number(above=0), 2.0)
+    option(parser, "--set NAME=VALUE", "solver setting, e.g. max_iterations=200; repeatable", action="append", default=[])
+    option(parser, "--force", "replace files that are already there")
+    option(parser, "--json", "print a summary as one JSON object instead of text")
 
 
 OPTIMIZE = Verb(
@@ -266,8 +263,8 @@ exit code 3: the search did not converge
 
 def _config(parser: argparse.ArgumentParser) -> None:
     add_settings_arguments(parser)
-    parser.add_argument("--all", action="store_true", help="list settings for experiments too")
-    parser.add_argument("--no-comments", action="store_true", help="values only")
+    option(parser, "--all", "list settings for experiments too")
+    option(parser, "--no-comments", "values only")
 
 
 CONFIG = Verb(

@@ -33,6 +33,14 @@ from .wording import findings_with_options, with_options
 from .workers import versions
 
 
+class Recordings(NamedTuple):
+    """What was read."""
+
+    logs: list[SensorLog]
+    seconds: float
+    """That reading took."""
+
+
 class Made(NamedTuple):
     """A map that is written."""
 
@@ -44,18 +52,19 @@ class Made(NamedTuple):
     """From the first recording's first byte to the last file."""
 
 
-def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> list[SensorLog]:
+def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> Recordings:
     """Return the recordings of the command line, with its mounting."""
+    began = time.perf_counter()
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
     told = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
-    return [replace(log, notes=notes) for log, notes in zip(logs, told, strict=True)]
+    logs = [replace(log, notes=notes) for log, notes in zip(logs, told, strict=True)]
+    return Recordings(logs, time.perf_counter() - began)
 
 
 def make(
     args: argparse.Namespace,
-    logs: list[SensorLog],
-    reading: float,
+    recordings: Recordings,
     progress: Progress | None = None,
     executor: Executor | None = None,
     note: Callable[[str], None] | None = None,
@@ -65,8 +74,7 @@ def make(
 
     Parameters
     ----------
-    logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
-    reading : time that it took to read them, s.
+    recordings : the list of logs is emptied, for scans that no map looks at are most of the memory.
     note : is told beforehand where memory will be short.
     maps : how many maps are made at a time, each in a process.
 
@@ -75,6 +83,7 @@ def make(
     ConfigError : the map needs more than twice the memory there is, and args.ignore_memory is not set.
     """
     config, constraints, freed = settings(args), known(args), FreedMemory()
+    logs, reading = recordings
 
     def report(stage: Stage, done: int, total: int) -> object:
         freed.give_back(over=done >= total)

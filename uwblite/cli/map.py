@@ -3,7 +3,6 @@
 import argparse
 import os
 import shlex
-import time
 from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,12 +16,11 @@ from ..io.results import check_target
 from ..mapping import Stage
 from ..report.printable import duration
 from ..screening.screen import screen
-from ..sensor_log import SensorLog
 from . import console
 from .cost import expected_cost, long_wait, together
 from .formats import format_of
 from .inputs import name_recordings_once
-from .making import Made, make, peak_memory, read_logs, settings
+from .making import Made, Recordings, make, peak_memory, read_logs, settings
 from .memory import shortage
 from .wording import anchor_line, calibration_line
 from .workers import workers
@@ -40,25 +38,23 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _map(args: argparse.Namespace) -> int:
-    began = time.perf_counter()
-    logs = _read(args)
-    made = _make_shown(args, logs, time.perf_counter() - began)
+    made = _make_shown(args, _read(args))
     if args.corrected_log:
         _write_corrected_log(args, made)
     console.report(args.json, summary_json(args, made), summary_lines(args, made))
     return 3 if made.result.doubts else 0
 
 
-def _read(args: argparse.Namespace) -> list[SensorLog]:
+def _read(args: argparse.Namespace) -> Recordings:
     """Return the recordings of the command line; what is wrong with their files is said."""
     with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
-        logs = read_logs(args, executor)
-    for notes in (log.notes for log in logs):
+        recordings = read_logs(args, executor)
+    for notes in (log.notes for log in recordings.logs):
         if notes.broken:
             number, why = notes.broken_lines[0]
             console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
         console.note_of(notes.source, notes.warnings)
-    return logs
+    return recordings
 
 
 def _check_corrected_log(args: argparse.Namespace) -> None:
@@ -83,9 +79,9 @@ def _write_corrected_log(args: argparse.Namespace, made: Made) -> None:
         )
 
 
-def _make_shown(args: argparse.Namespace, logs: list[SensorLog], reading: float) -> Made:
+def _make_shown(args: argparse.Namespace, recordings: Recordings) -> Made:
     """Map recordings with a progress bar, on the processes or the cluster that the command line asks for."""
-    lidar = "lidar" not in args.without and any(log.scans is not None for log in logs)
+    lidar = "lidar" not in args.without and any(log.scans is not None for log in recordings.logs)
     progress, overall = console.Progress(), Overall(lidar=lidar)
 
     def report(stage: Stage, done: int, total: int) -> None:
@@ -94,12 +90,12 @@ def _make_shown(args: argparse.Namespace, logs: list[SensorLog], reading: float)
         progress(stage, done, total, overall.take(stage, done, total))
 
     with closing(progress), workers(args.jobs, args.scheduler) as executor:
-        return make(args, logs, reading, report, executor, console.note)
+        return make(args, recordings, report, executor, console.note)
 
 
 def _dry_run(args: argparse.Namespace) -> int:
     config = settings(args)
-    costs = [expected_cost(screen(log, config.detect_laser_flip), config) for log in _read(args)]
+    costs = [expected_cost(screen(log, config.detect_laser_flip), config) for log in _read(args).logs]
     rows = [{"log": name, "expected cost of map": each} for name, each in zip(args.logs, costs, strict=True)]
     whole = together(costs)
     summary = {"recordings": rows, "expected cost of map": whole, "exit_code": 0}

@@ -11,6 +11,7 @@ from .options import (
     add_settings_arguments,
     number,
     numbers,
+    option,
     page_address,
     place,
 )
@@ -19,9 +20,9 @@ from .options import (
 def _add_worker_arguments(parser: argparse.ArgumentParser, jobs: str) -> None:
     """Declare --jobs, with its help, and --scheduler."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--jobs", metavar="N", type=number(above=0, whole=True), default=1, help=jobs)
+    option(where, "--jobs N", jobs, number(above=0, whole=True), 1)
     text = "hand the work to the workers of a dask.distributed scheduler, such as tcp://head:8786"
-    where.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
+    option(where, "--scheduler ADDRESS", text, default="")
 
 
 def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,24 +31,22 @@ def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
     without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
     text = "read every n-th laser scan only; the others take neither time nor memory (1)"
     counted = number(above=0, whole=True)
-    parser.add_argument("--every-nth-scan", metavar="N", type=counted, default=1, help=text)
+    option(parser, "--every-nth-scan N", text, counted, 1)
     output = parser.add_argument_group("map")
-    edge = "edge of a cell, m: short for --set grid.resolution=M"
-    output.add_argument("--resolution", metavar="M", type=number(above=0), help=edge)
+    option(output, "--resolution M", "edge of a cell, m: short for --set grid.resolution=M", number(above=0))
     align = "where the axes lie: odometry (default), first-pose, walls (along x and y), anchors; short for --set align=HOW"
-    output.add_argument("--align", metavar="HOW", choices=("odometry", "first-pose", "walls", "anchors"), help=align)
-    box = "keep this part of the grid, m: short for --set crop=[...]"
-    output.add_argument("--crop", metavar="X0,Y0,X1,Y1", type=numbers(4), help=box)
-    output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
-    output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
-    output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
+    option(output, "--align HOW", align, choices=("odometry", "first-pose", "walls", "anchors"))
+    option(output, "--crop X0,Y0,X1,Y1", "keep this part of the grid, m: short for --set crop=[...]", numbers(4))
+    option(output, "--scale-map", "write the probabilities too: map_scale.png (mode: scale)")
+    option(output, "--no-timings", "leave timings out of report.json: same run, same bytes")
+    option(output, "--report-timings", "show the stages' seconds in report.html too")
     beforehand = parser.add_argument_group("known beforehand")
     text = "surveyed anchors, pinned poses, distances, closures, see docs/formats.md"
-    beforehand.add_argument("--constraints", type=place, metavar="FILE.toml", help=text)
+    option(beforehand, "--constraints FILE.toml", text, place)
     text = "go on in the frame of an earlier map: its anchors.csv; anchors that were moved since are named"
-    beforehand.add_argument("--anchors-from", type=place, metavar="FILE.csv", help=text)
+    option(beforehand, "--anchors-from FILE.csv", text, place)
     text = "map although it is expected to need more than twice the memory that this computer, control group or shell gives"
-    parser.add_argument("--ignore-memory", action="store_true", help=text)
+    option(parser, "--ignore-memory", text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
@@ -65,12 +64,12 @@ def _map(parser: argparse.ArgumentParser) -> None:
     several = "CARMEN log, plain or .gz, ROS bag or CSV folder; several are mapped together; - reads a log from standard input"
     parser.add_argument("logs", metavar="LOG", nargs="+", help=several)
     out = parser.add_argument("--out", type=place, metavar="DIR", required=True, help="folder for the result")
-    parser.add_argument("--force", action="store_true", help="replace a result that is already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    option(parser, "--force", "replace a result that is already there")
+    option(parser, "--json", "print a summary as one JSON object instead of text")
     text = "read, estimate time and memory, and map nothing; needs no --out"
     parser.add_argument("--dry-run", action=_Instead, nargs=0, default=False, const=out, help=text)
     text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
-    parser.add_argument("--corrected-log", type=place, metavar="FILE", help=text)
+    option(parser, "--corrected-log FILE", text, place)
     _add_worker_arguments(parser, "processes for the heavy stages (1)")
     _add_map_arguments(parser)
 
@@ -102,11 +101,9 @@ exit code 3: the files are written, but the result should not be trusted; the re
 
 def _batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", metavar="LOG", nargs="+", help="CARMEN log, plain or .gz, ROS bag or CSV folder")
-    text = "folder for the results, a folder for each, and the table"
-    parser.add_argument("--out", type=place, metavar="DIR", required=True, help=text)
-    text = "replace results that were made of other recordings or with other settings"
-    parser.add_argument("--force", action="store_true", help=text)
-    parser.add_argument("--json", action="store_true", help="print the table as one JSON object instead of text")
+    option(parser, "--out DIR", "folder for the results, a folder for each, and the table", place, required=True)
+    option(parser, "--force", "replace results that were made of other recordings or with other settings")
+    option(parser, "--json", "print the table as one JSON object instead of text")
     _add_worker_arguments(parser, "recordings that are mapped at a time, each in a process (1)")
     _add_map_arguments(parser)
 
@@ -133,9 +130,9 @@ exit code 1: a recording failed; 3: a result should not be trusted; the table na
 def _view(parser: argparse.ArgumentParser) -> None:
     text = "result of uwblite map, or a recording that one was made of; recordings beside the results are found by themselves"
     parser.add_argument("paths", metavar="DIR|FILE", nargs="+", help=text)
-    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=0, help="port (any that is free)")
-    parser.add_argument("--constraints", type=place, metavar="FILE.toml", help="where corrections go (DIR_constraints.toml)")
-    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    option(parser, "--port N", "port (any that is free)", number(0, 65535, whole=True), 0)
+    option(parser, "--constraints FILE.toml", "where corrections go (DIR_constraints.toml)", place)
+    option(parser, "--open", "open the page in the browser")
 
 
 VIEW = Verb(
@@ -158,15 +155,14 @@ start, and "Map again" makes DIR_2, DIR_3 ... beside DIR. The page is served to 
 def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of --live."""
     group = parser.add_argument_group("live (docs/navigation.md)")
-    group.add_argument("--live", action="store_true", help="follow the log, or devices, and say the pose as it becomes known")
-    group.add_argument("--rate", metavar="HZ", type=number(above=0), default=10.0, help="lines per second of driving (10)")
-    group.add_argument("--idle", metavar="S", type=number(above=0), help="end when the log has not grown for so long (never)")
+    option(group, "--live", "follow the log, or devices, and say the pose as it becomes known")
+    option(group, "--rate HZ", "lines per second of driving (10)", number(above=0), 10.0)
+    option(group, "--idle S", "end when the log has not grown for so long (never)", number(above=0))
     late = "without data of a sensor for so long, and three of its periods, it is said to be silent (2)"
-    group.add_argument("--late", metavar="S", type=number(above=0), default=2.0, help=late)
-    lost = "without any data for so long the pose counts as lost (10)"
-    group.add_argument("--lost-after", metavar="S", type=number(above=0), default=10.0, help=lost)
+    option(group, "--late S", late, number(above=0), 2.0)
+    option(group, "--lost-after S", "without any data for so long the pose counts as lost (10)", number(above=0), 10.0)
     page = "show the pose on the map, on a page for this computer; an address opens it to others, such as 0.0.0.0:8000"
-    group.add_argument("--serve", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
+    option(group, "--serve [ADDRESS:]PORT", page, page_address, nargs="?", const=LOCAL)
     for name, form in (("odometry", "NAME:PORT"), ("lidar", "[NAME:]PORT"), ("uwb", "[NAME:]PORT"), ("gyro", "NAME:PORT")):
         help_text = "device, as for uwblite record" + ("; repeatable" if name == "uwb" else "")
         group.add_argument(f"--{name}", metavar=form, action="append", help=help_text)
@@ -175,13 +171,13 @@ def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
 def _localize(parser: argparse.ArgumentParser) -> None:
     text = "CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input; none with --live on devices"
     parser.add_argument("log", nargs="?", default="", help=text)
-    parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: anchors.csv, map.yaml")
+    option(parser, "--map DIR", "folder that uwblite map wrote: anchors.csv, map.yaml", required=True)
     out = "trajectory in the map's frame, FILE.tum; any other name is a folder for it, its covariances and a report"
-    parser.add_argument("--out", type=place, metavar="FILE.tum|DIR", help=out)
-    parser.add_argument("--covariance", type=place, metavar="FILE.csv", help="covariance of every keyframe")
-    parser.add_argument("--picture", type=place, metavar="FILE.png", help="the path drawn on the map")
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    option(parser, "--out FILE.tum|DIR", out, place)
+    option(parser, "--covariance FILE.csv", "covariance of every keyframe", place)
+    option(parser, "--picture FILE.png", "the path drawn on the map", place)
+    option(parser, "--force", "replace files that are already there")
+    option(parser, "--json", "print a summary as one JSON object instead of text")
     _add_live_arguments(parser)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
@@ -211,18 +207,18 @@ exit code 1: found nowhere for certain; nothing is written
 
 
 def _plan(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote, or the map.yaml of any map")
+    option(parser, "--map DIR", "folder that uwblite map wrote, or the map.yaml of any map", required=True)
     where = "X,Y in the map's frame, m"
-    parser.add_argument("--from", dest="start", metavar="X,Y[,THETA]", type=numbers(2, 3), required=True, help=f"{where}, rad")
-    parser.add_argument("--to", dest="goal", metavar="X,Y", type=numbers(2), required=True, help=where)
-    parser.add_argument("--via", metavar="X,Y", type=numbers(2), action="append", default=[], help="pass here; repeatable")
-    parser.add_argument("--radius", metavar="M", type=number(0, 1000), required=True, help="of the robot, m")
+    option(parser, "--from X,Y[,THETA]", f"{where}, rad", numbers(2, 3), dest="start", required=True)
+    option(parser, "--to X,Y", where, numbers(2), dest="goal", required=True)
+    option(parser, "--via X,Y", "pass here; repeatable", numbers(2), [], action="append")
+    option(parser, "--radius M", "of the robot, m", number(0, 1000), required=True)
     text = "unknown space: refuse it (default), or price it five times as dear as free space"
     parser.add_argument("--unknown", choices=("refuse", "price"), default="refuse", help=text)
-    parser.add_argument("--step", metavar="M", type=number(least=0.001), default=0.1, help="largest step of the path, m (0.1)")
-    parser.add_argument("--out", metavar="NAME", type=place, default="plan", help="NAME.csv and NAME.png are written (plan)")
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print one JSON object, with the path, instead of text")
+    option(parser, "--step M", "largest step of the path, m (0.1)", number(least=0.001), 0.1)
+    option(parser, "--out NAME", "NAME.csv and NAME.png are written (plan)", place, "plan")
+    option(parser, "--force", "replace files that are already there")
+    option(parser, "--json", "print one JSON object, with the path, instead of text")
 
 
 PLAN = Verb(
@@ -241,13 +237,13 @@ that cannot be reached ends with exit code 1 and the nearest one that can.
 
 
 def _plan_anchors(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: map.yaml, anchors.csv")
-    parser.add_argument("--count", metavar="N", type=number(above=0, whole=True), default=1, help="how many anchors (1)")
-    parser.add_argument("--reach", metavar="M", type=number(above=0), default=25.0, help="m up to which a radio reaches (25)")
-    parser.add_argument("--from-nothing", action="store_true", help="leave out the anchors that are there")
-    parser.add_argument("--out", metavar="NAME", default="anchor_plan", help="NAME.csv and NAME.png are written (anchor_plan)")
-    parser.add_argument("--force", action="store_true", help="replace files that are already there")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    option(parser, "--map DIR", "folder that uwblite map wrote: map.yaml, anchors.csv", required=True)
+    option(parser, "--count N", "how many anchors (1)", number(above=0, whole=True), 1)
+    option(parser, "--reach M", "m up to which a radio reaches (25)", number(above=0), 25.0)
+    option(parser, "--from-nothing", "leave out the anchors that are there")
+    option(parser, "--out NAME", "NAME.csv and NAME.png are written (anchor_plan)", default="anchor_plan")
+    option(parser, "--force", "replace files that are already there")
+    option(parser, "--json", "print one JSON object instead of text")
 
 
 PLAN_ANCHORS = Verb(
@@ -267,18 +263,18 @@ through walls. Anchors are put half a metre from walls; where that cannot be don
 
 def _evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
-    parser.add_argument("--truth", type=place, metavar="FILE.tum", action="append", help="true poses; one per recording")
-    parser.add_argument("--relations", type=place, metavar="FILE", help="true relative poses of scans (Kuemmerle et al. 2009)")
+    option(parser, "--truth FILE.tum", "true poses; one per recording", place, action="append")
+    option(parser, "--relations FILE", "true relative poses of scans (Kuemmerle et al. 2009)", place)
     counted, length = number(above=0, whole=True), number(above=0)
-    parser.add_argument("--recording", metavar="N", type=counted, help="the recording that a single truth is of (1)")
-    parser.add_argument("--anchors", type=place, metavar="FILE.csv", help="true anchors")
-    parser.add_argument("--landmarks", type=place, metavar="FILE.csv", help="true columns")
-    parser.add_argument("--walls", type=place, metavar="FILE.csv", help="true walls")
-    parser.add_argument("--delta", type=length, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
-    parser.add_argument("--max-gap", type=length, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
-    parser.add_argument("--search-radius", type=length, default=1.0, metavar="M", help="m around a column's place (1)")
-    parser.add_argument("--tolerance", type=length, default=0.1, metavar="M", help="m from a wall that count as on it (0.1)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    option(parser, "--recording N", "the recording that a single truth is of (1)", counted)
+    option(parser, "--anchors FILE.csv", "true anchors", place)
+    option(parser, "--landmarks FILE.csv", "true columns", place)
+    option(parser, "--walls FILE.csv", "true walls", place)
+    option(parser, "--delta M", "m of path per stretch of the RPE (1)", length, 1.0)
+    option(parser, "--max-gap S", "leave out truth in longer gaps, s (1)", length, 1.0)
+    option(parser, "--search-radius M", "m around a column's place (1)", length, 1.0)
+    option(parser, "--tolerance M", "m from a wall that count as on it (0.1)", length, 0.1)
+    option(parser, "--json", "print one JSON object instead of the table")
 
 
 EVALUATE = Verb(

@@ -7,9 +7,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
-_LIBRARIES = 300_000_000
+_LIBRARIES, _BUFFERS = 300_000_000, 130_000_000
 """Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
-matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own."""
+matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own; the buffers alone where they are loaded."""
 _RESIDENT = 76_000_000
 """Bytes of memory that Python, numpy, scipy and this package take before anything is read."""
 _ADDRESSES = 1 << 31
@@ -130,7 +130,7 @@ def _load_libraries() -> None:
     import mmap
 
     try:
-        mmap.mmap(-1, _LIBRARIES).close()
+        mmap.mmap(-1, _BUFFERS if "scipy" in sys.modules else _LIBRARIES).close()
     except OSError as error:
         raise NoRoom(f"numpy and scipy alone need {_LIBRARIES / 1e6:.0f} MB of addresses{allowed()}") from error
     import numpy as np

@@ -17,34 +17,42 @@ class Verb(NamedTuple):
     """Whether it makes or reads maps in this process, for which numpy and scipy must fit into memory."""
 
 
+def option(group: Any, name: str, help_text: str, kind: Callable[[str], Any] = str, default: Any = None, **more: Any) -> None:
+    """Declare an option ``--name METAVAR`` whose value `kind` reads; without METAVAR it is a switch."""
+    words = name.split(" ", 1)
+    if len(words) == 1:
+        group.add_argument(name, action="store_true", help=help_text)
+    else:
+        group.add_argument(words[0], metavar=words[1], type=kind, default=default, help=help_text, **more)
+
+
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --preset, --config and --set."""
     group = parser.add_argument_group("settings (a later one wins: preset, file, --set)")
-    group.add_argument("--preset", metavar="NAME", help="start from a preset: default or paper")
-    group.add_argument("--config", type=place, metavar="FILE.toml", help="settings from a file, as `uwblite config` prints it")
-    example = "change one setting, e.g. icp.max_iterations=30; repeatable"
-    group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)
+    option(group, "--preset NAME", "start from a preset: default or paper")
+    option(group, "--config FILE.toml", "settings from a file, as `uwblite config` prints it", place)
+    option(group, "--set NAME=VALUE", "change one setting, e.g. icp.max_iterations=30; repeatable", action="append", default=[])
 
 
 def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the sensors are mounted; the log's own PARAM lines hold where these are not given."""
     group = parser.add_argument_group("mounting (overrides what stands in the log)")
-    group.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
-    group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
-    group.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
-    group.add_argument("--anchor-height", metavar="H", type=number(), help="height of all anchors above the floor, m")
+    option(group, "--laser-pose X,Y,THETA", "laser on the base: m, m, rad", numbers(3))
+    option(group, "--laser-flipped", "the laser is mounted upside down")
+    option(group, "--tag X,Y,Z", "UWB tag on the base, z above the floor: m", numbers(3))
+    option(group, "--anchor-height H", "height of all anchors above the floor, m", number())
 
 
 def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare which topics of a ROS bag are read; recordings of other kinds have none."""
     bag = parser.add_argument_group("ROS bags (topics are guessed by their types where these are not given)")
-    bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
+    option(bag, "--odometry-topic TOPIC", "nav_msgs/Odometry of the wheels", default="")
     scans = "sensor_msgs/LaserScan; of a .log its messages, e.g. ROBOTLASER2 for the second lidar"
-    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help=scans)
-    bag.add_argument("--imu-topic", metavar="TOPIC", default="", help="sensor_msgs/Imu for the heading; none = the odometry's")
-    bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
-    bag.add_argument("--uwb-mapping", type=place, metavar="FILE.toml", help="where ranges stand in messages: docs/formats.md")
-    bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
+    option(bag, "--scan-topic TOPIC", scans, default="")
+    option(bag, "--imu-topic TOPIC", "sensor_msgs/Imu for the heading; none = the odometry's", default="")
+    option(bag, "--uwb-topic TOPIC", "ranges; repeatable", action="append", default=[])
+    option(bag, "--uwb-mapping FILE.toml", "where ranges stand in messages: docs/formats.md", place)
+    option(bag, "--base-frame FRAME", "frame of the robot (the odometry's child frame)", default="")
 
 
 def number(

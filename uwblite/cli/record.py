@@ -3,6 +3,7 @@
 import argparse
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..drivers.transport import absent_port
 from ..errors import DeviceError
 from .child import Child
 from .console import Progress, note, say, say_json
+from .interruption import stopped_by
 from .log_verbs import MOST
 from .named_devices import device_links, host_name, mounting_params, show_note, use_lasting_names
 
@@ -46,25 +48,19 @@ def run(args: argparse.Namespace) -> int:
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
     lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
     mounting = Mounting(lasers[0], tuple(mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
-    stopped: list[int] = []
     watching = _Watching(args) if args.watch else None
-    recorder = Recorder(
-        links, log, monotonic=time.monotonic, wall_offset=offset, host=host_name(), mounting=mounting,
-        on_note=show_note, wall=time.time,
-    )  # fmt: skip
-    endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {ending: signal.signal(ending, lambda n, _f: stopped.append(n)) for ending in endings}
-    try:
-        recorder.begin(_head(args, remark))
-        use_lasting_names(links)
-        recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder, watching))
-    finally:
-        log.close()
-        if watching is not None:
-            watching.stop()
-        for ending, handler in before.items():
-            signal.signal(ending, handler)
-    return _finish(recorder, args.json, bool(stopped) and stopped[0] == signal.SIGINT)
+    timed = partial(Recorder, monotonic=time.monotonic, wall_offset=offset, wall=time.time)
+    recorder = timed(links, log, host=host_name(), mounting=mounting, on_note=show_note)
+    with stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stopped:
+        try:
+            recorder.begin(_head(args, remark))
+            use_lasting_names(links)
+            recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder, watching))
+        finally:
+            log.close()
+            if watching is not None:
+                watching.stop()
+    return _finish(recorder, args.json, stopped[:1] == [signal.SIGINT])
 
 
 def _finish(recorder: Recorder, as_json: bool, interrupted: bool) -> int:

@@ -153,7 +153,8 @@ class FixPoller:
         narrow = high - low < 2 * (DENSE + (self._trip or 0.0)) + LEAD
         self._lead = max(LEAD, self._lead * LESS_LEAD) if narrow else min(self._lead + MORE_LEAD, self._period / 2)
         self._last_fix, self._latest = stamp, readings
-        self._pending, self._missed = None, False
+        # Of a bracket that holds several fixes the last one was read, and it may stand nearer to the end than the middle.
+        self._pending, self._missed = None, high - low > GAP * self._period
         self._known.update(reading.anchor_id for reading in readings)
         if readings and not unsure:
             yield RangeEpoch(stamp, readings, (high - low) / 2)

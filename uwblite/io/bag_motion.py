@@ -90,8 +90,8 @@ class Frames:
         """Raise ConfigError where a frame is missing in the transforms; without any transform every frame is accepted."""
         names = sorted(set(self._parents) | {parent for parent, _ in self._parents.values()})
         if names and frame.lstrip("/") not in names:
-            raise ConfigError(f"the transforms of the bag know no frame {frame}; {did_you_mean(frame, names)}they know "
-                              + ", ".join(names))  # fmt: skip
+            known = f"{did_you_mean(frame, names)}they know {', '.join(names)}"
+            raise ConfigError(f"the transforms of the bag know no frame {frame}; {known}")
 
     def pose(self, base: str, frame: str) -> Floats | None:
         """Return T_base_frame (4, 4), None where the frames are not connected."""

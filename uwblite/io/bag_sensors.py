@@ -86,11 +86,9 @@ class ScanReadings:
         spanned = (last - first) / max(beams - 1, 1)
         if np.isfinite(step) and step != 0.0 and abs(step) * (beams - 1) < _TURN:
             if np.isfinite(spanned) and abs((last - first) - step * (beams - 1)) > 2.0 * abs(step):
-                self._note(
-                    "contradiction", "angle_min, angle_max and angle_increment contradict each other in {count} scans"
-                    f" (the increment {np.degrees(step):.3g} degrees, by the ends {np.degrees(spanned):.3g}): the increment"
-                    " counts"
-                )  # fmt: skip
+                text = "angle_min, angle_max and angle_increment contradict each other in {count} scans (the increment"
+                text += f" {np.degrees(step):.3g} degrees, by the ends {np.degrees(spanned):.3g}): the increment counts"
+                self._note("contradiction", text)
             return ScanGeometry(first, step, beams)
         if not np.isfinite(spanned) or spanned == 0.0 or abs(last - first) > _TURN:
             return None

@@ -177,29 +177,15 @@ class LogTail:
         return bool(data)
 
     def _read(self) -> bytes:
-        if self._file is None or self._replaced():
+        if self._file is None:
             if not os.path.isfile(self.path):
                 return b""
-            opened = GrowingFile(self.path, whole=True)
-            if self._file is not None:
-                self._file.close()
-                self._restart()
-            self._file, self._first = opened, os.stat(self.path)
+            self._file = GrowingFile(self.path, whole=True)
         before, data = self._file.restarts, self._file.read()
         if self._file.restarts > before:
-            self._restart()
-            self._first = os.stat(self.path)
+            self.restarts += 1
+            self._begin()
         return data
-
-    def _restart(self) -> None:
-        self.restarts += 1
-        self._begin()
-
-    def _replaced(self) -> bool:
-        """Return whether the first part is another file than before, while a later one is read."""
-        if self._file is None or os.fspath(self._file.path) == self.path or not os.path.isfile(self.path):
-            return False
-        return not os.path.samestat(os.stat(self.path), self._first)
 
     def _take(self, data: bytes) -> None:
         self.bytes += len(data)

@@ -129,15 +129,14 @@ def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int,
 
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"
-_NUMBERS = frozenset((
-    "uwb_tag_offset_x", "uwb_tag_offset_y", "uwb_tag_height", "uwb_anchor_height", "robot_frontlaser_offset",
-    "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset", "robot_front_laser_max", "laser_front_laser_max_range",
-    "laser_front_laser_resolution", "laser_time_increment", "laser_range_min",
-))  # fmt: skip
+_NUMBER = re.compile(
+    r"uwb[2-9]?_tag_(offset_x|offset_y|height)|uwb_anchor_height(_.*)?|robot_frontlaser_(side_|angular_)?offset"
+    r"|robot_front_laser_max|laser_front_laser_(max_range|resolution)|laser_(time_increment|range_min)"
+)
+"""Names of parameters that are numbers."""
 LASER_IS_BASE = "laser_is_base"
 """Parameter of uwblite's own: the poses of the log are those of the laser, see SensorMounting."""
 _TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
-_FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
 _OF_LASER = ("laser_time_increment", "laser_range_min", "laser_flipped")
 """Parameters of the first lidar; of the second it is laser2_time_increment and so on."""
 _FLIPPED = ("laser_flipped", "laser_front_laser_flipped", "laser_laser1_flipped", "robot_frontlaser_flipped")
@@ -170,7 +169,7 @@ class Params:
             self._flipped = _TRUE[tokens[2].lower()]
         elif name == LASER_IS_BASE:
             self._laser_is_base = _TRUE.get(tokens[2].lower(), False)
-        elif name in _NUMBERS or _FURTHER_TAG.fullmatch(name) or name.startswith(_ANCHOR_HEIGHT):
+        elif _NUMBER.fullmatch(name):
             if name.startswith(_ANCHOR_HEIGHT) and (fault := fault_of_id(name.removeprefix(_ANCHOR_HEIGHT))):
                 raise BrokenLine(f"PARAM {_ANCHOR_HEIGHT}*: the anchor's id {fault}")
             (self._numbers[name],) = numbers(tokens[2:3], f"PARAM {name[:40]}", 1)

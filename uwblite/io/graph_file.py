@@ -66,15 +66,13 @@ class GraphFile:
         file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))
         file = file.from_odometry() if from_odometry else file
         lost, floating = ~tied_chains(file.graph, file.chains), floating_components(file.graph) > 0
-        lost_words, floating_words = (
-            f"pose {pose_ids[int(np.argmax(poses))]} is not connected to the first one ({poses.sum()} such poses)"
-            if poses.any() else "" for poses in (lost, floating)
-        )  # fmt: skip
-        if lost_words:
+        words = "pose {} is not connected to the first one ({} such poses)"
+        lost_words, floating_words = (words.format(pose_ids[int(np.argmax(p))], p.sum()) for p in (lost, floating))
+        if lost.any():
             raise content.error(lost_words)
         nowhere = [name for name, xy in zip(anchor_ids, file.graph.anchors, strict=True) if np.isnan(xy[0])]
         warnings = [f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}"] if nowhere else []
-        if floating_words:
+        if floating.any():
             warnings.append(f"{floating_words}: they keep to their own edges, and where they stand says nothing")
         return replace(file, warnings=tuple(warnings))
 

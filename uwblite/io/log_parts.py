@@ -11,6 +11,7 @@ import re
 import stat
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 
@@ -127,10 +128,10 @@ class GrowingFile:
         """How often the file was begun again."""
         try:
             self._file = _open(self.path)
-            size = os.fstat(self._file.fileno()).st_size
+            self._first, self._begun = self.path, os.fstat(self._file.fileno())
         except OSError as error:
             raise FormatError(f"cannot be followed: {error.strerror or error}", path) from None
-        self.skipped = 0 if whole else max(size - HEAD_BYTES - TAIL_BYTES, 0)
+        self.skipped = 0 if whole else max(self._begun.st_size - HEAD_BYTES - TAIL_BYTES, 0)
         """Bytes between head and tail that are not read."""
         self._head_left = HEAD_BYTES if self.skipped else 0
         self._end = b""
@@ -153,17 +154,17 @@ class GrowingFile:
         return data
 
     def _successor(self) -> bytes:
-        """Return the beginning of another file that has taken this one's place; b"" where none has."""
-        try:
-            if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
-                return b""
-            other = _open(self.path)
-        except OSError:
-            return b""
-        self._file.close()
-        self._file, self._end = other, b""
-        self.restarts += 1
-        return self._file.read(_PIECE)
+        """Return the beginning of another file in the place of this one, or of the first part; b"" where there is none."""
+        for path, known in ((self.path, os.fstat(self._file.fileno())), (self._first, self._begun)):
+            with suppress(OSError):
+                if not os.path.samestat(os.stat(path), known):
+                    other = _open(path)
+                    self._file.close()
+                    self.path, self._file, self._end = path, other, b""
+                    self._first, self._begun = path, os.fstat(other.fileno())
+                    self.restarts += 1
+                    return self._file.read(_PIECE)
+        return b""
 
     def _next_part(self) -> bytes:
         """Return the beginning of the part beside this one that this one names as the next; b"" where there is none."""

@@ -19,10 +19,8 @@ from ..sensor_log import LogNotes, SensorLog
 SCHEMA = 3
 """Version of report.json; it grows when a field changes its meaning or goes."""
 
-_ANCHOR_FIELDS = (
-    "id", "position", "covariance", "ranges", "used_share", "bias", "bias_sigma", "residual_rms", "status", "reason",
-    "alternative",
-)  # fmt: skip
+_ANCHOR_FIELDS: tuple[str, ...] = ("id", "position", "covariance", "ranges", "used_share", "bias", "bias_sigma", "residual_rms")
+_ANCHOR_FIELDS += ("status", "reason", "alternative")
 _GRID_FIELDS = ("resolution", "origin", "rows", "cols")
 _CALIBRATION_FIELDS = ("name", "value", "sigma", "unit", "meaning", "state", "reason")
 

@@ -149,9 +149,8 @@ def _closure_markers(result: StoredResult, stamp: float) -> list[ros.Fields]:
     return markers
 
 
-FILES = (
-    "map.pgm", "map.yaml", "keepout_mask.pgm", "keepout_mask.yaml", "nav2_params.yaml", "initial_pose.yaml", "anchors.yaml",
-)  # fmt: skip
+_GRIDS = tuple(f"{name}.{ending}" for name in ("map", "keepout_mask") for ending in ("pgm", "yaml"))
+FILES = (*_GRIDS, "nav2_params.yaml", "initial_pose.yaml", "anchors.yaml")
 _SURE = 4.0
 """Log-odds of a cell of the mask: beyond the thresholds of occupied and free space."""
 

@@ -30,10 +30,8 @@ class Reading(NamedTuple):
     """Id of the tag that measured; '' where the message does not tell."""
 
 
-_TAGS = (
-    "tagId", "tag_id", "tagID", "tag", "id_tag", "requester_id", "requesterId", "source_id", "sourceId", "src_id", "srcId",
-    "origin_id", "originId", "initiator_id", "initiatorId",
-)  # fmt: skip
+_OF_ENDS = ("requester", "source", "src", "origin", "initiator")
+_TAGS = ("tagId", "tag_id", "tagID", "tag", "id_tag", *(f"{end}{form}" for end in _OF_ENDS for form in ("_id", "Id")))
 """Usual names of the field with the tag's id."""
 
 

@@ -6,13 +6,7 @@ are compared by their evidence, the marginal likelihood of the source's surfaces
 
     log E = log N(T; mean, C) + sum over objects log((1 - m) exp(g - chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|,
 
-where g is what a match gains over one by chance, at most as much as an object that moves loses. That share is measured beside
-the place. Two clouds may also show nothing of each other's place; then neither part gains.
-
-The surfaces of a cloud are cut into objects, runs of neighbouring points. An object moves by itself with probability m, which
-falls with its length: people, trolleys and animals are short, walls are not. It counts as one thing however many rays meet
-it, and a cow that fills the view cannot outvote the walls behind it. A point agrees with the target on a surface, disagrees
-beside one or in its free space, and says nothing where the target did not look.
+where the sum is that of object_likelihood. Two clouds may also show nothing of each other's place; then neither part gains.
 """
 
 from collections.abc import Sequence
@@ -26,40 +20,22 @@ from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import CloudRasters, rasterize
 from .clouds import Clouds
 from .correlative_matching import search
-from .free_space import free_space
+from .object_likelihood import ObjectLikelihood, ObjectPolicy
 from .raster_search import Window, best_poses
 from .scan_matching import (
-    Correspondences,
     PairFactors,
     PairPoints,
-    condensed,
-    correspondences,
     nondegenerate_step,
     pair_points,
 )
-from .visibility import in_free_space
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationConfig:
-    """Likelihood of surfaces."""
+    """Descent and search."""
 
-    gate: ClassVar[float] = 0.15
-    """Farthest match at the end, m."""
     first_gate: ClassVar[float] = 0.5
     """Farthest match at the beginning of the descent, m; the reach of the rasters."""
-    correlation: ClassVar[float] = 8.0
-    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
-    outlier: ClassVar[float] = 9.0
-    """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
-    gap: ClassVar[float] = 0.4
-    """Distance between neighbouring points that ends an object, m."""
-    moves: ClassVar[float] = 0.03
-    """Probability that an object moves by itself."""
-    long: ClassVar[float] = 2.0
-    """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
-    fits: ClassVar[float] = 5.0 / 6.0
-    """Share of the points in view that match in the true place."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
     worth: ClassVar[float] = 0.02
@@ -182,10 +158,7 @@ class Registration:
         nearest : surface by bearing, see visibility. sigma : standard deviation of a match, m. chance : see matched_by_chance.
         """
         self._clouds, self._raster, self.sigma = clouds, raster, sigma
-        self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        self._chance = chance
-        self._object, length = objects(clouds, RegistrationConfig.gap)
-        self._most = -np.log(RegistrationConfig.moves) * np.maximum(length / RegistrationConfig.long, 1.0)
+        self.objects = ObjectLikelihood(clouds, raster, nearest, sigma, chance)
 
     def register(self, i: Ints, j: Ints, points: PairPoints, prior: Prior, other: Floats) -> Placement:
         """Place sources j (e,) in targets i (e,).
@@ -225,16 +198,16 @@ class Registration:
         pose, variance = start.copy(), self.sigma**2
         gate, temper, left = c.first_gate, 1.0, np.arange(len(i))
         for _ in range(c.iterations):
-            factors, _ = self._match(i[left], PairPoints(points.row[left]), pose[left], gate, covariance[left] * temper)
+            factors, _ = self.objects.match(i[left], PairPoints(points.row[left]), pose[left], gate, covariance[left] * temper)
             step = self._step(factors, information[left], pose[left], mean[left])
             pose[left] += step
-            if gate <= c.gate and temper < c.cold:
+            if gate <= ObjectPolicy.gate and temper < c.cold:
                 left = left[np.abs(step).max(axis=1) >= c.converged]
-            gate, temper = max(gate * c.shrink, c.gate), temper * c.cooling
+            gate, temper = max(gate * c.shrink, ObjectPolicy.gate), temper * c.cooling
         pose[:, 2] = se2.wrap_angle(pose[:, 2])
-        factors, judged = self._match(i, points, pose, c.gate, np.zeros_like(covariance))
+        factors, judged = self.objects.match(i, points, pose, ObjectPolicy.gate, np.zeros_like(covariance))
         likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
-        hessian = factors.hessian / (variance * c.correlation)
+        hessian = factors.hessian / (variance * ObjectPolicy.correlation)
         off = _difference(pose, mean)
         distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
         prior = -distance - 0.5 * np.linalg.slogdet(covariance)[1]
@@ -272,13 +245,13 @@ class Registration:
 
     def _most_odds(self, placed: Placed, prior: Prior) -> Floats:
         """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
-        hessian = placed.factors.hessian / (self.sigma**2 * RegistrationConfig.correlation)
+        hessian = placed.factors.hessian / (self.sigma**2 * ObjectPolicy.correlation)
         here, there = (np.linalg.slogdet(np.eye(3) + cov @ hessian)[1] for cov in (prior.covariance, prior.slipped))
         return np.asarray(placed.evidence_lost + 0.5 * (here - there))
 
     def _step(self, factors: PairFactors, information: Floats, pose: Floats, mean: Floats) -> Floats:
         """Return a damped Gauss-Newton step (e, 3) of matches and prior."""
-        scale = self.sigma**2 * RegistrationConfig.correlation
+        scale = self.sigma**2 * ObjectPolicy.correlation
         hessian = factors.hessian / scale + information
         gradient = factors.gradient / scale + np.einsum("eij,ej->ei", information, _difference(pose, mean))
         step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
@@ -290,82 +263,8 @@ class Registration:
         """Return the log likelihood (e,) of sources in targets i (e,) at poses (e, 3), by that in unknown space."""
         if not len(i):
             return np.zeros(0)
-        _, judged = self._match(i, points, pose, RegistrationConfig.gate, np.zeros((len(i), 3, 3)))
+        _, judged = self.objects.match(i, points, pose, ObjectPolicy.gate, np.zeros((len(i), 3, 3)))
         return np.concatenate([part.likelihood for part in judged])
-
-    def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats, covariance: Floats) -> Bools:
-        """Return which points (p,) of all clouds belong to objects of sources j (e,) that moved by themselves.
-
-        Parameters
-        ----------
-        pose, covariance : (e, 3) T_i_j and (e, 3, 3). For the others see register.
-        """
-        moves = np.zeros(len(self._clouds.points), dtype=bool)
-        for found in correspondences(self._clouds, self._raster, i, pose, points, RegistrationConfig.gate):
-            some = found.pairs
-            judged = self._judge(found, i[some], pose[some], covariance[some])
-            for source, static in zip(j[some].tolist(), judged.static, strict=True):
-                rows = slice(int(self._clouds.offsets[source]), int(self._clouds.offsets[source + 1]))
-                number = np.minimum(self._object[rows], len(static) - 1)
-                moves[rows] |= (static[number] < _UNLIKELY) & (self._object[rows] < len(static))
-        return moves
-
-    def _match(
-        self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats
-    ) -> tuple[PairFactors, list["_Judged"]]:
-        """Return factors of the objects that do not move, and how each pair agrees, at poses (e, 3)."""
-        parts, judged = [], []
-        for found in correspondences(self._clouds, self._raster, i, pose, points, gate):
-            some = found.pairs
-            own = self._judge(found, i[some], pose[some], covariance[some])
-            weight = np.take_along_axis(own.static, self._object[found.row], axis=1) * found.good
-            parts.append(condensed(self._clouds, found, max(gate / 2.0, 3.0 * self.sigma), np.sqrt(weight)))
-            judged.append(own)
-        return concatenated(parts), judged
-
-    def _judge(self, found: Correspondences, i: Ints, pose: Floats, covariance: Floats) -> "_Judged":
-        """Judge the objects of some pairs (e,) at poses (e, 3), whose covariance (e, 3, 3) is left out of the residuals."""
-        c, usable = RegistrationConfig, found.row >= 0
-        (nx, ny), (rx, ry) = found.normal, found.arm
-        jacobian = np.stack([nx, ny, ny * rx - nx * ry])
-        # What the prior leaves open shifts a surface without making it a thing that moves.
-        variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
-        squared = np.square(found.distance) / variance
-        cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
-        through, in_view = in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
-        through &= usable & ~found.good
-        missed = usable & ~found.good & in_view & ~through
-        chance = self._chance[i][:, None]
-        cost += 2.0 * np.log(np.maximum((1.0 - chance) / (1.0 - c.fits), 1.0)) * missed
-        cost[through] = c.outlier
-        group = self._object[found.row]
-        many = int(group.max(initial=0)) + 1
-        key = (np.arange(len(i))[:, None] * many + group)[usable]
-        chi2, matched, asked = (
-            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / c.correlation
-            for v in (cost, found.good.astype(np.float64), usable.astype(np.float64))
-        )
-        most = np.full((len(i), many), -np.log(c.moves))
-        most.reshape(-1)[key] = self._most[found.row[usable]]
-        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
-        stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
-        return _Judged(
-            1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
-            np.logaddexp(fixed + stays, -most).sum(axis=1),
-            np.logaddexp(fixed + np.minimum(gain * asked, most), -most).sum(axis=1),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judged:
-    """How the objects of some pairs (e,) agree with their targets."""
-
-    static: Floats
-    """(e, o) probability that each object does not move."""
-    likelihood: Floats
-    """(e,) log likelihood of the source, by that in unknown space."""
-    most: Floats
-    """(e,) the same where every point agreed."""
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:
@@ -387,37 +286,3 @@ def _difference(pose: Floats, mean: Floats) -> Floats:
     off = pose - mean
     off[:, 2] = se2.wrap_angle(off[:, 2])
     return off
-
-
-def matched_by_chance(clouds: Clouds, raster: CloudRasters, i: Ints, points: PairPoints, mean: Floats) -> Floats:
-    """Return the share (k,) of points of sources that match each target cloud i (e,) where they do not belong: aside.
-
-    Parameters
-    ----------
-    points : of the sources, see pair_points. mean : (e, 3) about where these belong, T_i_j.
-    """
-    matched = np.ones(len(i))
-    for x in (-_ASIDE, _ASIDE):
-        for y in (-_ASIDE, _ASIDE):
-            aside = mean + np.array([x, y, 0.0])
-            for found in correspondences(clouds, raster, i, aside, points, RegistrationConfig.gate):
-                matched[found.pairs] += found.good.sum(axis=1)
-    # One match of three beforehand (Laplace's rule of succession).
-    chance = np.full(len(clouds), 1.0 / 3.0)
-    chance[i] = matched / (4 * (points.row >= 0).sum(axis=1) + 3)
-    return chance
-
-
-_ASIDE = 0.4
-"""Distance along both axes at which no point is where it belongs, m; along a wall, points match all the same."""
-
-
-def objects(clouds: Clouds, gap: float) -> tuple[Ints, Floats]:
-    """Return the number (p,) of the object of each point within its cloud, from 0 on, and the length (p,) of it, m."""
-    points, owner = clouds.points.astype(np.float64), clouds.owner
-    away = np.hypot(*np.diff(points, axis=0).T) if len(points) else np.zeros(0)
-    new = np.concatenate([[True], (away > gap) | (np.diff(owner) != 0)])[: len(points)]
-    number = np.cumsum(new) - 1
-    length = np.bincount(number, np.concatenate([[0.0], away])[: len(points)] * ~new)
-    first = number[np.minimum(clouds.offsets[:-1], max(len(points) - 1, 0))] if len(points) else number
-    return number - first[owner], length[number]

@@ -19,8 +19,9 @@ from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
+from .object_likelihood import ObjectLikelihood, matched_by_chance
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, Registration, RegistrationConfig, matched_by_chance
+from .registration import Placed, Prior, Registration, RegistrationConfig
 from .scan_matching import match, measured, pair_points
 from .step_search import StepSearch
 from .visibility import nearest_by_bearing
@@ -146,7 +147,7 @@ def follow(
     seen, others = np.flatnonzero(lasting), ~np.isin(edges.i, i[slips > 0.5])
     slid = RelativePoseEdges(i[seen], i[seen] + 1, *placed.rows(seen).measured(sigma**2 * config.correlation))
     both = edges.rows(np.flatnonzero(others)).followed_by(slid)
-    miss, moving = _miss(clouds, noise), _moving(registration, clouds, i, placed, config)
+    miss, moving = _miss(clouds, noise), _moving(registration.objects, clouds, i, placed, config)
     return ScanOdometry(
         edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
         float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving, rejected,
@@ -193,7 +194,7 @@ _FEWEST = 6
 
 
 def _moving(
-    registration: Registration, clouds: Clouds, first: Ints, placed: Placed, config: TrackingConfig
+    objects: ObjectLikelihood, clouds: Clouds, first: Ints, placed: Placed, config: TrackingConfig
 ) -> Bools:
     """Return which points (p,) belong to objects that moved since the keyframe before, or one some steps before.
 
@@ -202,7 +203,7 @@ def _moving(
     i, j, pose, covariance = first, first + 1, placed.pose, placed.covariance
     moves = np.zeros(len(clouds.points), dtype=bool)
     for _ in range(_STEPS_BACK):
-        moves |= registration.moving(i, j, pair_points(clouds, j, config.points), pose, covariance)
+        moves |= objects.moving(i, j, pair_points(clouds, j, config.points), pose, covariance)
         after = np.flatnonzero(np.isin(j, first))
         follows = np.searchsorted(first, j[after])
         turn = se2.rotation(pose[after, 2])

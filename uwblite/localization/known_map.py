@@ -45,10 +45,15 @@ class KnownAnchors:
         """Return the anchors that have one of these names."""
         rows = [k for k, name in enumerate(self.ids) if name in names]
         return replace(
-            self, ids=tuple(self.ids[k] for k in rows), positions=self.positions[rows], bias=self.bias[rows],
-            rise=self.rise[rows], sigma=self.sigma[rows], bias_sigma=self.bias_sigma[rows],
+            self,
+            ids=tuple(self.ids[k] for k in rows),
+            positions=self.positions[rows],
+            bias=self.bias[rows],
+            rise=self.rise[rows],
+            sigma=self.sigma[rows],
+            bias_sigma=self.bias_sigma[rows],
             errors=tuple(self.errors[k] for k in rows if self.errors),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

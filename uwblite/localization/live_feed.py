@@ -43,9 +43,12 @@ class LiveFeed:
     """
 
     def __init__(
-        self, known: KnownMap, mounting: Callable[[SensorMounting], SensorMounting], note: Callable[[str], None],
+        self,
+        known: KnownMap,
+        mounting: Callable[[SensorMounting], SensorMounting],
+        note: Callable[[str], None],
         patience: Patience | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._known, self._mounting, self._note, self._patience = known, mounting, note, patience or Patience()
         self._reader = LiveReader()
         self._localizer: Localizer | None = None

@@ -81,9 +81,14 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     localized, agreed = float(there.mean()), 1.0 - float(found.contradicting[there].mean())
     warnings, more = _findings(log, known, passes, localized, agreed, overlap)
     return Localization(
-        log.odometry.stamps[rows][there], found.poses[there], found.covariances[there], localized, overlap,
-        warnings, (*doubts, *more),
-    )  # fmt: skip
+        log.odometry.stamps[rows][there],
+        found.poses[there],
+        found.covariances[there],
+        localized,
+        overlap,
+        warnings,
+        (*doubts, *more),
+    )
 
 
 def _both(log: SensorLog, known: KnownMap, rows: np.ndarray, progress: Progress | None) -> tuple[Pass, Pass]:

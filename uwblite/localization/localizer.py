@@ -87,6 +87,11 @@ class Localizer:
         return self._estimator.work
 
     @property
+    def tracks(self) -> bool:
+        """Whether one place is tracked, however vague the pose has become."""
+        return self._estimator.tracks
+
+    @property
     def ends(self) -> Floats:
         """(2,) numbers of rays on walls, and in known space, while the pose was known."""
         return self._estimator.ends.copy()
@@ -247,9 +252,14 @@ class Localizer:
     def _use_range(self, entry: Range, stamp: float, then: Floats) -> None:
         anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor
         fact = RangeFacts(
-            anchor, anchors.positions[anchor], entry.metres - float(anchors.bias[anchor]), float(self._square[anchor]),
-            float(anchors.sigma[anchor]), anchors.scale, anchors.errors[anchor] if anchors.errors else None,
-        )  # fmt: skip
+            anchor,
+            anchors.positions[anchor],
+            entry.metres - float(anchors.bias[anchor]),
+            float(self._square[anchor]),
+            float(anchors.sigma[anchor]),
+            anchors.scale,
+            anchors.errors[anchor] if anchors.errors else None,
+        )
         self._estimator.use_range(fact, tags[min(max(entry.tag, 0), len(tags) - 1), :2], stamp, then)
 
 

@@ -77,7 +77,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
     for done, (at, kind, k) in enumerate(zip(times.tolist(), kinds.tolist(), numbers.tolist(), strict=True)):
         if kind == _ODOMETRY:
             state = localizer.add_odometry(at, *log.odometry.poses[k].tolist())
-            if (slot := wanted[k]) >= 0 and not state.lost:
+            if (slot := wanted[k]) >= 0 and localizer.tracks:
                 poses[slot], covariances[slot] = state.pose, state.covariance - known.covariance_at(state.pose[:2])
             reason = state.reason
         elif kind == _RANGE and log.ranges is not None:

@@ -26,6 +26,8 @@ _FRESH_WAY = 0.1
 """m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
+_UNFELT = 0.1
+"""m and rad; motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _UNIT_WAY = 1.0
@@ -71,11 +73,16 @@ class PoseEstimator:
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
-        """Odometer and T_map_odom of the first of the searches that agree."""
+        """Odometer and T_map_odom at the first of the searches that agree."""
         self._compared = 0
         """Comparisons of the unit that the map has passed, one after the other."""
         self._running = full_agreement(len(known.anchors.ids))
         self._reason = "nothing has been measured yet"
+
+    @property
+    def tracks(self) -> bool:
+        """Whether one place is tracked, however vague the pose has become."""
+        return self._certain
 
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
@@ -124,6 +131,15 @@ class PoseEstimator:
         some = turned.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         self.work += len(before) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
+        if self._certain and driven <= 1e-3:
+            # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
+            slack = hypotheses.moved(self._bank, np.zeros(3), _UNFELT, self.known.anchors.slow_sigma)
+            pushed = hypotheses.matched(slack, walls, rays, 1.0)
+            there = walls.agreement(pushed.poses, some)
+            self.work += hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit)
+            if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
+                self.wander(_UNFELT)
+                self._bank, found = pushed, there
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
@@ -179,9 +195,9 @@ class PoseEstimator:
         share, covariance = hypotheses.mixture(bank, best)
         fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
-        reason = "" if self._certain else self._reason
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
-        return LocalizerState(stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], far)
+        reason = verdict.vague(covariance) if self._certain else self._reason
+        return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
 
     def _laser_turn(self) -> Floats:
         """Return the pose (3,) of the base as the laser's stated mounting shows it, in its own frame; m, m, rad."""
@@ -249,11 +265,18 @@ class PoseEstimator:
             self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)
             fitting = verdict.agreeing(self._bank.poses[best], ranges)
         pose = self._bank.poses[best].copy()
-        fit, likelihood, agreed = float(found.fit[best]), float(found.by_ranges[best]), self._agreed(pose)
+        certain = verdict.needed(fitting, proven)
+        undecided = verdict.undecided(self._bank, best, found.complete, certain)
+        agreed = self._agreed(None if undecided else pose)
+        fit, likelihood = float(found.fit[best]), float(found.by_ranges[best])
         odds = verdict.map_odds(fit, known, found.independent, likelihood, fitting, agreed)
-        self._reason = verdict.doubt(self._bank, best, found.complete, odds, fitting, proven) or verdict.other_unit(
-            self.known.walls, pose, found.rays, found.looks, ranges, not proven
+        self._reason = (
+            undecided
+            or verdict.nowhere(odds, fitting)
+            or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
         )
+        if not self._reason and odds.total < certain:
+            self._reason = "found; a little more driving will confirm it"
         self._trim(bool(verdict.nowhere(odds, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
@@ -261,9 +284,12 @@ class PoseEstimator:
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
             self._running.restart(self._sees())
 
-    def _agreed(self, pose: Floats) -> float:
-        """Return over how many metres of driving all searches found the same place, the one of a pose (3,) now."""
+    def _agreed(self, pose: Floats | None) -> float:
+        """Return over how many metres driven searches found the same place alone, that of a pose (3,) now; None = none."""
         odom, first = self._odometer.pose, self._confirmed
+        if pose is None:
+            self._confirmed = None
+            return 0.0
         if first is None or hypotheses.apart(pose, se2.compose(first[1], odom)[None])[0]:
             self._confirmed = first = (self._way, se2.compose(pose, se2.inverse(odom)))
         return self._way - first[0]

@@ -53,9 +53,7 @@ _LENGTH, _SAME_PLACE = 1.5, 0.01
 """m; length of the errors in a map that does not say it, as RadioModel; and way below which nothing is new."""
 
 
-def ranged(
-    bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0
-) -> tuple[Hypotheses, Floats, Floats, Floats]:
+def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) -> tuple[Hypotheses, Floats, Floats, Floats]:
     """Correct every hypothesis by one range.
 
     Parameters

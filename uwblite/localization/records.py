@@ -45,7 +45,7 @@ class LocalizerState:
     odometry: Floats
     """(3,) T_odom_base at the same time, as the wheels have it: pose * odometry^-1 is T_map_odom."""
     lost: bool
-    """The pose is not known; `pose` is the best guess."""
+    """The pose is not known, or not to half a metre; `pose` is the best guess."""
     reason: str = ""
     """Why it is not known, for people."""
     alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))

@@ -18,6 +18,8 @@ _CERTAIN_AGAIN = 4.6
 """The same in a map that is the right one, as a pose was tracked in it: 100 : 1."""
 SIGMA_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less certain is not found yet."""
+_VAGUE = (0.4, 0.25)
+"""m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
 ELSEWHERE = (-0.35, -1.2)
 """Log-likelihood of a ray, and of an independent range, at the best place of a building that is not the map's. In 770 searches
 in three of them the odds against that were never 400 : 1; in the right building they are after 0.7 to 1.4 m (median)."""
@@ -33,34 +35,43 @@ ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 _AGREED = 3.0
 """Log-likelihood, 20 : 1, of a metre of driving over which all searches found the same place: in another building the best
 place leaps. By scans or ranges alone, with nothing independent beside them, it is all that counts: two metres."""
-_UNIT_KNOWN = 0.04
-"""Standard deviation of the map's unit from which another one would have been noticed; a start also needs the unit itself to be
-within what data sheets allow."""
+_UNIT_KNOWN = 0.7
+"""Standard deviation of the map's unit, as a share of what data sheets allow, from which another one would have been noticed; a
+start also needs the unit itself to be within that."""
 _UNIT_CLEAR = 0.01
 """The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
 
 
-def doubt(bank: Hypotheses, best: int, complete: bool, odds: "MapOdds", fitting: "RangeFit", proven: bool = False) -> str:
-    """Return why the best hypothesis is not certain yet; "" = it is.
+def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> str:
+    """Return why another place than the best one, or none in particular, may be right; "" = none may.
 
     Parameters
     ----------
-    complete : the search left no place out. odds : of the best hypothesis. fitting : how the ranges agree there.
-    proven : the map is the right one.
+    complete : the search left no place out. certain : log-likelihood by which it must be better than any other.
     """
-    certain = _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
-    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     if not complete:
         return "too many places are as likely; drive on"
-    if why := nowhere(odds, fitting):
-        return why
-    if len(rivals) and rivals.max() > -certain:
+    if rivals.max(initial=-np.inf) > -certain:
         count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
         return "place or heading is not sure yet; drive on"
-    return "found; a little more driving will confirm it" if odds.total < certain else ""
+    return ""
+
+
+def needed(fitting: "RangeFit", proven: bool) -> float:
+    """Return the log-likelihood of certainty; proven : the map is the right one, as a pose was tracked in it."""
+    return _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
+
+
+def vague(covariance: Floats) -> str:
+    """Return why a pose that is tracked is not known, by its covariance (3, 3), m and rad; "" = it is known."""
+    place, heading = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
+    if place <= _VAGUE[0] and heading <= _VAGUE[1]:
+        return ""
+    return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +81,7 @@ class MapOdds:
     scans: float
     ranges: float
     agreed: float
-    """m driven over which all searches found it."""
+    """m driven over which all searches found it and no other place."""
     alone: bool
     """There are scans or ranges alone."""
 
@@ -86,7 +97,7 @@ def map_odds(fit: float, ends: float, rays: float, likelihood: float, fitting: "
     Parameters
     ----------
     fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
-    likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven with all searches the same.
+    likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven over which searches agree.
     """
     ranges = likelihood - INDEPENDENT_RANGES * fitting.count * ELSEWHERE[1]
     sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
@@ -126,7 +137,7 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges
         if not start and scale.sigma < _UNIT_CLEAR:
             break
     sigma, error, limit = min(((s.sigma, abs(s.error), limit) for _, s, limit in compared), default=(0.0, 0.0, 0.0))
-    if start and (sigma > _UNIT_KNOWN or error > limit):
+    if start and (sigma > _UNIT_KNOWN * limit or error > limit):
         return "whether the map has the sensors' unit is not known yet; drive on"
     return ""
 
@@ -142,13 +153,9 @@ class RangeFit:
     """Anchors whose ranges agree."""
 
     @property
-    def share_of_needed(self) -> float:
-        """Ranges to two anchors or more that agree, as a share of what a start needs."""
-        return self.share * self.count / ENOUGH_RANGES if self.anchors >= 2 else 0.0
-
-    @property
     def enough(self) -> bool:
-        return self.share_of_needed >= 1.0
+        """Whether those that agree, to two anchors or more, are as many as ranges alone need."""
+        return self.anchors >= 2 and self.share * self.count >= ENOUGH_RANGES
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:

@@ -222,9 +222,7 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
     origin, nearest = _nearest(points, cell)
     missing = float(np.clip(grid.missing_share, _STRANGE, 1.0)) if np.isfinite(grid.missing_share) else _STRANGE
-    return Walls(
-        grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest
-    )
+    return Walls(grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest)
 
 
 def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats) -> Floats:

@@ -30,7 +30,7 @@ class LoopClosureConfig:
     reach: float = setting(6.0, advanced=True)
     """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
     search_limit: float = setting(8.0, advanced=True)
-    """Largest half-width of a search among sub-maps, m; pairs less certain than that are sought by long stretches."""
+    """Largest half-width of a search among sub-maps, m. Where a pair is less certain, long stretches are compared first."""
     search_angle: ClassVar[float] = 0.7
     """Largest half-width of a search, rad."""
     gate: float = 0.15

@@ -228,7 +228,7 @@ def _along_rows(obstacles: Bools, cut: int) -> tuple[NDArray[np.int32], NDArray[
 
 def _across_rows(
     along: NDArray[np.unsignedinteger], count: int, margin: int, reach: int, up: int, cut: int
-) -> NDArray[np.unsignedinteger]:  # fmt: skip
+) -> NDArray[np.unsignedinteger]:
     """Return squared distances (count, cols) in half cells, of centres or, `up` by half a cell, of the edges above."""
     found = np.full((count, along.shape[1]), cut, dtype=along.dtype)
     for d in range(up - reach, reach + 1):

@@ -66,13 +66,24 @@ def posterior(log_odds: Floats, duration: Floats) -> Floats:
 
 def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
     """Return the logarithm of the density (e,) of each step at a graph's poses, sound or slipping with their shares of time."""
+    share = LASTS / (EVERY + LASTS)
+    sound, slipping = _of_either(wheels, graph)
+    return np.asarray(np.logaddexp(np.log(1.0 - share) + sound, np.log(share) + slipping))
+
+
+def slipped(wheels: OdometryEdges, graph: Graph) -> Floats:
+    """Return the probability (e,) that wheels, whose noise is that of sound ones, slip over each step at a graph's poses."""
+    sound, slipping = _of_either(wheels, graph)
+    return posterior(slipping - sound, wheels.duration)
+
+
+def _of_either(wheels: OdometryEdges, graph: Graph) -> tuple[Floats, Floats]:
+    """Return the logarithm of the density (e,) of each step, sound and slipping."""
     sound = covariance_of(wheels, graph)
     slipping = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
     off = se2.between(graph.poses[wheels.i], graph.poses[wheels.j]) - wheels.corrected(graph)
     off[:, 2] = se2.wrap_angle(off[:, 2])
-    share = LASTS / (EVERY + LASTS)
-    parts = [np.log(p) + _log_normal(off, covariance) for p, covariance in ((1.0 - share, sound), (share, slipping))]
-    return np.asarray(np.logaddexp(*parts))
+    return _log_normal(off, sound), _log_normal(off, slipping)
 
 
 def _log_normal(off: Floats, covariance: Floats) -> Floats:

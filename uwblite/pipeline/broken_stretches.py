@@ -15,7 +15,8 @@ from .. import se2
 from ..arrays import Bools, Ints
 from ..findings import Fact
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..lidar.registration import Registration, matched_by_chance
+from ..lidar.object_likelihood import matched_by_chance
+from ..lidar.registration import Registration
 from ..lidar.scan_matching import pair_points
 from ..lidar.visibility import nearest_by_bearing
 from ..odometry.slips import log_densities, with_slips

@@ -17,6 +17,7 @@ from ..graph.robust import SQUARED
 from ..graph.solver import Optimizer, SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
+from ..odometry.slips import slipped, with_slips
 from ..odometry.wheels import sideways_priors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
@@ -121,13 +122,18 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
+    wheels, slips = estimate.odometry, estimate.bootstrap.slips
     optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
         estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
         laps = range(0) if have_scans else laps[-1:]
     for lap in laps:
+        # Noise learnt with wheels bent over a slip would keep them bent.
+        if slips.any():
+            estimate = replace(estimate, odometry=with_slips(wheels, slips))
         estimate, result = _lap(estimate, lap, task, optimizer)
+        slips = slipped(wheels, estimate.graph) if slips.any() else slips
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:

@@ -1,5 +1,6 @@
 """Starting values from nothing: attempts with several errors of the heading, the first of which agrees with the ranges."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,8 @@ def bootstrap_graph(
     hypothesis that begins like an earlier attempt would continue like it, and is dropped. Where the first began well, one that
     begins as well is continued at once, as long as the ranges agree, then the others in the order of their misfit; the first
     that reaches the end is taken. Where none does, the best of them is continued if it began clearly better than the
-    uncorrected heading, and is taken if it also ends better.
+    uncorrected heading, and is taken if it also ends better. Wheels that slip are the other explanation: they are sought from
+    several first stretches, and of the attempts that agree the one of greatest evidence is taken.
 
     Parameters
     ----------
@@ -44,8 +46,28 @@ def bootstrap_graph(
     begun = first.misfit()
     # Where it has a jump, it is completed only if nothing else agrees.
     first.run(torn=not others)
-    if first.misfit() < config.agreement or not others:
+    if first.misfit() < config.agreement:
         return first.estimate()
+    tried, slipping = [_likeliest_heading(first, begun, others, config)] if others else [first], list[Attempt]()
+    while len(slipping) <= _STARTS and (not slipping or slipping[-1].slips.any()):
+        # The wheels may have slipped in the first stretch as well.
+        slipping.append(Attempt(graph, odometry, ranges, path, config, search, [each.first for each in slipping]))
+        slipping[-1].run()
+    agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
+    return max([*tried, *agreeing], key=Attempt.evidence).estimate()
+
+
+_STARTS = 3
+"""Further stretches that are tried as the first one where the wheels slip."""
+
+
+def _likeliest_heading(first: Attempt, begun: float, others: Sequence[Attempt], config: BootstrapConfig) -> Attempt:
+    """Return the first attempt, or another one with a gross error of the heading whose ranges agree better, complete.
+
+    Parameters
+    ----------
+    begun : misfit with which the first one began.
+    """
     tried, misfits = [first], [np.inf]
     for attempt in others:
         attempt.run(0.0)
@@ -55,15 +77,15 @@ def bootstrap_graph(
         tried.append(attempt)
         misfits.append(attempt.misfit())
         if misfits[-1] <= begun < config.agreement and attempt.agrees_to_the_end():
-            return attempt.estimate()
+            return attempt
     order = np.argsort(misfits, kind="stable")[: len(tried) - 1].tolist()
     for number in order:
         if tried[number].agrees_to_the_end():
-            return tried[number].estimate()
+            return tried[number]
     hopeful = tried[order[0]] if order and misfits[order[0]] < 0.8 * begun else first
     first.run()
     hopeful.run()
-    return (hopeful if hopeful.misfit() < 0.8 * first.misfit() else first).estimate()
+    return hopeful if hopeful.misfit() < 0.8 * first.misfit() else first
 
 
 def _with_heading_scale(calibration: Calibration, value: float) -> Calibration | None:

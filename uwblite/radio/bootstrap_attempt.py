@@ -7,19 +7,25 @@ poses extends at both ends. Each piece is appended by the calibrated odometry, o
 again and anchors not yet placed are searched from the poses so far.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, spread
+from ..arrays import Bools, Floats, runs_of, spread
 from ..config import setting
 from ..graph.gnc import tightened
-from ..graph.graph import Graph
+from ..graph.graph import Edges, Graph, edge_cost
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
+from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
+from ..odometry.slips import with_slips
+from ..problem.alternatives import EvidencePolicy
+from .range_noise import RangeNoise, RangeNoiseConfig, effective_sigma
+from .slip_search import TagRanges, likeliest_slip, log_prior
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
 
 
@@ -65,6 +71,8 @@ class BootstrapResult:
     """By anchor: what the last search found, best first."""
     ambiguous: Bools
     """(a,) two positions explain the ranges about equally well."""
+    slips: Floats = field(default_factory=lambda: np.zeros(0))
+    """(e,) probability that the wheels slipped over each step; empty = not sought."""
 
 
 class Attempt:
@@ -72,11 +80,20 @@ class Attempt:
 
     def __init__(
         self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
-        search: TrilaterationConfig,
-    ) -> None:
+        search: TrilaterationConfig, without: Sequence[tuple[int, int]] | None = None,
+    ) -> None:  # fmt: skip
+        """Take what is known.
+
+        Parameters
+        ----------
+        without : stretches, of poses first <= k < last, none of which the first one overlaps; wheels may slip then. None = they
+            do not.
+        """
+        self.seeks, self.without = without is not None, without or ()
         self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
         self.config, self.search = config, search
         self.live = ranges.alive
+        self.wheels, self.slips = odometry, np.zeros(len(odometry))
         self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
@@ -104,10 +121,10 @@ class Attempt:
             agreed = self._extend(self.piece)
             self.piece = 1.5 * self.piece if agreed else max(0.8 * self.piece, self.smallest)
             if self.high - self.low >= self.config.resolve_factor * self.solved or self.complete:
-                self._solve((6.0, 3.0))
+                self._solve(_SCALES[1:])
                 self.solved = self.high - self.low
                 if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
-                    self._solve((6.0, 3.0))
+                    self._solve(_SCALES[1:])
                 if not torn and self._is_torn():
                     break
         if np.isinf(enough):
@@ -126,6 +143,7 @@ class Attempt:
     def _begin(self) -> None:
         """Solve the clearest stretch."""
         self.piece = self.config.piece * self._seed()
+        self.first = self.low, self.high
         self.smallest, self.solved = 0.3 * self.piece, self.high - self.low
         if self.placed.any():
             self._solve((10.0, 3.0))
@@ -152,7 +170,23 @@ class Attempt:
         """Return the estimate of this attempt."""
         final = replace(self.graph, poses=self.poses, anchors=self.anchors, calibration=self.calibration)
         found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
-        return BootstrapResult(final, self.placed, found, self.doubtful)
+        return BootstrapResult(final, self.placed, found, self.doubtful, self.slips)
+
+    def evidence(self) -> float:
+        """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant."""
+        part, number = self._part(self.low, self.high), len(runs_of(self.slips > 0.0))
+        edges = [self._as_often_as_independent(e, part) if isinstance(e, RangeEdges) else e for e in part.edges]
+        ranges = sum(len(e) for e in edges if isinstance(e, RangeEdges))
+        return number * log_prior(0.0, ranges // (number + 1)) - _cost_of(edges, part)
+
+    def _as_often_as_independent(self, ranges: RangeEdges, part: Graph) -> RangeEdges:
+        """Return ranges of the assumed noise that count as often as they have errors of their own: neighbours are alike."""
+        usual, weights, tags = RangeNoiseConfig(), np.ones(len(ranges)), ranges.tag_positions(part.poses)
+        noise = RangeNoise(np.sqrt(1.0 - usual.slow_share), np.sqrt(usual.slow_share), usual.correlation_length)
+        for anchor in np.unique(ranges.anchor):
+            own = ranges.anchor == anchor
+            weights[own] = effective_sigma(tags[own], noise) ** -2
+        return replace(ranges, sigma=np.full(len(ranges), self.config.range_sigma), weights=weights)
 
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
@@ -170,7 +204,7 @@ class Attempt:
         low, high = self.low, self.high or len(self.path)
         steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))[low : high - 1]
         off = se2.between(steps, se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
-        return bool(np.any(np.abs(off) > self.config.tear))
+        return bool(np.any(np.abs(off[self.slips[low : high - 1] == 0.0]) > self.config.tear))
 
     def _unclear(self, hypotheses: list[AnchorHypothesis]) -> bool:
         return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
@@ -187,6 +221,8 @@ class Attempt:
             for start in np.linspace(0.0, total - length, places):
                 low = int(np.searchsorted(self.path, start))
                 high = int(np.searchsorted(self.path, start + length, "right"))
+                if any(low < last and first < high for first, last in self.without) and length < total:
+                    continue
                 found = self._search(low, high, self.config.drift * length)
                 clear = [h[0] for h in found.values() if h and not self._unclear(h)]
                 worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
@@ -231,14 +267,67 @@ class Attempt:
             old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), old + 1)
             self.poses[old - 1 : self.high] = se2.chain(self.poses[old - 1], motion[old - 1 : self.high - 1])
-            agreed &= self._optimise_piece(old - 1, self.high, old - 1)
+            if not self._optimise_piece(old - 1, self.high, old - 1):
+                agreed = False
+                begin = int(np.searchsorted(self.path, self.path[old - 1] - piece))
+                self._with_slip(max(begin, self.low, self._last_slip(old)), self.high, motion, forward=True)
         if self.low > 0:
             old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, old - 1)
             back = se2.inverse(motion[self.low : old])[::-1]
             self.poses[self.low : old + 1] = se2.chain(self.poses[old], back)[::-1]
-            agreed &= self._optimise_piece(self.low, old + 1, old)
+            if not self._optimise_piece(self.low, old + 1, old):
+                agreed = False
+                end = int(np.searchsorted(self.path, self.path[old] + piece, "right"))
+                self._with_slip(self.low, min(end, self.high, self._next_slip(old)), motion, forward=False)
         return agreed
+
+    def _last_slip(self, before: int) -> int:
+        """Return the pose at which the last slip before a pose ends."""
+        found = np.flatnonzero(self.slips[:before] > 0.0)
+        return int(found[-1]) + 1 if len(found) else 0
+
+    def _next_slip(self, after: int) -> int:
+        """Return the number of poses until the next slip after a pose begins."""
+        found = np.flatnonzero(self.slips[after:] > 0.0)
+        return after + int(found[0]) + 1 if len(found) else len(self.path)
+
+    def _with_slip(self, low: int, high: int, motion: Floats, *, forward: bool) -> None:
+        """Let the wheels slip once in [low, high), where all is much likelier then than with wheels that are bent.
+
+        Parameters
+        ----------
+        motion : (n - 1, 3) of the wheels, calibrated. forward : whether the pose at the lower end is known, not the other one.
+        """
+        if not self.seeks:
+            return
+        own = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
+        rows, duration = self.ranges.rows(np.flatnonzero(own)), self.odometry.duration[low : high - 1]
+        prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
+        if bent - _USUAL * len(rows) + prior < EvidencePolicy.positive:
+            return
+        arm = rows.lever_arm + se2.rotate(rows.turn, np.broadcast_to(rows.tag, (len(rows), 2)))
+        pose, steps, start = rows.pose - low, motion[low : high - 1], self.poses[low]
+        if not forward:
+            pose, steps, start = high - low - 1 - pose, se2.inverse(steps)[::-1], self.poses[high - 1]
+            duration = duration[::-1]
+        seen = TagRanges(pose, arm, self.anchors[rows.anchor], rows.planar_ranges(), self.sigma[rows.anchor])
+        found = likeliest_slip(se2.chain(start, steps), duration, seen)
+        if found is None:
+            return
+        before = self.poses.copy(), self.slips.copy(), self.wheels
+        ends = (low + found.first, low + found.last) if forward else (high - 1 - found.last, high - 1 - found.first)
+        self.poses[low:high] = found.poses if forward else found.poses[::-1]
+        self.slips[slice(*ends)] = 1.0
+        self.wheels = with_slips(self.odometry, self.slips)
+        self._anneal_poses(low, high, low if forward else high - 1, _SCALES[1:])
+        if bent - self._cost(low, high) + prior < EvidencePolicy.positive:
+            self.poses, self.slips, self.wheels = before
+
+    def _cost(self, low: int, high: int) -> float:
+        """Return half the robust chi2 of wheels and ranges over the poses [low, high)."""
+        part = self._part(low, high)
+        return _cost_of(part.edges, part)
 
     def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
@@ -249,13 +338,15 @@ class Attempt:
         errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
         if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
             return True
-        fixed = np.zeros(high - low, dtype=bool)
-        fixed[fixed_pose - low] = True
-        everything = np.ones(len(self.anchors), dtype=bool)
-        unmoved = np.ones(len(self.calibration.values), dtype=bool)
-        part = replace(part, fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)
-        self.poses[low:high] = _anneal(part, (20.0, 6.0, 3.0)).poses
+        self._anneal_poses(low, high, fixed_pose, _SCALES)
         return False
+
+    def _anneal_poses(self, low: int, high: int, fixed_pose: int, schedule: tuple[float, ...]) -> None:
+        """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed."""
+        fixed = np.arange(low, high) == fixed_pose
+        everything, unmoved = np.ones(len(self.anchors), dtype=bool), np.ones(len(self.calibration.values), dtype=bool)
+        part = replace(self._part(low, high), fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)
+        self.poses[low:high] = _anneal(part, schedule).poses
 
     def _solve(self, schedule: tuple[float, ...]) -> None:
         """Optimise everything known so far and learn each anchor's spread."""
@@ -272,13 +363,26 @@ class Attempt:
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
-        wheels = self.odometry.rows(np.arange(low, max(high - 1, low)))
+        wheels = self.wheels.rows(np.arange(low, max(high - 1, low)))
         wheels = replace(wheels, i=wheels.i - low, j=wheels.j - low)
         which = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
         radio = self.ranges.rows(np.flatnonzero(which))
         radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
         alone = Graph(self.poses[low:high], self.anchors, (), self.calibration, work=self.graph.work)
         return alone.with_edges(wheels, radio)
+
+
+def _cost_of(edges: Iterable[Edges], part: Graph) -> float:
+    """Return half the chi2 of a part's edges, that of its ranges as annealing ends."""
+    kernel = Kernel("geman-mcclure", _SCALES[-1])
+    robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in edges)
+    return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
+
+
+_SCALES = (20.0, 6.0, 3.0)
+"""Scales of the ranges' kernel, one after the other, standard deviations."""
+_USUAL = 0.5
+"""Half the chi2 of a sound range."""
 
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:

@@ -20,9 +20,14 @@ from .requests import HTML, PNG, Response, json_response, path_of, refusal, text
 from .shown_results import ShownResult, described, shown_result
 
 _TYPES = {
-    ".html": HTML, ".png": PNG, ".json": "application/json", ".csv": "text/plain; charset=utf-8",
-    ".toml": "text/plain; charset=utf-8", ".tum": "text/plain; charset=utf-8", ".yaml": "text/plain; charset=utf-8",
-}  # fmt: skip
+    ".html": HTML,
+    ".png": PNG,
+    ".json": "application/json",
+    ".csv": "text/plain; charset=utf-8",
+    ".toml": "text/plain; charset=utf-8",
+    ".tum": "text/plain; charset=utf-8",
+    ".yaml": "text/plain; charset=utf-8",
+}
 _FARTHEST = 1e7
 """m; no anchor is pinned beyond it."""
 

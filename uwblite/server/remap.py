@@ -8,9 +8,19 @@ from typing import Any
 from ..errors import ConfigError
 
 _REPEATED = (
-    "--every-nth-scan", "--laser-pose", "--laser-flipped", "--tag", "--anchor-height", "--anchors-from",
-    "--odometry-topic", "--scan-topic", "--imu-topic", "--uwb-topic", "--uwb-mapping", "--base-frame",
-)  # fmt: skip
+    "--every-nth-scan",
+    "--laser-pose",
+    "--laser-flipped",
+    "--tag",
+    "--anchor-height",
+    "--anchors-from",
+    "--odometry-topic",
+    "--scan-topic",
+    "--imu-topic",
+    "--uwb-topic",
+    "--uwb-mapping",
+    "--base-frame",
+)
 """Options of the earlier command that hold again."""
 _FLAGS = ("--laser-flipped",)
 """Those without a value."""

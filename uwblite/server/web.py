@@ -119,9 +119,9 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a request, or close the connection: where a request ends must not be a matter of opinion."""
         length = self.headers.get("Content-Length", "0" if self.command != "POST" else "")
         number = length.isascii() and length.isdigit()
-        if fault := self._fault(number and not int(length[:9])):
+        if fault := self._fault(number and not int(length[:9])) or ("" if number else "a length is a number"):
             self._refuse(400, fault)
-        elif not number or len(length) > 9 or int(length) > MOST_BYTES:
+        elif len(length) > 9 or int(length) > MOST_BYTES:
             self._refuse(413, "too long")
         else:
             self._answer(self.rfile.read(int(length)))
@@ -172,9 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: the page itself shows what went wrong."""
 
 
-def server_for(
-    page: Page, port: int = 0, host: str = LOOPBACK, names: tuple[str, ...] = ()
-) -> ThreadingHTTPServer:  # fmt: skip
+def server_for(page: Page, port: int = 0, host: str = LOOPBACK, names: tuple[str, ...] = ()) -> ThreadingHTTPServer:
     """Return a server that answers for a page; `serve_forever` runs it.
 
     Parameters

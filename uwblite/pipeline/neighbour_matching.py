@@ -1,0 +1,227 @@
+"""Scan-to-scan matching: clouds per keyframe, matched with their neighbours; keyframes and clouds follow the lidar's clock.
+
+Neighbours make sub-maps stiff, show the offset of the lidar's clock, and tell slips of the wheels.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools
+from ..graph.calibration import LASER, TURNING, with_free
+from ..graph.graph import Graph
+from ..graph.robust import SQUARED
+from ..graph.solver import optimize
+from ..lidar import scan_to_scan
+from ..lidar.scan_to_scan import ScanOdometry, Steps
+from ..problem.solution import rough
+from . import clock_offset, scan_clouds, turn_checks
+from .estimate import Estimate, Task
+from .keyframe_changes import with_keyframes
+from .lidar_stages import pairs, refine
+from .recordings import denser, later
+
+
+def make_clouds(estimate: Estimate, task: Task) -> Estimate:
+    """Make a cloud for each keyframe, and free the laser's mounting and clock, or where it turns."""
+    scans = scan_clouds.make(task.recordings, task.config, 0.0, task.stages.work)
+    task.stages.end("clouds", points=len(scans.clouds.points))
+    # Wheels that turn about another point of the base look like a laser elsewhere on it: one of the two is known.
+    kinds = LASER if estimate.graph.calibration.of_kinds(*LASER[:2]).any() else (*LASER, TURNING)
+    return replace(estimate, graph=with_free(estimate.graph, *kinds), scans=scans)
+
+
+def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
+    """Make clouds and match neighbouring ones; where the lidar's clock is found to be off, move keyframes and clouds with it.
+
+    Keyframes are then at the times of the scans: otherwise the odometry's velocity would have to bridge the offset, and it is
+    inaccurate where the robot turns fast. The clouds are made here, and not in an earlier stage, so that no reference keeps
+    the replaced ones in memory.
+    """
+    estimate, steps = _descended(make_clouds(estimate, task), task)
+    # With ranges, which judge the path, slips are told later; a step that the clouds contradict is else cut at once.
+    doubtful = steps.contradicted(task.config.scan_to_scan) & (estimate.ranges is None)
+    cut = _with_keyframes_where(estimate, doubtful, task)
+    if cut is not None:
+        estimate, task = cut, task.following(cut)
+        steps = _steps(estimate, task)
+    track = _followed(estimate, steps, task)
+    estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
+    corrected = np.inf
+    for _ in range(_RETIMINGS):
+        late = clock_offset.late(estimate, task)
+        if late == 0.0:
+            break
+        if abs(late) > corrected:
+            estimate, track = _without_offset(replace(estimate, scans=None), estimate.lidar.delay, task)
+            break
+        corrected, delay, estimate = abs(late), estimate.lidar.delay + late, replace(estimate, scans=None)
+        estimate = _at_delay(estimate, late, delay, task)
+        now = task.following(estimate)
+        if abs(late) < _SAME_STEPS:
+            estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
+        else:
+            estimate, steps = _descended(estimate, now)
+            track = _followed(estimate, steps, now)
+            estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, now)
+    if estimate.lidar.delay != 0.0:
+        estimate = _with_clock_at(estimate, estimate.lidar.delay)
+    return _with_slips(estimate, track, task.following(estimate))
+
+
+def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
+
+    Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
+    Without ranges nothing judges them afterwards, and the steps as measured stay.
+    """
+    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
+        return estimate
+    track = _followed(estimate, _steps(estimate, task), task)
+    cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
+    if cut is not None:
+        estimate, task = cut, task.following(cut)
+        track = _followed(estimate, _steps(estimate, task), task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
+
+
+def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
+    """Return the estimate with the lidar's clock late by `delay` s and no longer an unknown, until covariances are taken.
+
+    An offset moves clouds along the velocity of the wheels, whose noise would bend steps and bias the offset; clouds made with
+    it need no velocity.
+    """
+    fixed = estimate.graph.calibration.of_kinds("laser_delay")
+    graph = estimate.graph.updated(
+        estimate.graph.poses, estimate.graph.anchors, np.where(fixed, delay, estimate.graph.calibration.values)
+    )
+    return replace(estimate, graph=replace(graph, fixed_calibration=graph.fixed_calibration | fixed))
+
+
+def _without_offset(estimate: Estimate, delay: float, task: Task) -> tuple[Estimate, ScanOdometry]:
+    """Return the estimate with the clock of the lidar as that of the odometry, where a correction made its offset larger.
+
+    With a clock that is off by a constant, each correction leaves a part of the error before it.
+    """
+    estimate = _at_delay(_with_clock_at(estimate, 0.0), -delay, 0.0, task)
+    now = task.following(estimate)
+    task.stages.note("clock-offset", offset=delay)
+    estimate, steps = _descended(estimate, now)
+    track = _followed(estimate, steps, now)
+    return _match_neighbours(replace(estimate, odometry=track.wheels), track, now), track
+
+
+def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
+    """Return the estimate with keyframes later by `late` s and clouds made for a lidar whose clock is late by `delay` s."""
+    before = task.following(estimate).recordings
+    estimate = with_keyframes(estimate, before, later(before, late))
+    task = task.following(estimate)
+    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
+    task.stages.end("clouds made again", laser_delay=round(delay, 4))
+    return estimate
+
+
+def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
+    """Return the estimate from odometry and weakly weighted ranges, and the steps that the clouds measure from there.
+
+    False ranges of full weight would displace neighbours; with weak ones, these follow the odometry until clouds correct it.
+    """
+    weak, config = _with_inflated_ranges(estimate), task.config
+    whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
+    estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*whole), rough(config.solver))[0])
+    return estimate, _steps(estimate, task)
+
+
+def _steps(estimate: Estimate, task: Task) -> Steps:
+    """Return the steps of the odometry as the clouds measure them from the estimate's poses."""
+    scans, poses, i, config = estimate.lidar, estimate.graph.poses, estimate.odometry.i, task.config
+    guess = se2.between(poses[i], poses[i + 1])
+    return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
+
+
+def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
+    scans, config = estimate.lidar, task.config
+    return scan_to_scan.follow(
+        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan
+    )
+
+
+def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
+    """Cut doubtful steps of the odometry (e,) at the scans within them: it slipped there, or the clouds contradict it.
+
+    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud. None is returned
+    where no scans are within them.
+    """
+    before = task.recordings
+    steps = estimate.odometry.i[doubtful]
+    after = denser(before, steps, _CUTS)
+    if len(after.stamps) == len(before.stamps):
+        return None
+    scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
+    task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
+    return replace(with_keyframes(estimate, before, after), scans=scans)
+
+
+_LIKELY = 0.5
+"""Probability from which on a step slipped."""
+
+
+_CUTS = 4
+"""Keyframes added within a doubtful step, at most."""
+_SAME_STEPS = 0.015
+"""Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
+_RETIMINGS = 4
+"""Most times that clouds are made again; a quarter of the error remains each time."""
+
+
+def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Match each cloud with those just before and after it, so that sub-maps are stiff; objects that move are left out."""
+    config, rules, graph = task.config, task.config.refinement, estimate.graph
+    rejected = np.zeros(len(graph.poses), dtype=bool)
+    rejected[estimate.odometry.i[track.rejected]] = True
+    estimate = replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, config), rejected=rejected)
+    weak = _with_inflated_ranges(estimate)
+    problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
+    graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
+    gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
+    return _refined_neighbours(
+        estimate, graph, gate, task, searched=track.searched, rejected=int(track.rejected.sum()),
+        slipped=int(np.sum(track.slips > _LIKELY)), moving=round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
+    )  # fmt: skip
+
+
+def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, **figures: object) -> Estimate:
+    """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
+    scans, rules = estimate.lidar, task.config.refinement
+    settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
+    i, j = pairs(estimate, graph, settings, task)
+    edges = _with_inflated_ranges(estimate).odometry_and_ranges
+    refined = refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
+    ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
+    poses, laid = scan_to_scan.reattached(
+        scans.clouds, scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
+        rules.first_gate, task.config.scan_to_scan,
+    )  # fmt: skip
+    if len(laid):
+        graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
+        settings = replace(settings, first_gate=rules.later_gate)
+        refined = refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
+        figures = {**figures, "placed_again": len(laid)}
+    task.stages.end(
+        "scan-to-scan matching", pairs=len(i), used=int(refined.used.sum()), gate=round(gate, 3),
+        sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
+    )  # fmt: skip
+    estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
+    return turn_checks.with_constant_turn_scales(estimate, task)
+
+
+def _with_inflated_ranges(estimate: Estimate) -> Estimate:
+    """Return the estimate with ranges that constrain the trajectory only where nothing else does."""
+    ranges = estimate.ranges
+    return estimate if ranges is None else replace(estimate, ranges=replace(ranges, sigma=ranges.sigma * _INFLATION))
+
+
+_INFLATION = 10.0
+"""Factor on the ranges' standard deviations."""
