@@ -67,7 +67,7 @@ def walked_once(shift, moved):
     graph = replace(estimate.graph, poses=true, anchors=ANCHORS.copy())
     yes = np.ones(4, dtype=bool)
     estimate = replace(estimate, graph=graph, bootstrap=BootstrapResult(graph, yes, ((),) * 4, ~yes))
-    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0))
+    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0, task.stages.work))
     return refine_jointly(estimate, task), task, true
 
 

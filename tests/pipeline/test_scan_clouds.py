@@ -7,6 +7,7 @@ from helpers.planted import box, odometry, recording, scans, wander
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import denser, gather
+from uwblite.work import Work
 
 CONFIG = MappingConfig()
 
@@ -25,9 +26,9 @@ def test_clouds_taken_over_are_those_made_again(steps):
     last = before.each[2]
     after = denser(before, np.array([*steps, last.first + np.argmax(last.frames.duration)]), 4)
     assert len(after.stamps) > len(before.stamps)
-    old = scan_clouds.make(before, CONFIG, 0.02)
+    old = scan_clouds.make(before, CONFIG, 0.02, Work())
     mixed = scan_clouds.remake(old, before, after, CONFIG)
-    fresh = scan_clouds.make(after, CONFIG, 0.02)
+    fresh = scan_clouds.make(after, CONFIG, 0.02, Work())
     for name in ("offsets", "points", "normals", "owner", "normal_variance"):
         np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(fresh.clouds, name))
     for k in range(len(fresh.clouds)):
