@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import logit
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
@@ -21,7 +22,7 @@ from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood, matched_by_chance
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, Registration, RegistrationConfig
+from .registration import Placed, Prior, Registration, RegistrationConfig, of_fallible
 from .scan_matching import match, measured, pair_points
 from .step_search import StepSearch
 from .visibility import nearest_by_bearing
@@ -115,7 +116,7 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
 
 def follow(
     clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
-    config: TrackingConfig,
+    config: TrackingConfig, by_ranges: Floats | None = None,
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
@@ -124,6 +125,7 @@ def follow(
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes. graph : holds their calibration.
     steps : the same steps after descent, see descend. gate : reach of the raster, m.
+    by_ranges : (e,) probability of a slip over each step by what is no scan; it weighs as much as one pair of clouds.
     """
     i, tight = wheels.i, min(config.gate, gate)
     good = steps.enough & (steps.share >= config.good_share)
@@ -135,7 +137,8 @@ def follow(
     sound = covariance_of(noise, graph)
     prior = Prior(mean, sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
     found = registration.register(i, i + 1, points, prior, steps.pose)
-    slips = posterior(found.log_odds, wheels.duration)
+    prior_odds = 0.0 if by_ranges is None else of_fallible(logit(by_ranges), RegistrationConfig.useless)
+    slips = posterior(found.log_odds + prior_odds, wheels.duration)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)
     # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.

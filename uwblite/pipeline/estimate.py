@@ -85,6 +85,8 @@ class Estimate:
     """None without lidar, and again after the final optimisation."""
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
+    sound: OdometryEdges | None = None
+    """The odometry as if wheels did not slip where ranges show it; None where they show none, and once clouds have judged."""
     rejected: Bools | None = None
     """(k,) keyframes whose step to the next the clouds measure falsely, see ScanOdometry; None = none."""
     closures: Closures = field(default_factory=no_closures)

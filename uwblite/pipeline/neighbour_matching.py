@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools
+from ..arrays import Bools, Floats
 from ..graph.calibration import LASER, TURNING, with_free
 from ..graph.graph import Graph
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
+from ..odometry.slips import slipped
 from ..problem.solution import rough
 from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, Task
@@ -46,8 +47,15 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    track = _followed(estimate, steps, task)
-    estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
+    if estimate.sound is None:
+        track = _followed(estimate, steps, task)
+        estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
+    else:
+        # Ranges that are wrong show slips as well; where clouds measure a step, they tell.
+        by_ranges = slipped(estimate.sound, estimate.graph)
+        track = _followed(replace(estimate, odometry=estimate.sound), steps, task, by_ranges)
+        estimate = replace(estimate, odometry=track.slipped, sound=None)
+        estimate = _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
     corrected = np.inf
     for _ in range(_RETIMINGS):
         late = clock_offset.late(estimate, task)
@@ -140,11 +148,17 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
-def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
-    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
+def _followed(estimate: Estimate, steps: Steps, task: Task, by_ranges: Floats | None = None) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped.
+
+    Parameters
+    ----------
+    by_ranges : (e,) probability of a slip over each step, as the ranges show it.
+    """
     scans, config = estimate.lidar, task.config
     return scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan
+        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
+        by_ranges,
     )
 
 

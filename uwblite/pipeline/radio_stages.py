@@ -134,6 +134,8 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
             estimate = replace(estimate, odometry=with_slips(wheels, slips))
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
+    if slips.any():
+        estimate = replace(estimate, sound=wheels)
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
