@@ -24,7 +24,7 @@ def odometry_steps(truth, clouds, stated):
     return result.steps, result.slipped, result.searched
 
 
-def tracked(truth, clouds, stated):
+def tracked(truth, clouds, stated, by_ranges=None):
     """Return the scan odometry of a chain whose odometry reports the steps said (k - 1, 3)."""
     wheels = replace(chained(truth, NOISE), motion=stated)
     poses = [truth[0]]
@@ -32,7 +32,7 @@ def tracked(truth, clouds, stated):
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig())
+    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), by_ranges)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,19 @@ def test_steps_are_measured(walk):
     assert np.sqrt(np.mean(error[:, 2] ** 2)) < 0.003
     whitened = np.einsum("eij,ej->ei", steps.sqrt_information, error)
     assert np.mean(np.sum(whitened**2, axis=1)) < 6.0
+
+
+def test_clouds_judge_the_slips_that_ranges_show(walk):
+    """Ranges alone decide where no cloud has points; false ones lose against clouds that lie where sound wheels count them."""
+    truth, clouds, exact = walk
+    shown = np.full(len(exact), 1e-3)
+    seen, blind = slice(3, 9), slice(20, 26)
+    shown[seen] = shown[blind] = 0.999
+    some = clouds.only(~np.isin(clouds.owner, np.arange(20, 27)))
+    with_ranges, without = (tracked(truth, some, exact, odds).slips > 0.5 for odds in (shown, None))
+    np.testing.assert_array_equal(np.flatnonzero(with_ranges), np.arange(blind.start, blind.stop))
+    assert not with_ranges[seen].any()
+    assert not without.any()
 
 
 def test_slips_are_found_by_a_search(walk):
