@@ -57,11 +57,12 @@ def test_where_the_library_has_no_such_function_nothing_happens(monkeypatch):
 def test_without_proc_it_is_given_back_where_a_stage_is_over(monkeypatch, tmp_path):
     trimmed = []
     monkeypatch.setattr(memory, "_trim", lambda: trimmed.append)
-    monkeypatch.setattr(memory, "_OF_STATM", str(tmp_path / "statm"))
+    monkeypatch.setattr(memory, "_PROC", str(tmp_path))
     freed = memory.FreedMemory()
     freed.give_back(over=False)
     freed.give_back(over=True)
-    (tmp_path / "statm").write_text("no numbers")
+    (tmp_path / "self").mkdir()
+    (tmp_path / "self/statm").write_text("no numbers")
     freed.give_back(over=True)
     assert trimmed == [0, 0]
 

@@ -197,7 +197,6 @@ def _text(path: str) -> str:
 _GROWN = 64 << 20
 """Bytes by which the process has grown since memory was last given back, when it is worth doing again: each page that is used
 anew costs a microsecond."""
-_OF_STATM = "/proc/self/statm"
 
 
 class FreedMemory:
@@ -225,10 +224,4 @@ def _trim() -> Callable[[int], Any] | None:
 
 def _resident() -> int:
     """Return the memory of this process, bytes; 0 where it is not known, as where /proc is not mounted."""
-    import os
-
-    try:
-        with open(_OF_STATM, encoding="ascii") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0
+    return _pages().resident

@@ -25,8 +25,8 @@ _SPARSE = 0.1
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
 
-
 _MANY = 1 << 16
+"""Scans whose hits 16 bits do not hold."""
 
 
 class RayCounter:
