@@ -92,7 +92,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "nothing (the defaults)": LeftOut(),
     "surfaces": LeftOut(patches=(("pipeline.surface_adjustment.adjust_surfaces", _pairs_alone),)),
     "columns": LeftOut(patches=(
-        ("pipeline.surface_search.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
+        ("pipeline.surface_adjustment.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
     )),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
     "noise of wheels by residuals": LeftOut(patches=(

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from .columns import to_circle
 from .ray_noise import RayNoise, learnt_noise
-from .round_columns import to_circle
 from .surface_rays import ROUGHNESS, MeasuredSurfaces, SurfaceRays, Surfaces, in_map
 
 _LEAST = 0.05

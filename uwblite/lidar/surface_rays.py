@@ -19,8 +19,8 @@ from .. import se2
 from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
+from .columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
 from .ray_noise import RayNoise, range_sigma
-from .round_columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
 
 ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
