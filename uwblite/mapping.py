@@ -25,7 +25,6 @@ from .pipeline import (
     closure_rounds,
     constraint_edges,
     final_stages,
-    landmark_ties,
     lidar_stages,
     map_frame,
     mirror_images,
@@ -136,7 +135,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places
     if given.landmark_distances:
-        yield landmark_ties.tie_landmarks
+        yield constraint_edges.tie_landmarks
     yield anchor_presence.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images

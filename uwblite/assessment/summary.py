@@ -10,8 +10,8 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
-from ..graph.covariances import Covariances, about_best_fit, shape_error
 from ..graph.graph import Graph
+from ..graph.marginals import Covariances, about_best_fit, shape_error
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult

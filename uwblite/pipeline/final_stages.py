@@ -7,9 +7,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..graph.calibration import HEIGHT, with_free
-from ..graph.covariances import Covariances
 from ..graph.graph import Graph
-from ..graph.marginals import Marginals, marginals
+from ..graph.marginals import Covariances, Marginals, marginals
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns

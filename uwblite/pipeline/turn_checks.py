@@ -8,7 +8,7 @@ import numpy as np
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.solver import Optimizer
-from ..odometry.turn_scale import turn_scales
+from ..odometry.wheels import turn_scales
 from ..problem.evidence import prior_sigma, with_prior_sigma
 from .estimate import Estimate, Task
 
