@@ -12,10 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .arrays import require_type
 from .assessment import summary
 from .constraints import Constraints
-from .errors import DataError
 from .map_result import MapResult
 from .pipeline import (
     anchor_heights,
@@ -38,7 +36,7 @@ from .pipeline import (
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stage, Stages
-from .pipeline.recordings import check_distinct, gather
+from .pipeline.recordings import check_distinct, gather, require_types
 from .sensor_log import SensorLog
 
 __all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
@@ -70,7 +68,7 @@ def build_map(
     DataError : there is nothing to map, or recordings share too few anchors, or measurements; an argument is of another type.
     Cancelled : the callback asked to stop.
     """
-    _require_types(logs, config, constraints)
+    require_types(logs, config, constraints)
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
@@ -85,18 +83,6 @@ def build_map(
     covariance = final_stages.covariances_of(estimate, task)
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, covariance, grid, task)
-
-
-def _require_types(logs: object, config: object, constraints: object) -> None:
-    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else None
-    for k, log in enumerate([logs] if several is None else several):
-        require_type(log, "logs" if several is None else f"logs[{k}]", SensorLog)
-    if several is not None and not several:
-        raise DataError("there is no recording to map: logs is empty")
-    if config is not None:
-        require_type(config, "config", MappingConfig)
-    if constraints is not None:
-        require_type(constraints, "constraints", Constraints)
 
 
 def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:

@@ -18,9 +18,9 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import WIDE, Floats, Ints
 from ..errors import SINGULAR, SolverError
-from ..work import ENTRIES, FACTORISATIONS, Work
 from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
 from .schwarz_cg import expected_work
+from .work import ENTRIES, FACTORISATIONS, Work
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""

@@ -46,7 +46,6 @@ import numpy as np
 from ..arrays import Floats
 from ..config import documented, setting
 from ..errors import ConfigError, SolverError
-from ..work import ENTRIES
 from .anchor_subproblem import with_anchors_solved
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
@@ -54,6 +53,7 @@ from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .schwarz_cg import iterated
 from .unknowns import cheaper_move, linked_poses
+from .work import ENTRIES
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""

@@ -28,6 +28,7 @@ from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
+from ..graph.work import RAYS
 from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_equations import RaySums, misfit, noise_of, weighted_sums
@@ -47,7 +48,6 @@ from ..lidar.surface_rays import (
 from ..lidar.walls import Pieces, find_walls, straight_pieces
 from ..odometry import floor as floors
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
-from ..work import RAYS
 from .estimate import Estimate, ScanClouds, Task
 from .recordings import Recording
 
