@@ -114,8 +114,7 @@ def _products(
 ) -> Floats:
     """Return for each group the sums (g, 8, 8) of products of derivatives by the pose (3), by the surface (4), and residual."""
     curved = bool(found.surfaces.round[rays.surface[0]])
-    noise = found.noise.relative(_reach(rays))
-    share, narrow = 1.0 / (noise**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * noise) ** 2
+    share, narrow = 1.0 / (found.noise.ratio**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * found.noise.ratio) ** 2
     sums = _sums_on_columns if curved else _sums_on_walls
     return sums(rays, first, found.surfaces, sensors, poses, share, narrow)
 
@@ -127,14 +126,8 @@ def _groups(rays: SurfaceRays) -> Ints:
     return np.flatnonzero(new)
 
 
-def _reach(rays: SurfaceRays) -> Floats:
-    """Return the distances from their keyframes at which rays (m,) end, m."""
-    x, y = rays.points.T
-    return np.asarray(np.sqrt(x * x + y * y))
-
-
 def _sums_on_columns(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: Floats, narrow: Floats
+    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
 ) -> Floats:
     lines = linearized(rays, surfaces, sensors, poses)
     rows = np.column_stack([lines.by_pose, lines.by_surface, lines.residual])
@@ -186,7 +179,7 @@ def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Float
 
 
 def _sums_on_walls(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: Floats, narrow: Floats
+    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
 ) -> Floats:
     on = _at_walls(rays, first, surfaces, sensors)
     weight = share * on.information / (1.0 + on.residual**2 * on.information * narrow) ** 2
@@ -210,7 +203,7 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
     """Learn the noise of rays from their residuals; for the parameters see linearized."""
     shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts(surfaces)]
     residual, place = (np.concatenate(part) for part in zip(*shown, strict=True))
-    return learnt_noise(residual, _reach(rays), place, rays.surface, surfaces.round)
+    return learnt_noise(residual, place, rays.surface, surfaces.round)
 
 
 def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
@@ -219,7 +212,7 @@ def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
     many = len(found.surfaces.facing)
     count, squares = np.zeros(many), np.zeros(many)
     for rays in found.rays.in_parts(found.surfaces):
-        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.relative(_reach(rays))
+        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.ratio
         count += np.bincount(rays.surface, minlength=many)
         squares += np.bincount(rays.surface, np.minimum(residual**2, _CLIP**2), many)
     return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
