@@ -1,9 +1,9 @@
 """Noise of single rays: from data sheets, and learnt from their residuals on known surfaces.
 
 Residuals show two things. The first is the size of the noise. The second is the correlation of residuals in one place, since
-walls are not straight, columns not round, and errors of neighbouring rays are correlated: the variance of the sum of n residuals
-is then n times a factor, the design effect (L. Kish, Survey sampling, 1965), and n rays have the information of n divided by that
-factor.
+walls are not straight, columns not round, and errors of neighbouring rays are correlated: the variance of the sum of n
+residuals is then n times a factor, the design effect (L. Kish, Survey sampling, 1965), and n rays have the information of n
+divided by that factor.
 """
 
 from dataclasses import dataclass
