@@ -57,9 +57,12 @@ def truncated_weight(squared: Floats, mu: float) -> Floats:
 
 
 def optimize_gnc(
-    graph: Graph, thresholds: Mapping[int, float], solver: SolverConfig = SolverConfig(), progress: Progress | None = None,
+    graph: Graph,
+    thresholds: Mapping[int, float],
+    solver: SolverConfig = SolverConfig(),
+    progress: Progress | None = None,
     allowed: float = np.inf,
-) -> tuple[Graph, SolverSummary, dict[int, Floats]]:  # fmt: skip
+) -> tuple[Graph, SolverSummary, dict[int, Floats]]:
     """Optimise a graph and find the outliers among chosen kinds of edges.
 
     Parameters

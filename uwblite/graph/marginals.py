@@ -111,9 +111,7 @@ class Marginals:
     curvature.
     """
 
-    def __init__(
-        self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None
-    ) -> None:
+    def __init__(self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal, further)
         self._unseen = np.append(normal.diagonal <= 0, False)
@@ -126,9 +124,7 @@ class Marginals:
         chosen = self.unknowns.number["poses"][self._among].ravel()
         parts = [chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(chosen), 1), _COLUMNS_AT_ONCE)]
         among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
-        return Covariances(
-            blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among
-        )
+        return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among)
 
     def estimated(self, common: CommonErrors) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
@@ -266,9 +262,7 @@ def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) ->
     return found
 
 
-def marginals(
-    graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None
-) -> Marginals:
+def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
     Parameters

@@ -140,9 +140,13 @@ def optimize(
 
 
 def minimise(
-    graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig,
-    progress: Progress | None = None, allowed: float = np.inf,
-) -> tuple[Graph, SolverSummary]:  # fmt: skip
+    graph: Graph,
+    linearized: list[Linearization],
+    normal: NormalEquations,
+    config: SolverConfig,
+    progress: Progress | None = None,
+    allowed: float = np.inf,
+) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
     descent = _Descent(graph, linearized, normal, config, allowed)
     del linearized
@@ -225,9 +229,14 @@ class _Descent:
         return NO_DECREASE if over else ""
 
     def _take(
-        self, trial: Graph, linearized: list[Linearization], costs: list[float], promised: float, negligible: float,
+        self,
+        trial: Graph,
+        linearized: list[Linearization],
+        costs: list[float],
+        promised: float,
+        negligible: float,
         reused: bool,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
         decrease = self.chi2 - sum(costs)
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE

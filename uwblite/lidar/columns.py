@@ -299,9 +299,7 @@ _PROBABLE = 1.22
 """Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
 
 
-def refined_columns(
-    columns: Floats, at: Floats, direction: Floats, sigma: Floats, config: ColumnConfig = _CONFIG
-) -> Floats:
+def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Floats, config: ColumnConfig = _CONFIG) -> Floats:
     """Fit columns (c, 3) to the rays that end at (p, 2) in the map, and keep those that are round.
 
     Parameters

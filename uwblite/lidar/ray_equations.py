@@ -58,9 +58,14 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
     by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
     turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
-    by_surface = np.column_stack([
-        np.where(curved, -normal[:, 0], turn), np.where(curved, -normal[:, 1], -1.0), -incidence, np.where(curved, -1.0, 0.0),
-    ])  # fmt: skip
+    by_surface = np.column_stack(
+        [
+            np.where(curved, -normal[:, 0], turn),
+            np.where(curved, -normal[:, 1], -1.0),
+            -incidence,
+            np.where(curved, -1.0, 0.0),
+        ]
+    )
     return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
 
 
@@ -109,9 +114,7 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
     )
 
 
-def _products(
-    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
-) -> Floats:
+def _products(rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> Floats:
     """Return for each group the sums (g, 8, 8) of products of derivatives by the pose (3), by the surface (4), and residual."""
     curved = bool(found.surfaces.round[rays.surface[0]])
     share, narrow = 1.0 / (found.noise.ratio**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * found.noise.ratio) ** 2

@@ -160,9 +160,7 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
-def on_columns(
-    rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS
-) -> SurfaceRays:
+def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
     if not len(columns):
         return rays.rows(np.zeros(0, dtype=np.intp))

@@ -220,9 +220,13 @@ def _one_graph(
     work = estimates[0].graph.work
     graph = Graph(poses, anchors, (priors,), block, fixed_anchors=unplaced, fixed_calibration=fixed, work=work)
     return replace(
-        estimates[0], graph=graph, odometry=_one_odometry([e.odometry for e in estimates], at, recordings),
-        ranges=_one_ranges([e.ranges for e in estimates], at, place, recordings), bootstrap=joined, anchor_ids=ids,
-    )  # fmt: skip
+        estimates[0],
+        graph=graph,
+        odometry=_one_odometry([e.odometry for e in estimates], at, recordings),
+        ranges=_one_ranges([e.ranges for e in estimates], at, place, recordings),
+        bootstrap=joined,
+        anchor_ids=ids,
+    )
 
 
 def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools, list[Ints]]:

@@ -55,10 +55,13 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
         if factor != 1.0:
             high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
             task.stages.note(
-                "odometry-unit", recording=recording.number + 1, name=recording.name if len(recordings) > 1 else "",
-                factor=factor, checked=recording.has_scans or len(task.given.anchors) > 1 or bool(task.given.distances),
+                "odometry-unit",
+                recording=recording.number + 1,
+                name=recording.name if len(recordings) > 1 else "",
+                factor=factor,
+                checked=recording.has_scans or len(task.given.anchors) > 1 or bool(task.given.distances),
                 high=other.high if other is not None and high else None,
-            )  # fmt: skip
+            )
     return factors
 
 

@@ -169,9 +169,11 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
         own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
-        added = [np.zeros(0)] if log.scans is None else [
-            _spread(log.scans.middles, stamps[k], stamps[k + 1], most) for k in own.tolist()
-        ]
+        added = (
+            [np.zeros(0)]
+            if log.scans is None
+            else [_spread(log.scans.middles, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+        )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
         alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))

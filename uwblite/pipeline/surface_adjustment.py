@@ -158,9 +158,13 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
-        "surfaces", walls=walls, columns=columns, rays=len(found.rays.keyframe), shift=round(estimate.moved_since(before), 5),
+        "surfaces",
+        walls=walls,
+        columns=columns,
+        rays=len(found.rays.keyframe),
+        shift=round(estimate.moved_since(before), 5),
         alike=found.noise.alike.round(1).tolist(),
-    )  # fmt: skip
+    )
     found = replace(found, surfaces=found.surfaces.seen_from(graph.poses[0]))
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
