@@ -20,6 +20,7 @@ from .pipeline import (
     anchor_places,
     anchor_presence,
     broken_stretches,
+    calibration_checks,
     closure_rounds,
     constraint_edges,
     final_stages,
@@ -27,11 +28,9 @@ from .pipeline import (
     map_frame,
     mirror_images,
     neighbour_matching,
-    odometry_units,
     radio_stages,
     scan_selection,
     surface_adjustment,
-    turn_checks,
 )
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
@@ -73,7 +72,7 @@ def build_map(
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
     logs = [scan_selection.prepared(log, config) for log in logs]
-    config = odometry_units.with_given_mounting_and_clock(odometry_units.with_units_checked(config, logs), logs)
+    config = calibration_checks.with_given_mounting_and_clock(calibration_checks.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)
@@ -88,7 +87,7 @@ def build_map(
 def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
     """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
     estimate, config = radio_stages.first_optimisation(task), task.config
-    factors = odometry_units.odometry_unit_factors(estimate, task)
+    factors = calibration_checks.odometry_unit_factors(estimate, task)
     if np.all(factors == 1.0):
         return estimate, task
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
@@ -107,7 +106,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield neighbour_matching.match_scan_to_scan if config.scan_to_scan.on else neighbour_matching.make_clouds
         if config.scan_to_scan.on:
             yield radio_stages.reestimate_ranges
-            yield turn_checks.with_slip_in_turns
+            yield calibration_checks.with_slip_in_turns
         if config.use_loops:
             yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
             yield anchor_places.decide_places
