@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools
 from ..graph.calibration import LASER, TURNING, with_free
 from ..graph.graph import Graph
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
-from ..odometry.slips import slipped
+from ..odometry.slips import SoundWheels
 from ..problem.solution import rough
 from . import clock_offset, scan_clouds, turn_checks
 from .estimate import Estimate, Task
@@ -47,15 +47,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    if estimate.sound is None:
-        track = _followed(estimate, steps, task)
-        estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
-    else:
-        # Ranges that are wrong show slips as well; where clouds measure a step, they tell.
-        by_ranges = slipped(estimate.sound, estimate.graph)
-        track = _followed(replace(estimate, odometry=estimate.sound), steps, task, by_ranges)
-        estimate = replace(estimate, odometry=track.slipped, sound=None)
-        estimate = _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
+    estimate, track = _tracked(estimate, steps, task)
     corrected = np.inf
     for _ in range(_RETIMINGS):
         late = clock_offset.late(estimate, task)
@@ -70,9 +62,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         if abs(late) < _SAME_STEPS:
             estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
         else:
-            estimate, steps = _descended(estimate, now)
-            track = _followed(estimate, steps, now)
-            estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, now)
+            estimate, track = _tracked(*_descended(estimate, now), now)
     if estimate.lidar.delay != 0.0:
         estimate = _with_clock_at(estimate, estimate.lidar.delay)
     return _with_slips(estimate, track, task.following(estimate))
@@ -85,13 +75,33 @@ def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate
     Without ranges nothing judges them afterwards, and the steps as measured stay.
     """
     if estimate.ranges is None or not np.any(track.slips > _LIKELY):
-        return estimate
+        return replace(estimate, sound=None)
+    if estimate.sound is None:
+        estimate = replace(estimate, sound=SoundWheels(estimate.odometry))
     track = _followed(estimate, _steps(estimate, task), task)
     cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task), task)
-    return _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
+    return replace(_matched(estimate, track, task), sound=None)
+
+
+def _tracked(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, ScanOdometry]:
+    """Return the estimate with neighbours matched from measured steps, and these as edges."""
+    track = _followed(estimate, steps, task)
+    return _matched(estimate, track, task), track
+
+
+def _matched(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Return the estimate with neighbours matched; where something shows slips already, as if the wheels slipped there.
+
+    Ranges that are wrong show slips as well; where clouds measure a step, they tell.
+    """
+    if estimate.sound is None:
+        return _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
+    sound = replace(estimate.sound, edges=track.wheels)
+    estimate = replace(estimate, odometry=track.slipped, sound=sound)
+    return _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -115,9 +125,7 @@ def _without_offset(estimate: Estimate, delay: float, task: Task) -> tuple[Estim
     estimate = _at_delay(_with_clock_at(estimate, 0.0), -delay, 0.0, task)
     now = task.following(estimate)
     task.stages.note("clock-offset", offset=delay)
-    estimate, steps = _descended(estimate, now)
-    track = _followed(estimate, steps, now)
-    return _match_neighbours(replace(estimate, odometry=track.wheels), track, now), track
+    return _tracked(*_descended(estimate, now), now)
 
 
 def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
@@ -148,18 +156,12 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
-def _followed(estimate: Estimate, steps: Steps, task: Task, by_ranges: Floats | None = None) -> ScanOdometry:
-    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped.
-
-    Parameters
-    ----------
-    by_ranges : (e,) probability of a slip over each step, as the ranges show it.
-    """
+def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
     scans, config = estimate.lidar, task.config
-    return scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
-        by_ranges,
-    )
+    sound = estimate.sound or SoundWheels(estimate.odometry)
+    gate = config.refinement.first_gate
+    return scan_to_scan.follow(scans.clouds, scans.raster, sound, estimate.graph, steps, gate, config.scan_to_scan)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
