@@ -17,7 +17,7 @@ from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..odometry.slips import SoundWheels
 from ..problem.solution import rough
-from . import clock_offset, scan_clouds, turn_checks
+from . import calibration_checks, scan_clouds
 from .estimate import Estimate, Task
 from .keyframe_changes import with_keyframes
 from .lidar_stages import pairs, refine
@@ -50,7 +50,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     estimate, track = _tracked(estimate, steps, task)
     corrected = np.inf
     for _ in range(_RETIMINGS):
-        late = clock_offset.late(estimate, task)
+        late = calibration_checks.late(estimate, task)
         if late == 0.0:
             break
         if abs(late) > corrected:
@@ -230,7 +230,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
     )  # fmt: skip
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
-    return turn_checks.with_constant_turn_scales(estimate, task)
+    return calibration_checks.with_constant_turn_scales(estimate, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:

@@ -15,6 +15,7 @@ from ..graph.calibration import BIAS, ODOMETRY, OMNI, RADIO, RANGE_SCALE, with_f
 from ..graph.graph import Graph, edge_cost
 from ..graph.robust import SQUARED
 from ..graph.solver import Optimizer, SolverSummary
+from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import SoundWheels, slipped, with_slips
@@ -25,7 +26,6 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from ..work import Work
 from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
