@@ -3,7 +3,7 @@
 import pytest
 
 from uwblite.drivers.link import Mounting
-from uwblite.drivers.log_text import LogText
+from uwblite.drivers.log_file import LogText
 
 
 class Written:

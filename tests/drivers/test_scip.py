@@ -10,11 +10,10 @@ from emulators.scip_device import ScipDevice, ScipOptions, data_lines, encode
 from emulators.world import RoomWorld, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, good
 
-from uwblite.drivers import scip, scip_codes, scip_commands
+from uwblite.drivers import scip, scip_commands
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.scip import Distances, Reply, ScipProtocol
-from uwblite.drivers.scip_codes import RANGE_CODES
-from uwblite.drivers.scip_commands import Geometry, parse_geometry
+from uwblite.drivers.scip_commands import RANGE_CODES, Geometry, ScanRequest, parse_geometry
 from uwblite.errors import ProtocolError
 
 RNG = random.Random(1)
@@ -199,7 +198,7 @@ def test_memory_is_bounded():
 
 
 def test_range_codes_are_complete_and_become_rep_117():
-    assert sorted(scip_codes.RANGE_CODES) == list(range(20))
+    assert sorted(scip_commands.RANGE_CODES) == list(range(20))
     ranges = scip_commands.to_ranges((0, 6, 1, 7, 18, 19, 20, 1234, 5599, 5600, 9000), Geometry())
     assert ranges[:2] == (math.inf, math.inf)
     assert all(math.isnan(r) for r in ranges[2:6])
@@ -216,16 +215,11 @@ def test_geometry_of_the_urg_04lx():
 
 
 def test_commands():
-    assert scip_commands.scan_command() == b"MD0044072501000\n"
-    assert scip_commands.scan_command(128, 640, cluster=3, skip=2, count=10, wide=False) == b"MS0128064003210\n"
-    assert scip_commands.scan_command(count=None) == b"GD0044072501\n"
-    assert scip_commands.text_command("QT") == b"QT\n"
-    for bad in ({"start": 0}, {"end": 800}, {"start": 300, "end": 200}, {"cluster": 100}, {"skip": 10}, {"count": 100}):
+    assert ScanRequest().command(Geometry()) == b"MD0044072501000\n"
+    assert ScanRequest(128, 640, 3, 2, wide=False).command(Geometry()) == b"MS0128064003200\n"
+    for bad in ({"start": 0}, {"end": 800}, {"start": 300, "end": 200}, {"cluster": 100}, {"cluster": 0}, {"skip": 10}):
         with pytest.raises(ProtocolError):
-            scip_commands.scan_command(**bad)
-    for command in ("ME", "%ST", "", "qt", "MD"):
-        with pytest.raises(ProtocolError):
-            scip_commands.text_command(command)
+            ScanRequest(**bad).command(Geometry())
 
 
 @pytest.mark.parametrize(
@@ -247,7 +241,7 @@ def test_commands():
     ],
 )
 def test_status_codes_have_names(command, status, kind):
-    got, text = scip_codes.status_meaning(command, status)
+    got, text = scip_commands.status_meaning(command, status)
     assert got == kind
     assert text
 

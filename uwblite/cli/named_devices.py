@@ -7,14 +7,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ..drivers.device_options import Setup
-from ..drivers.devices import SENSORS, open_device
+from ..drivers.devices import SENSORS, Setup, open_device
 from ..drivers.events import Note, Pose
 from ..drivers.link import Link
 from ..drivers.log_file import LogFile
-from ..drivers.ports import stable_name
 from ..drivers.recorder import Recorder
-from ..drivers.transport import check_pyserial, check_url
+from ..drivers.transport import check_pyserial, check_url, stable_name
 from ..errors import ConfigError
 from .console import note
 from .log_verbs import MOST
@@ -30,7 +28,7 @@ def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list
         if len(specs) > MOST[sensor]:
             raise ConfigError(f"--{sensor} is given {len(specs)} times; a log keeps {MOST[sensor]} apart")
         for k, spec in enumerate(specs, start=1):
-            session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else None)
+            session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else {})
             links.append(Link(sensor, url, session, k))
     for link in links:
         check_url(link.url)

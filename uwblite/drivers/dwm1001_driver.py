@@ -8,11 +8,10 @@ that died, is brought round.
 from typing import Any
 
 from .continuity import LinkHealth, RangeGuard
-from .dwm1001 import BAUD, QUERIES, STATUS_GET, TlvProtocol
 from .dwm1001_advice import advise, not_joined
-from .dwm1001_blocks import NodeConfig, Status, UpdateRate, Value, short_id
 from .dwm1001_poll import FixPoller
 from .dwm1001_shell import ENTER, NodeInfo, PositionLine, Prompt, RangeLine, ShellProtocol, TextLine, parse_node_info
+from .dwm1001_tlv import BAUD, QUERIES, STATUS_GET, NodeConfig, Status, TlvProtocol, UpdateRate, Value, short_id
 from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
 

@@ -10,9 +10,8 @@ has no checksum: a fix is read twice and must agree, unless the link is too slow
 from typing import Any
 
 from ..clocks.device_clock import GAP
-from .dwm1001 import LOC_GET, STATUS_GET
 from .dwm1001_advice import not_joined
-from .dwm1001_blocks import ERRORS, Answer, Distances, Status
+from .dwm1001_tlv import ERRORS, LOC_GET, STATUS_GET, Answer, Distances, Status
 from .events import Corrupt, Lost, Note, RangeEpoch, RangeReading, Send
 from .session import Driver, Script, Wait
 

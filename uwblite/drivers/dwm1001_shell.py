@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .events import Corrupt, RangeReading, corrupt
-from .line_reader import Line, LineReader
+from .framing import LineReader, RawLine
 
 ENTER = b"\r\r"
 PROMPT = b"dwm> "
@@ -109,7 +109,7 @@ class ShellProtocol:
         return events
 
 
-def _parse(line: Line) -> list[Event]:
+def _parse(line: RawLine) -> list[Event]:
     """Find what a line holds; the rest of it before that is Corrupt."""
     text = line.data.decode("latin-1").rstrip()
     broken: Corrupt | None = None

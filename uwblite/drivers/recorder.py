@@ -11,10 +11,8 @@ from collections.abc import Callable
 
 from ..errors import DeviceError
 from .events import Action, Corrupt, Lost, Measurement, Note, Param, Reopen, Send, SetBaud, SetDtr
-from .link import Link, Mounting
-from .link_summary import doubts, summary_lines
-from .log_file import LogFile
-from .log_text import LogText
+from .link import Link, Mounting, doubts, summary_lines
+from .log_file import LogFile, LogText
 from .transport import Port, open_port
 
 HOUSEKEEPING = 0.25
