@@ -41,7 +41,7 @@ def transcript():
         ok + bytes.fromhex("4e081215950448f0cade"),
         bytes.fromhex("400101"),
     ]
-    position = Position(1.0, 2.635, 1.055, 3.740, 100)
+    position = Position(1.0)
     expected = [
         Answer(1.0, 0), Status(1.0, 3),
         Answer(1.0, 0), position, Distances(1.0, RANGES),

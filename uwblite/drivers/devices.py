@@ -23,7 +23,8 @@ from .lds01 import Lds01Driver
 from .linktrack import BU03_BAUD, LINKTRACK_BAUD, Bu03Protocol, LinkTrackProtocol
 from .odometry_line import GyroLineDriver, OdometryLineDriver, gyro_format, odometry_format
 from .rplidar import RpLidarDriver
-from .scip_driver import ScanRequest, ScipDriver
+from .scip_commands import ScanRequest
+from .scip_driver import ScipDriver
 from .session import Driver, Session
 from .text_lines import LineProtocol
 from .uwb_line import BOARDS, Parse, UwbDriver, by_columns, parse_columns, within_reach
@@ -135,8 +136,8 @@ def _scip(options: Values, setup: Setup) -> Driver:
     first, _, last = steps.partition(":")
     if steps and not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= 9999):
         raise ConfigError(f"--lidar scip: steps={steps} is not two steps such as 128:640")
-    ends = (int(first), int(last)) if steps else (None, None)
-    request = ScanRequest(*ends, options["cluster"], options["skip"], wide=not options["narrow"])
+    start, end = (int(first), int(last)) if steps else (None, None)
+    request = ScanRequest(start, end, options["cluster"], options["skip"], wide=not options["narrow"])
     return ScipDriver(request, options["baud"], stream=setup.stream)
 
 

@@ -20,8 +20,7 @@ from .framing import HeadedFrames
 BAUD = 115200
 
 LOC_GET, STATUS_GET = b"\x0c\x00", b"\x32\x00"
-QUERIES = {"ver_get": b"\x15\x00", "nodeid_get": b"\x30\x00", "panid_get": b"\x2f\x00", "cfg_get": b"\x08\x00",
-           "upd_rate_get": b"\x04\x00"}  # fmt: skip
+VER_GET, NODEID_GET, PANID_GET, CFG_GET, UPD_RATE_GET = b"\x15\x00", b"\x30\x00", b"\x2f\x00", b"\x08\x00", b"\x04\x00"
 """What a module is asked once; nothing is ever set."""
 
 
@@ -30,10 +29,7 @@ MAX_RANGE_MM = 200_000
 MAX_PLACE_MM = 10_000_000
 """mm; largest plausible distance of an anchor from the origin."""
 
-ERRORS = {
-    0: "ok", 1: "unknown command or broken request", 2: "internal error", 3: "invalid parameter", 4: "busy",
-    5: "not permitted",
-}  # fmt: skip
+ERRORS = ("ok", "unknown command or broken request", "internal error", "invalid parameter", "busy", "not permitted")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +39,14 @@ class Answer:
     stamp: float
     """s, arrival of its first byte."""
     error: int
-    """Key of ERRORS."""
+    """Index into ERRORS."""
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """The module's own estimate of a position; uwblite does not use it."""
+    """The module's own estimate of a position, of which uwblite uses nothing."""
 
     stamp: float
-    x: float
-    y: float
-    z: float
-    """m."""
-    quality: int
-    """0..100."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +112,12 @@ class Value:
 Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Corrupt
 
 _VALUES = {
-    0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"),
-}  # fmt: skip
+    0x4D: (2, "pan_id"),
+    0x4E: (8, "node_id"),
+    0x50: (4, "firmware"),
+    0x51: (4, "configuration"),
+    0x52: (4, "hardware"),
+}
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
 _HEAD_AS_STATUS = 0x0140
 """``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""
@@ -163,7 +157,7 @@ def decode(piece: bytes, stamp: float) -> Event:
         x, y, z, quality = _POSITION.unpack(value)
         if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
             return corrupt(piece, "position or quality out of range")
-        return Position(stamp, x / 1000, y / 1000, z / 1000, quality)
+        return Position(stamp)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
         return UpdateRate(stamp, normal / 10, stationary / 10)

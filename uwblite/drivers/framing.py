@@ -88,10 +88,6 @@ class FrameReader(ABC):
         ----------
         data : bytes from the port.
         stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of events of the protocol, and Corrupt.
         """
         events: list[Any] = []
         for start in range(0, len(data), CHUNK):

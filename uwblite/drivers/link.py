@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from ..errors import DeviceError
 from .events import Note, Send, SetBaud, SetDtr
 from .session import Session
-from .transport import Port
+from .transport import Port, open_port
 
 SILENCE = 3.0
 """s without a measurement before it is reported."""
@@ -53,6 +53,21 @@ class Mounting:
     """x, y, theta of the second lidar, the third ..."""
 
 
+@dataclass(frozen=True, slots=True)
+class Host:
+    """The computer that records."""
+
+    name: str
+    monotonic: Callable[[], float]
+    """s, a clock that never leaps."""
+    wall_offset: float
+    """s to add to it for the log's timestamps."""
+    wall: Callable[[], float] | None = None
+    """s, the computer's own clock, to report that it was set; stamps do not follow it."""
+    open_port: Callable[[str, int], Port] = open_port
+    """(url, baud) -> Port."""
+
+
 class Opening:
     """A port that is being opened by a thread of its own, so that nobody has to wait for it.
 
@@ -82,7 +97,7 @@ class Opening:
             result.close()
 
     def result(self) -> "Port | DeviceError | None":
-        """Return the port, why it cannot be opened, or None as long as that is not known."""
+        """Return the port, why not, None while that is unknown."""
         return self._result
 
     def give_up(self) -> None:
@@ -123,16 +138,12 @@ class Link:
     # ---- its port
 
     def connect(self, now: float, open_port: Callable[[str, int], Port]) -> Port | DeviceError | None:
-        """Open the port in the background, or take it when it is open.
+        """Open the port in the background; return it once it is open, why not, None while that is unknown.
 
         Parameters
         ----------
         now : s.
         open_port : (url, baud) -> Port.
-
-        Returns
-        -------
-        Port that is open now, DeviceError where it cannot be, None as long as that is not known.
         """
         if self.opening is None:
             self.opening = Opening(open_port, self.url, self.session.baud)

@@ -10,12 +10,11 @@ import math
 import os
 import re
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import DataError
 from .events import GyroHeading, LaserScan, Measurement, OdometryPose, RangeEpoch
-from .link import Link, Mounting
+from .link import Host, Link, Mounting
 
 _MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
 TAIL, _PIECE = 1 << 18, 1 << 20
@@ -70,18 +69,14 @@ def scan_line(
     robot : latest odometry, None = origin. The reader interpolates odometry itself; this is for other readers.
     tail : ipc timestamp, host and logger timestamp.
     number : of the robot's first (1), second ... lidar.
-
-    Returns
-    -------
-    str, without a line end.
     """
     count = len(scan.ranges)
     readings = " ".join([metre_text(value, scan.range_max) for value in scan.ranges])
     x, y, theta = (robot.x, robot.y, robot.theta) if robot else (0.0, 0.0, 0.0)
     cos, sin = math.cos(theta), math.sin(theta)
-    laser_pose = (x + cos * laser[0] - sin * laser[1], y + sin * laser[0] + cos * laser[1],
-                  math.remainder(theta + laser[2], 2 * math.pi))  # fmt: skip
-    poses = " ".join(number_text(v) for v in (*laser_pose, x, y, theta))
+    laser_x, laser_y = x + cos * laser[0] - sin * laser[1], y + sin * laser[0] + cos * laser[1]
+    laser_theta = math.remainder(theta + laser[2], 2 * math.pi)
+    poses = " ".join(number_text(v) for v in (laser_x, laser_y, laser_theta, x, y, theta))
     velocity = f"{number_text(robot.speed)} {number_text(robot.turn_rate)}" if robot else "0.000000 0.000000"
     return (
         f"ROBOTLASER{number} 0 {scan.angle_min:.9f} {scan.angle_increment * (count - 1):.9f} {scan.angle_increment:.9f}"
@@ -257,16 +252,12 @@ class LogText:
 
     Parameters
     ----------
-    log : where to write. mounting : sensors on the base.
-    monotonic : s, a clock that never leaps. start : its time when the recording began, s.
-    wall_offset : s to add to it for the log's timestamps. host : name of this computer.
+    log : where to write. mounting : sensors on the base. host : the computer that records.
     """
 
-    def __init__(
-        self, log: LogFile, mounting: Mounting, monotonic: Callable[[], float], start: float, wall_offset: float, host: str
-    ) -> None:  # fmt: skip
-        self._log, self._mounting, self._now = log, mounting, monotonic
-        self._start, self._offset, self._host = start, wall_offset, host
+    def __init__(self, log: LogFile, mounting: Mounting, host: Host) -> None:
+        self._log, self._mounting, self._host = log, mounting, host
+        self._start = host.monotonic()
         self._pose: OdometryPose | None = None
         self._params: dict[str, str] = {}
         self._lines: list[str] = []
@@ -293,7 +284,7 @@ class LogText:
         """Write a PARAM unless it stands there already."""
         if self._params.get(name) != value:
             self._params[name] = value
-            line = f"PARAM {name} {value} {self._tail(self._now())}"
+            line = f"PARAM {name} {value} {self._tail(self._host.monotonic())}"
             self._lines.append(line)
             self._log.head.append(line)
 
@@ -318,7 +309,7 @@ class LogText:
             self._lines.append(scan_line(measured, laser, self._pose, tail, link.number))
 
     def _elapsed(self) -> float:
-        return max(0.0, self._now() - self._start)
+        return max(0.0, self._host.monotonic() - self._start)
 
     def _tail(self, stamp: float) -> str:
-        return f"{stamp + self._offset:.6f} {self._host} {self._elapsed():.6f}"
+        return f"{stamp + self._host.wall_offset:.6f} {self._host.name} {self._elapsed():.6f}"

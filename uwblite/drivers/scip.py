@@ -54,7 +54,7 @@ class Distances:
     time: int
     """ms, device clock, 0 .. 2**24 - 1, at the first step."""
     values: tuple[int, ...]
-    """mm, one per step or cluster; below DMIN they are RANGE_CODES."""
+    """mm, one per step or cluster; below DMIN they are codes."""
     start: int
     end: int
     """First and last step."""
@@ -90,10 +90,6 @@ def decode_values(data: bytes, width: int) -> tuple[int, ...]:
     ----------
     data : characters 0x30..0x6F.
     width : 2 or 3 characters a value.
-
-    Returns
-    -------
-    tuple of int, mm.
     """
     if width == 2:
         return tuple([(a << 6) + b - 0xC30 for a, b in zip(data[0::2], data[1::2], strict=True)])

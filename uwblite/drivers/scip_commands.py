@@ -78,13 +78,13 @@ def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = N
 
     Parameters
     ----------
-    values : mm or range_codes of the model.
+    values : mm, below DMIN codes of the model.
     geometry : gives DMIN and DMAX.
     limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
     """
     low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
-    known = range_codes(geometry.model)
-    codes = [known[v][0] if v in known else math.nan for v in range(low)]
+    nothing = NOTHING_SEEN.get(geometry.model[:3], ())
+    codes = [math.inf if v in nothing else math.nan for v in range(low)]
     return tuple([codes[v] if v < low else v / 1000 if v < high else math.inf for v in values])
 
 
@@ -100,75 +100,51 @@ def parse_geometry(reply: Reply) -> Geometry:
         numbers = {key: int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")}
     except (KeyError, ValueError) as error:
         raise ProtocolError(f"PP: field missing or not a number ({error})") from None
-    unit = Geometry(
-        fields.get("MODL", "unknown").partition("(")[0], numbers["DMIN"], numbers["DMAX"], numbers["ARES"],
-        numbers["AMIN"], numbers["AMAX"], numbers["AFRT"], numbers["SCAN"],
-    )  # fmt: skip
+    unit = Geometry(fields.get("MODL", "unknown").partition("(")[0], *numbers.values())
     sane = 0 <= unit.distance_min < unit.distance_max and unit.resolution > 0 and unit.speed > 0
     if not (sane and 0 <= unit.first < unit.last <= unit.resolution + unit.front):
         raise ProtocolError(f"PP: absurd geometry {unit}")
     return unit
 
 
-INF, NAN = math.inf, math.nan
+NOTHING_SEEN = {"URG": (0, 6), "UBG": (0, 6), "UHG": (0, 6), "UTM": (1,)}
+"""Values below DMIN that say that nothing reflects within range, by the first letters of the model: no echo; of a UTM no object
+(table 4 of the specification). All others are errors, as low intensity, readings that disagree, a strong reflector; of a model
+that is not known too, so that nothing is taken for free space."""
 
-RANGE_CODES: dict[int, tuple[float, str]] = {
-    0: (INF, "no echo: nothing within range, or too dark to see"),
-    1: (NAN, "low intensity"),
-    2: (NAN, "low intensity"),
-    3: (NAN, "measurement error"),
-    4: (NAN, "measurement error"),
-    5: (NAN, "measurement error"),
-    6: (INF, "no valid echo; older manuals: possibly beyond 5.7 m"),
-    7: (NAN, "too near, or contradicted by its neighbours"),
-    8: (NAN, "the two modulation waves disagree in intensity"),
-    9: (NAN, "same step failed in the last two scans"),
-    **dict.fromkeys(range(10, 18), (NAN, "measurement error")),
-    18: (NAN, "strong reflector"),
-    19: (NAN, "step cannot be measured"),
-}
-"""Meaning of range values below DMIN, as REP-117 wants them: +inf = looked and saw nothing, nan = do not use."""
-
-UTM_CODES: dict[int, tuple[float, str]] = {
-    1: (INF, "no object in the range"),
-    2: (NAN, "too near"),
-    3: (NAN, "measurement error, perhaps interference"),
-    4: (NAN, "out of range at the near end"),
-    5: (NAN, "other errors"),
-}
-"""The same of the UTM-30LX (table 4 of the specification)."""
-OTHER_CODES: dict[int, tuple[float, str]] = {}
-"""Of a model whose codes are not known: nothing is taken for free space."""
-
-
-def range_codes(model: str) -> dict[int, tuple[float, str]]:
-    """Return the meaning of values below DMIN for a model as PP names it."""
-    families = {"URG": RANGE_CODES, "UBG": RANGE_CODES, "UHG": RANGE_CODES, "UTM": UTM_CODES}
-    return families.get(model[:3], OTHER_CODES)
-
-
-STATUS_BY_COMMAND: dict[str, dict[str, str]] = {
-    "BM": {"00": "laser on", "01": "laser malfunction", "02": "laser is on already"},
+_TIME_ADJUST = ("ok", "bad code", "in time-adjust mode already", "left time-adjust mode already", "not in time-adjust mode")
+_BIT_RATE = ("ok", "not a number", "no such bit rate", "that rate is set already", "rate not possible")
+STATUS_BY_COMMAND = {
     "QT": {"00": "laser off, stream stopped"},
-    "RS": {"00": "reset"},
-    "TM": {"00": "ok", "01": "bad code", "02": "in time-adjust mode already", "03": "left time-adjust mode already",
-           "04": "not in time-adjust mode"},
-    "SS": {"00": "ok", "01": "not a number", "02": "no such bit rate", "03": "that rate is set already",
-           "04": "rate not possible"},
-    "CR": {"00": "ok", "01": "not a number", "02": "no such speed", "03": "that speed is set already",
-           "04": "speed not possible"},
-}  # fmt: skip
+    "TM": {f"{code:02d}": text for code, text in enumerate(_TIME_ADJUST)},
+    "SS": {f"{code:02d}": text for code, text in enumerate(_BIT_RATE)},
+}
 STATUS_OF_SCANS = {
-    "00": "ok", "01": "start step is not a number", "02": "end step is not a number", "03": "cluster is not a number",
-    "04": "end step out of range", "05": "end step is before the start step", "06": "skip is not a number",
-    "07": "count is not a number", "10": "laser is off", "98": "resumed after a pause", "99": "data follow",
-}  # fmt: skip
+    "00": "ok",
+    "01": "start step is not a number",
+    "02": "end step is not a number",
+    "03": "cluster is not a number",
+    "04": "end step out of range",
+    "05": "end step is before the start step",
+    "06": "skip is not a number",
+    "07": "count is not a number",
+    "10": "laser is off",
+    "98": "resumed after a pause",
+    "99": "data follow",
+}
 STATUS_OF_ALL = {
-    "0A": "cannot create the transmission", "0B": "buffer short, or the command was repeated in one batch",
-    "0C": "too few parameters", "0D": "too few parameters", "0E": "undefined command", "0F": "undefined command",
-    "0G": "string too long", "0H": "string has bad characters", "0I": "in firmware-update mode",
-    "0L": "abnormal state", "0M": "unstable",
-}  # fmt: skip
+    "0A": "cannot create the transmission",
+    "0B": "buffer short, or the command was repeated in one batch",
+    "0C": "too few parameters",
+    "0D": "too few parameters",
+    "0E": "undefined command",
+    "0F": "undefined command",
+    "0G": "string too long",
+    "0H": "string has bad characters",
+    "0I": "in firmware-update mode",
+    "0L": "abnormal state",
+    "0M": "unstable",
+}
 
 
 def status_meaning(command: str, status: str) -> tuple[str, str]:
@@ -196,5 +172,5 @@ def status_meaning(command: str, status: str) -> tuple[str, str]:
             return "hardware-fault", f"status {status}: hardware fault (laser, motor or the like)"
         if number == 98:
             return "resumed", f"status {status}: {text}"
-    good = status in ("00", "99") or (command[:2], status) in {("BM", "02"), ("TM", "02"), ("TM", "03"), ("SS", "03")}
+    good = status in ("00", "99") or (command[:2], status) in {("TM", "02"), ("TM", "03"), ("SS", "03")}
     return "ok" if good else "refused", f"status {status}: {text or 'not in the manual'}"

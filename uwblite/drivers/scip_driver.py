@@ -211,8 +211,8 @@ class ScipDriver(ScipUnit):
     def identity(self) -> Identity:
         """Say who answered."""
         unit, facts, findings = self.geometry, self.facts, []
-        details = [(name, facts[key]) for name, key in (
-            ("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT")) if key in facts]  # fmt: skip
+        fields = (("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT"))
+        details = [(name, facts[key]) for name, key in fields if key in facts]
         details.append(("range", f"{unit.distance_min / 1000:.2f} to {unit.distance_max / 1000:.2f} m"))
         details.append(("steps", f"{unit.first} to {unit.last}, {unit.speed} rev/min"))
         if facts.get("LASR") == "OFF":

@@ -101,10 +101,6 @@ def open_port(url: str, baud: int) -> Port:
     url : a path, ``socket://host:port``, or what `serial.serial_for_url` takes.
     baud : bit/s.
 
-    Returns
-    -------
-    Port
-
     Raises
     ------
     DeviceError : cannot be opened; the message says how to fix it.
@@ -281,10 +277,6 @@ def stable_name(url: str) -> str | None:
     Parameters
     ----------
     url : as the user gave it.
-
-    Returns
-    -------
-    str, or None where there is none or the path is one already.
     """
     if "://" in url or "/serial/by-" in url or not BY_ID.is_dir():
         return None

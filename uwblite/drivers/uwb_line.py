@@ -102,9 +102,12 @@ def _at_range(line: str) -> Ranges | str | None:
 
 _SESSION_ROW = r'\[mac_address=0x([0-9A-Fa-f]{4}), status="[A-Z_]+"(?:, distance\[cm\]=(-?\d+))?(?:, [\w\[\]]+=-?[\d.]+)*\]'
 _session = _each(
-    rf"(?:SESSION_INFO_NTF: \{{[\w=, ]+)?(?:{_SESSION_ROW}[;}}\s]*)*", _SESSION_ROW,
-    "SESSION|session_|mac_addr|status=|distance", 0.01, r"block_index=(\d{1,9})\b",
-)  # fmt: skip
+    rf"(?:SESSION_INFO_NTF: \{{[\w=, ]+)?(?:{_SESSION_ROW}[;}}\s]*)*",
+    _SESSION_ROW,
+    "SESSION|session_|mac_addr|status=|distance",
+    0.01,
+    r"block_index=(\d{1,9})\b",
+)
 
 
 def _dwm3001(line: str) -> Ranges | Refused | str | None:
@@ -126,7 +129,8 @@ BOARDS: dict[str, Parse] = {
     # from: 1782\t Range: 3.21 m\t RX power: -65.10 dBm
     "makerfabs": _each(
         r"from:\s*[0-9A-Fa-f]{1,4}\s+Range:\s*-?\d+\.\d+\s*m(?:\s+RX power:\s*(?:-?\d+\.\d+|-?inf|nan|ovf)\s*dBm)?",
-        r"from:\s*([0-9A-Fa-f]{1,4})\s+Range:\s*(-?\d+\.\d+)", "from:|Range:|RX power|dBm",
+        r"from:\s*([0-9A-Fa-f]{1,4})\s+Range:\s*(-?\d+\.\d+)",
+        "from:|Range:|RX power|dBm",
     ),
     # AT+RANGE=tid:0,mask:0F,seq:182,range:(232,401,518,633,0,0,0,0),ancid:(0,1,2,3,-1,-1,-1,-1)
     "makerfabs-at": _at_range,
@@ -136,7 +140,7 @@ BOARDS: dict[str, Parse] = {
     # SESSION_INFO_NTF: {session_handle=1, sequence_number=39, block_index=39, n_measurements=2
     #  [mac_address=0x0001, status="SUCCESS", distance[cm]=245];      on lines of their own, or all on one
     "dwm3001": _dwm3001,
-}  # fmt: skip
+}
 
 
 def reading(anchor: str, metres: float, quality: float = 100.0) -> RangeReading:
@@ -224,9 +228,7 @@ class UwbDriver(LineDriver):
     tag : the tag whose ranges to take, where lines name several; "" = the first that is seen twice.
     """
 
-    def __init__(
-        self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = ""
-    ) -> None:  # fmt: skip
+    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = "") -> None:
         super().__init__(protocol, title, baud, clock, unit)
         self.first_is_whole = clock.proven
         self._tag, self._leap, self._empty = tag, 0, 0
