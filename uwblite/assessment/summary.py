@@ -18,7 +18,7 @@ from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.sensors import name_and_number
 from . import plausibility
 from .residual_tests import NO_DISTANCES
 

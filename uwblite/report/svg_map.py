@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-from .picture_frame import round_length
+from .picture import round_length
 from .printable import sigma_text
 
 MOST_POINTS = 4000
