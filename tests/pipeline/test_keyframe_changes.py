@@ -101,6 +101,14 @@ def test_added_keyframes_keep_poses_measurements_and_what_is_stated_of_them(exac
     assert np.abs(dense.ranges.residuals(dense.graph) * dense.ranges.sigma[:, None]).max() < 1e-3
 
 
+def test_scans_of_a_late_clock_are_added_where_they_were_taken(exact):
+    """Keyframes that follow the lidar's clock already have the scans at both ends of a step."""
+    recordings, _ = exact
+    usual = denser(recordings, CUT, 2)
+    moved = denser(later(recordings, 0.06), CUT, 2, 0.06)
+    np.testing.assert_allclose(moved.stamps, usual.stamps + 0.06, atol=1e-9)
+
+
 def test_pieces_of_a_step_have_its_variance_together(exact):
     recordings, estimate = exact
     after = denser(recordings, CUT, 2)

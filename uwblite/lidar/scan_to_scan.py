@@ -114,6 +114,12 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
     return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
+def descended_edges(clouds: Clouds, raster: CloudRasters, steps: Steps, config: TrackingConfig) -> RelativePoseEdges:
+    """Return the steps that descent measured, without a search, as edges."""
+    shown = steps.enough & (steps.share >= _LEAST_SHARE)
+    return _edges(clouds, raster, steps.i[shown], steps.pose[shown], config.gate, config)[0]
+
+
 def follow(
     clouds: Clouds, raster: CloudRasters, sound: SoundWheels, graph: Graph, steps: Steps, gate: float, config: TrackingConfig
 ) -> ScanOdometry:
