@@ -26,7 +26,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
-from ..sensor_log.anchor_names import first_place, place_name
+from ..sensor_log.sensors import first_place, place_name
 from .estimate import Estimate
 from .recordings import Recording, Recordings
 

@@ -18,7 +18,7 @@ from ..graph.solver import Optimizer, SolverSummary
 from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
-from ..odometry.slips import slipped, with_slips
+from ..odometry.slips import SoundWheels, slipped, with_slips
 from ..odometry.wheels import sideways_priors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
@@ -135,7 +135,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
-        estimate = replace(estimate, sound=wheels)
+        estimate = replace(estimate, sound=SoundWheels(wheels, slips))
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:

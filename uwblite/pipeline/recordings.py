@@ -158,12 +158,12 @@ def later(recordings: Recordings, shift: float) -> Recordings:
     return _joined([s.log for s in recordings.each], frames)
 
 
-def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
+def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -> Recordings:
     """Return the recordings with the scans inside some steps as keyframes, too; clouds there are of single scans.
 
     Parameters
     ----------
-    steps : (s,) keyframes at which the steps begin. most : keyframes added to one step.
+    steps : (s,) keyframes at which the steps begin. most : keyframes added to one step. delay : of the lidar's clock, s.
     """
     frames = []
     for recording in recordings.each:
@@ -172,7 +172,7 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
         added = (
             [np.zeros(0)]
             if log.scans is None
-            else [_spread(log.scans.middles, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()]
         )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
         alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
@@ -182,8 +182,13 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
 
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
-    within = stamps[np.searchsorted(stamps, begin, "right") : np.searchsorted(stamps, end, "left")]
+    first, last = np.searchsorted(stamps, (begin + _SAME_MOMENT, end - _SAME_MOMENT))
+    within = stamps[first:last]
     return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
+
+
+_SAME_MOMENT = 1e-6
+"""Difference of stamps, s, up to which it is rounding."""
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:
