@@ -16,7 +16,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.sensors import name_and_number
 from .causes import explained
 from .certainty import check_certainty, check_other_side
 from .decisions import RULES

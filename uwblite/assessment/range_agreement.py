@@ -9,7 +9,7 @@ from ..arrays import Bools, Floats, runs_of
 from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
-from ..sensor_log.anchor_names import first_place, name_and_number
+from ..sensor_log.sensors import first_place, name_and_number
 from .repairs import check_recordings, spans
 
 

@@ -10,15 +10,15 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
-from ..graph.covariances import Covariances, about_best_fit, shape_error
 from ..graph.graph import Graph
+from ..graph.marginals import Covariances, about_best_fit, shape_error
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.sensors import name_and_number
 from . import plausibility
 from .residual_tests import NO_DISTANCES
 
@@ -224,7 +224,7 @@ def _count(name: str, recordings: Recordings) -> int:
 def _calibration(
     k: int, unknown: Unknown, graph: Graph, covariance: Covariances, by_steps: float | None
 ) -> CalibrationEstimate:
-    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
+    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (calibration_checks)."""
     value = float(graph.calibration.values[k])
     if by_steps is not None:
         return CalibrationEstimate(unknown.key, value, by_steps, unknown.unit, unknown.meaning, "estimated")
