@@ -189,7 +189,7 @@ def failure(error: BaseException) -> tuple[int, str]:
     if isinstance(error, UwbliteError):
         return 2 if isinstance(error, UsageError) else 1, str(error)
     # A library that does not fit is an ImportError; one that is absent is a ModuleNotFoundError.
-    unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
+    unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.shell_limits()
     if isinstance(error, MemoryError) or unfit:
         return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY + memory.allowed()}"
     if isinstance(error, OSError):
