@@ -76,7 +76,7 @@ def planted(seeds=(0,), moves=(), held=True, given=None, names=None):
     for number, seed in enumerate(seeds):
         rng = np.random.default_rng(seed)
         stamps, truth = wander(rng, 120.0)
-        radio = ranges(rng, stamps, truth, PLACES, rate=0.6, sigma=0.05, bias=0.1 * rng.random(4), outliers=0.05)
+        radio = ranges(rng, stamps, truth, PLACES, rate=0.4, sigma=0.05, bias=0.1 * rng.random(4), outliers=0.05)
         tag = se2.interpolate_trajectory(stamps, truth, radio.stamps)[:, :2]
         measured = radio.ranges.copy()
         for of, anchor, by, since, until in moves:
