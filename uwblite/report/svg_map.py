@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-from .picture_frame import round_length
+from .picture import round_length
 from .printable import sigma_text
 
 MOST_POINTS = 4000

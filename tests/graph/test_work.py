@@ -10,8 +10,8 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
+from uwblite.graph.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 from uwblite.mapping import build_map
-from uwblite.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 
 USUAL = {
     "all sensors": {
