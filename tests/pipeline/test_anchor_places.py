@@ -76,7 +76,7 @@ def planted(seeds=(0,), moves=(), held=True, given=None, names=None):
     for number, seed in enumerate(seeds):
         rng = np.random.default_rng(seed)
         stamps, truth = wander(rng, 120.0)
-        radio = ranges(rng, stamps, truth, PLACES, rate=0.4, sigma=0.05, bias=0.1 * rng.random(4), outliers=0.05)
+        radio = ranges(rng, stamps, truth, PLACES, rate=0.6, sigma=0.05, bias=0.1 * rng.random(4), outliers=0.05)
         tag = se2.interpolate_trajectory(stamps, truth, radio.stamps)[:, :2]
         measured = radio.ranges.copy()
         for of, anchor, by, since, until in moves:
@@ -157,7 +157,7 @@ def torn(estimate, task, at, by, visits=False):
     return replace(estimate, graph=graph, steps=scans(poses, i, i + 1), closures=closures)
 
 
-@pytest.mark.parametrize("by", [(1.5, 0.0, 0.0), (0.3, 0.2, 0.5), (0.0, 0.0, -1.2)])
+@pytest.mark.parametrize("by", [(1.5, 0.0, 0.0), (0.3, 0.2, -0.8)])
 def test_where_the_path_is_torn_no_anchor_is_moved(by):
     """One step of the path explains the ranges to all anchors."""
     estimate, task = planted()

@@ -51,7 +51,7 @@ def walked_once(shift, moved):
     stamps, truth = wander(rng, 40.0, half_width=4.0)
     motion = se2.between(truth[:-1], truth[1:])
     motion[(stamps[:-1] >= SLIP) & (stamps[:-1] < SLIP + 1.0)] *= [0.0, 0.0, 1.0]
-    radio = ranges(rng, stamps, truth, ANCHORS, rate=0.5, sigma=0.05)
+    radio = ranges(rng, stamps, truth, ANCHORS, rate=0.75, sigma=0.05)
     tag = se2.interpolate_trajectory(stamps, truth, radio.stamps)[:, :2]
     place = ANCHORS[radio.anchor]
     late = (radio.stamps > SLIP) & np.isin(radio.anchor, moved)

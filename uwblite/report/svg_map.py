@@ -65,8 +65,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     x, y, width, height = _extent(result)
     size = max(width, height)
     frame = np.array([[x, -y - height], [x + width, -y]])
-    names = [(a.id, a.position) for a in result.anchors]
-    sides = free_sides(names, result.grid, frame, _HEIGHTS)
+    sides = free_sides([(a.id, a.position) for a in result.anchors], result.grid, frame, _HEIGHTS)
     marks = [_anchor_mark(a, size, side) for a, side in zip(result.anchors, sides, strict=True)]
     parts = []
     if grid_png is not None and result.grid is not None:
@@ -144,7 +143,8 @@ def free_sides(
         outside = sum(bool((b[0] < frame[0]).any() or (b[1] > frame[1]).any()) for b in boxes)
         return outside, sum(int(((walls >= b[0]) & (walls <= b[1])).all(axis=1).sum()) for b in boxes)
 
-    return [min(_SIDES, key=lambda side, name=name, place=place: cost(side, len(name), place)) for name, place in names]
+    costs = [{side: cost(side, len(name), place) for side in _SIDES} for name, place in names]
+    return [min(each, key=each.__getitem__) for each in costs]
 
 
 def _anchor_mark(anchor: AnchorEstimate, size: float, side: str) -> str:
