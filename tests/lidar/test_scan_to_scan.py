@@ -26,13 +26,13 @@ def odometry_steps(truth, clouds, stated):
 
 def tracked(truth, clouds, stated, by_ranges=None):
     """Return the scan odometry of a chain whose odometry reports the steps said (k - 1, 3)."""
-    wheels = replace(chained(truth, NOISE), motion=stated)
+    wheels = replace(chained(truth, NOISE), motion=stated, slips=by_ranges)
     poses = [truth[0]]
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), by_ranges)
+    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, TrackingConfig())
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools
 from ..graph.calibration import LASER, TURNING, scan_indices, with_free
 from ..graph.graph import Graph
 from ..graph.pose_edges import ScanEdges
@@ -16,7 +16,6 @@ from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
-from ..odometry.slips import slipped
 from ..odometry.wheels import reestimate_wheel_noise
 from ..problem.solution import rough
 from . import clock_offset, scan_clouds, turn_checks
@@ -50,14 +49,11 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    if estimate.sound is None:
-        track = _followed(estimate, steps, task)
+    track = _followed(estimate, steps, task)
+    if estimate.odometry.slips is None:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
-        # Ranges that are wrong show slips as well; where clouds measure a step, they tell.
-        by_ranges = slipped(estimate.sound, estimate.graph)
-        track = _followed(replace(estimate, odometry=estimate.sound), steps, task, by_ranges)
-        estimate = replace(estimate, odometry=track.slipped, sound=None)
+        estimate = replace(estimate, odometry=track.slipped)
         estimate = _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
     return _with_slips(estimate, track, task.following(estimate))
 
@@ -159,18 +155,10 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
-def _followed(estimate: Estimate, steps: Steps, task: Task, by_ranges: Floats | None = None) -> ScanOdometry:
-    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped.
-
-    Parameters
-    ----------
-    by_ranges : (e,) probability of a slip over each step, as the ranges show it.
-    """
-    scans, config = estimate.lidar, task.config
-    return scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
-        by_ranges,
-    )
+def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
+    scans, config = estimate.lidar, task.config.scan_to_scan
+    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
