@@ -24,7 +24,7 @@ from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
-from ..radio.range_noise import short_term_sigma
+from ..radio.range_noise import assumed, short_term_sigma
 from ..work import Work
 from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
@@ -102,7 +102,8 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     path = recordings.path[recordings.each[number].rows]
     used = ranges.alive
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
-    settings = replace(config.bootstrap, range_sigma=max(1.5 * sigma, config.bootstrap.least_sigma))
+    # What lasts does not show in differences of neighbours.
+    settings = replace(config.bootstrap, range_sigma=float(np.hypot(sigma, assumed(config.ranges).slow)))
     found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
