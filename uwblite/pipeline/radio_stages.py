@@ -102,8 +102,9 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     path = recordings.path[recordings.each[number].rows]
     used = ranges.alive
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
-    # What lasts does not show in differences of neighbours.
-    settings = replace(config.bootstrap, range_sigma=float(np.hypot(sigma, assumed(config.ranges).slow)))
+    # Differences of neighbours do not show the part of the errors that lasts.
+    sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
+    settings = replace(config.bootstrap, range_sigma=sigma)
     found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
