@@ -18,7 +18,7 @@ from ..graph.solver import Optimizer, SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import slipped, with_slips
-from ..odometry.wheels import sideways_priors, wheel_edges
+from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
@@ -124,16 +124,21 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    wheels, slips = estimate.odometry, estimate.bootstrap.slips
+    assumed_noise = wheels = estimate.odometry
+    slips, factors = estimate.bootstrap.slips, np.ones(3)
+    slips = slips if len(slips) else np.zeros(len(wheels))
     optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
         estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
         laps = range(0) if have_scans else laps[-1:]
     for lap in laps:
+        # Clouds show the noise of the wheels better; each recording that was joined has its own already.
+        if lap and task.config.ranges.learn and not (have_scans or estimate.alone):
+            factors = variance_factors(estimate.problem, estimate.odometry, 1.0 - slips, factors)
+            wheels = replace(assumed_noise, sqrt_information=assumed_noise.sqrt_information / np.sqrt(factors))
         # Noise learnt with wheels bent over a slip would keep them bent.
-        if slips.any():
-            estimate = replace(estimate, odometry=with_slips(wheels, slips))
+        estimate = replace(estimate, odometry=with_slips(wheels, slips))
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
@@ -158,7 +163,7 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
     return replace(estimate, odometry=odometry), result
 
 
-_NOISE_ROUNDS = 3
+_NOISE_ROUNDS = 4
 """Number of laps: each estimates noise and optimises the graph; in the last one the radio's calibration is free too."""
 
 
@@ -185,7 +190,14 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     values, shares = zip(*(_evidence_and_shares(estimate, config) for estimate in (one, other)), strict=True)
     common = 0.5 * (shares[0] + shares[1]) * ((shares[0] > 0.0) & (shares[1] > 0.0))
     gain = sum(sign * (rest + float(common @ density)) for sign, (rest, density) in zip((1.0, -1.0), values, strict=True))
-    return float(gain)
+    return float(gain) + _for_tighter_wheels(one, other)
+
+
+def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
+    """Return by how much the logarithm of the density of wheels of less noise is greater, where other measurements show them."""
+    tighter = np.einsum("eii->ei", one.odometry.sqrt_information) / np.einsum("eii->ei", other.odometry.sqrt_information)
+    shown = [redundancy(each.problem, each.odometry, np.ones(len(each.odometry))) for each in (one, other)]
+    return float(np.mean(shown, axis=0) @ np.log(tighter).mean(axis=0))
 
 
 def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tuple[float, Floats], Floats]:
