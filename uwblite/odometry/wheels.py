@@ -119,16 +119,19 @@ def variance_factors(graph: Graph, wheels: OdometryEdges, sound: Floats, before:
 def redundancy(graph: Graph, wheels: OdometryEdges, sound: Floats) -> Floats:
     """Return how many (3,) of the steps along, across and in heading all other measurements of a graph show as well.
 
-    It is the trace of a matrix as large as there are steps, estimated by vectors of random signs (M. Hutchinson, A stochastic
-    estimator of the trace, 1989).
+    It is the trace of a matrix as large as there are steps, estimated by vectors of unrelated signs, those of chirps (M.
+    Hutchinson, A stochastic estimator of the trace, 1989).
     """
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PROBES, len(wheels))) * np.sqrt(sound)
-    shifts = np.einsum("ke,cd->cked", signs, np.eye(3)).reshape(-1, len(wheels), 3)
+    phase = np.outer(np.arange(1, _PROBES + 1), np.arange(len(wheels)) ** 2) * _GOLDEN
+    shifts = np.einsum("ke,e,cd->cked", np.where(phase % 1.0 < 0.5, -1.0, 1.0), np.sqrt(sound), np.eye(3))
+    shifts = shifts.reshape(-1, len(wheels), 3)
     return np.asarray(np.mean(added_unknown(graph, wheels, shifts)[1].reshape(3, -1) ** -2.0, axis=1))
 
 
 _PROBES = 8
-"""Vectors of random signs."""
+"""Vectors of signs."""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+"""Rate at which the frequency of the first chirp grows: no ratio is farther from all fractions."""
 _ASSUMED_COUNTS = 4.0
 """Standard deviations that are assumed are right but for a factor of 1.4, as those learnt from four steps are."""
 _LEAST_FACTOR = 0.1

@@ -138,7 +138,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
             factors = variance_factors(estimate.problem, estimate.odometry, 1.0 - slips, factors)
             wheels = replace(assumed_noise, sqrt_information=assumed_noise.sqrt_information / np.sqrt(factors))
         # Noise learnt with wheels bent over a slip would keep them bent.
-        estimate = replace(estimate, odometry=with_slips(wheels, slips))
+        estimate = replace(estimate, odometry=with_slips(wheels, slips) if slips.any() else wheels)
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
@@ -194,8 +194,10 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
 
 
 def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
-    """Return by how much the logarithm of the density of wheels of less noise is greater, where other measurements show them."""
+    """Return by how much the logarithm of the density of wheels of less noise is greater, of steps that others measure."""
     tighter = np.einsum("eii->ei", one.odometry.sqrt_information) / np.einsum("eii->ei", other.odometry.sqrt_information)
+    if np.all(tighter == 1.0):
+        return 0.0
     shown = [redundancy(each.problem, each.odometry, np.ones(len(each.odometry))) for each in (one, other)]
     return float(np.mean(shown, axis=0) @ np.log(tighter).mean(axis=0))
 
