@@ -24,7 +24,7 @@ PACKAGE = ROOT / "uwblite"
 
 _SOLVER = ("graph.solver", "graph.pose_edges", "graph.range_edges", "graph.point_edges", "graph.distance_edges")
 PARTS = {
-    "map": ("mapping", "io.carmen", "io.results", "io.settings_toml"),
+    "map": ("mapping", "io.carmen", "io.results", "config"),
     "solve": _SOLVER,
     "covariances": (*_SOLVER, "graph.marginals"),
     "localize": ("localization", "localization.localize", "io.stored_result", "io.carmen"),

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.io.carmen_readings import Block, Pending, decode_equal_widths
+from uwblite.io.carmen_laser import Block, Pending, decode_equal_widths
 
 
 @given(st.integers(1, 6), st.integers(1, 2), st.lists(st.integers(0, 10**8 - 1), min_size=6, max_size=6), st.booleans())

@@ -16,8 +16,7 @@ from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.g2o import read_g2o, write_g2o
-from uwblite.io.graph_file import chained_poses
-from uwblite.io.plain_edges import plain_edges, root
+from uwblite.io.graph_file import chained_poses, plain_edges, root
 from uwblite.io.pyfg import read_pyfg, write_pyfg
 
 FORMATS = [

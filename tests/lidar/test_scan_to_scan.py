@@ -12,7 +12,7 @@ from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
 from uwblite.lidar.scan_to_scan import TrackingConfig, descend, follow, reattached
-from uwblite.odometry.slips import EVERY, LASTS
+from uwblite.odometry.slips import EVERY, LASTS, SoundWheels
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -32,7 +32,8 @@ def tracked(truth, clouds, stated, by_ranges=None):
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), by_ranges)
+    sound = SoundWheels(wheels, by_ranges)
+    return follow(clouds, raster, sound, Graph(np.array(poses)), steps, GATE, TrackingConfig())
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,18 @@ def test_clouds_judge_the_slips_that_ranges_show(walk):
     np.testing.assert_array_equal(np.flatnonzero(with_ranges), np.arange(blind.start, blind.stop))
     assert not with_ranges[seen].any()
     assert not without.any()
+
+
+def test_that_ranges_show_no_slip_is_no_evidence_against_one(walk):
+    """A path of few ranges follows the wheels, slips and all."""
+    truth, clouds, exact = walk
+    stated = exact.copy()
+    slips = np.arange(8, 14)
+    stated[slips] += [0.25, 0.0, 0.2]
+    found = [tracked(truth, clouds, stated, shown).slips for shown in (None, np.full(len(exact), 1e-6))]
+    np.testing.assert_array_equal(*found)
+    # The first may be a turn as the wheels can make it.
+    assert np.isin(slips[1:], np.flatnonzero(found[1] > 0.5)).all()
 
 
 def test_slips_are_found_by_a_search(walk):

@@ -14,8 +14,11 @@ from helpers.results import EVIL, small_result
 
 from uwblite.graph.graph import UnknownKey
 from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
+from uwblite.report import svg_map
 from uwblite.report.html import render
 
+FRAME = np.array([[-10.0, -10.0], [10.0, 10.0]])
+"""Corners of a map, m."""
 VOID = {"meta", "link", "input", "br", "img"}
 
 
@@ -154,6 +157,20 @@ def test_works_without_lidar_and_without_radio():
     text = render(bare, title="a", command="b")
     assert "No warnings." in text
     assert "<image" not in text
+
+
+@pytest.mark.parametrize(("walls", "free"), [("", "right"), ("r", "left"), ("rl", "below"), ("rlb", "above"), ("lba", "right")])
+def test_the_name_of_an_anchor_stands_where_no_wall_is(walls, free):
+    """A map of 20 m, on a phone 18 pixels a metre; y is downwards."""
+    middles = {"r": (1.5, 0.0), "l": (-1.5, 0.0), "b": (0.0, 0.8), "a": (0.0, -1.0)}
+    points = np.array([middles[side] for side in walls]).reshape(-1, 2)
+    assert svg_map._free_side(np.zeros(2), 4, points, FRAME) == free
+
+
+def test_a_name_leaves_the_map_on_no_side():
+    nothing = np.zeros((0, 2))
+    assert svg_map._free_side(np.array([9.8, 0.0]), 4, nothing, FRAME) == "left"
+    assert svg_map._free_side(np.array([np.nan, np.nan]), 4, nothing, FRAME) == "right"
 
 
 def test_an_unplaced_anchor_is_listed_and_not_drawn():

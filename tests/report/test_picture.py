@@ -11,8 +11,19 @@ from uwblite.io.png import decode_png, encode_png
 from uwblite.report import picture
 from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATH, PATHS, PROPOSED, START, WIDTH, Canvas, text_mask
 from uwblite.report.error_map import draw_errors
-from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
-from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
+from uwblite.report.picture import (
+    INK,
+    PAPER,
+    WALL,
+    Key,
+    PictureAnchor,
+    _paste,
+    _rows,
+    draw_map,
+    foot_height,
+    round_length,
+    shaded,
+)
 
 
 def room(rows=80, cols=120, resolution=0.05):

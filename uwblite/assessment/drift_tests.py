@@ -2,7 +2,7 @@
 
 A radio that warms up, wheels that wear or lose air, a radio whose clock is seconds off: bent paths and displaced anchors
 explain nearly all of such an effect, and no residual is conspicuous. The small remainder is compared with the pattern that each
-of these faults would leave: a score test (graph/added_unknown.py) gives the best-fitting size. A wheel that slips for
+of these faults would leave: a score test (graph/marginals.py) gives the best-fitting size. A wheel that slips for
 seconds is hidden in the same way: the error of each step is small, and the calibration of the turns absorbs the rest.
 """
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from ..arrays import Floats
 from ..findings import Finding, doubt
-from ..graph.added_unknown import added_unknown, added_unknown_and_moves
 from ..graph.graph import Edges, Graph, edge_weights
+from ..graph.marginals import added_unknown, added_unknown_and_moves
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.joint_refinement import with_fewer_pairs
-from ..odometry.turn_scale import TurnScale, turn_scales
+from ..odometry.wheels import TurnScale, turn_scales
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
 from .decisions import shown

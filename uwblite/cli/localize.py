@@ -9,6 +9,7 @@ from typing import Any
 from ..errors import ConfigError, UsageError
 from ..io.files import write_text
 from ..io.folders import replacing_folder
+from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.result_text import covariance_csv, json_lines, notices
 from ..io.stored_result import read_result
@@ -17,7 +18,6 @@ from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
 from ..report.picture import PictureAnchor, draw_map
 from . import console
-from .formats import refuse_existing
 from .inputs import effective_config, recording
 from .live import run_live, tell_doubts
 from .wording import signed

@@ -11,6 +11,7 @@ from ..errors import UsageError
 from ..findings import DOUBT, folded
 from ..io.corrected_log import poses_of_scans, write_corrected_log
 from ..io.folders import sole_writer
+from ..io.formats import format_of
 from ..io.result_text import notices
 from ..io.results import check_target
 from ..mapping import Stage
@@ -18,7 +19,6 @@ from ..report.printable import duration
 from ..screening.screen import screen
 from . import console
 from .cost import expected_cost, long_wait, together
-from .formats import format_of
 from .inputs import name_recordings_once
 from .making import Made, Recordings, make, peak_memory, read_logs, settings
 from .memory import shortage

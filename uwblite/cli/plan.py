@@ -9,13 +9,13 @@ import numpy as np
 from ..errors import ConfigError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.files import write_text
+from ..io.formats import refuse_existing
 from ..io.map_server import read_map
 from ..io.png import write_png
 from ..io.stored_result import StoredAnchor, read_result
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.picture import PictureAnchor, draw_map
 from . import console
-from .formats import refuse_existing
 
 
 def run(args: argparse.Namespace) -> int:

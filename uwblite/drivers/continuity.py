@@ -143,10 +143,9 @@ class RangeGuard:
         rounds: dict[float, list[Ranged]] = {}
         for item in sorted(passed, key=lambda item: item[0].stamp):
             rounds.setdefault(item[0].stamp, []).append(item)
-        return [*[Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up), *(
-            RangeEpoch(stamp, tuple([reading for _, reading in items]), items[0][0].spread)
-            for stamp, items in rounds.items()
-        )]  # fmt: skip
+        damaged: list[Action] = [Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up)
+        epochs = (RangeEpoch(t, tuple([reading for _, reading in items]), items[0][0].spread) for t, items in rounds.items())
+        return [*damaged, *epochs]
 
     def _follows(self, before: Ranged, after: Ranged) -> bool:
         seconds = max(after[0].stamp - before[0].stamp, 0.0)

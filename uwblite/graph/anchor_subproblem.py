@@ -17,9 +17,12 @@ from .unknowns import free_unknowns
 
 
 def with_anchors_solved(
-    graph: Graph, before: Sequence[float], trial: Graph, linearized: list[Linearization],
+    graph: Graph,
+    before: Sequence[float],
+    trial: Graph,
+    linearized: list[Linearization],
     solve: Callable[[Graph], Graph],
-) -> tuple[Graph, list[Linearization]]:  # fmt: skip
+) -> tuple[Graph, list[Linearization]]:
     """Return a trial and its linearisation with the anchors solved for at its poses, where only these make its cost too high.
 
     Parameters
@@ -58,9 +61,11 @@ def anchor_subproblem(graph: Graph, trial: Graph, linearized: Sequence[Lineariza
     inner &= ~_touched(len(inner), [lin for k, lin in enumerate(linearized) if k not in kinds])
     values = np.where(inner, graph.calibration.values, trial.calibration.values)
     return replace(
-        graph.updated(trial.poses, graph.anchors, values), edges=tuple(graph.edges[k] for k in kinds),
-        fixed_poses=np.ones(len(free["poses"]), dtype=bool), fixed_calibration=~inner,
-    )  # fmt: skip
+        graph.updated(trial.poses, graph.anchors, values),
+        edges=tuple(graph.edges[k] for k in kinds),
+        fixed_poses=np.ones(len(free["poses"]), dtype=bool),
+        fixed_calibration=~inner,
+    )
 
 
 def _touched(values: int, linearized: Sequence[Linearization]) -> Bools:

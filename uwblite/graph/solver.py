@@ -46,7 +46,6 @@ import numpy as np
 from ..arrays import Floats
 from ..config import documented, setting
 from ..errors import ConfigError, SolverError
-from ..work import ENTRIES
 from .anchor_subproblem import with_anchors_solved
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
@@ -54,6 +53,7 @@ from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .schwarz_cg import iterated
 from .unknowns import cheaper_move, linked_poses
+from .work import ENTRIES
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
@@ -140,9 +140,13 @@ def optimize(
 
 
 def minimise(
-    graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig,
-    progress: Progress | None = None, allowed: float = np.inf,
-) -> tuple[Graph, SolverSummary]:  # fmt: skip
+    graph: Graph,
+    linearized: list[Linearization],
+    normal: NormalEquations,
+    config: SolverConfig,
+    progress: Progress | None = None,
+    allowed: float = np.inf,
+) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
     descent = _Descent(graph, linearized, normal, config, allowed)
     del linearized
@@ -225,9 +229,14 @@ class _Descent:
         return NO_DECREASE if over else ""
 
     def _take(
-        self, trial: Graph, linearized: list[Linearization], costs: list[float], promised: float, negligible: float,
+        self,
+        trial: Graph,
+        linearized: list[Linearization],
+        costs: list[float],
+        promised: float,
+        negligible: float,
         reused: bool,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
         decrease = self.chi2 - sum(costs)
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE

@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
-from .carmen_laser import LaserMessages
-from .carmen_readings import Block
+from .carmen_laser import Block, LaserMessages
 from .carmen_stamps import LineClock, judged, time_order
 from .carmen_words import BrokenLine, Params, is_message_name, numbers, stamp_of, why_broken
 from .carmen_writer import write_log

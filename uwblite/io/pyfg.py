@@ -24,8 +24,19 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, check_lines, check_planar, given_places, measurements, rows_of
-from .plain_edges import ENDS, Measured, plain_edges, upper_triangle
+from .graph_file import (
+    ENDS,
+    GraphFile,
+    Measured,
+    assembled,
+    check_lines,
+    check_planar,
+    given_places,
+    measurements,
+    plain_edges,
+    rows_of,
+    upper_triangle,
+)
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 

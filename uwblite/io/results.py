@@ -24,8 +24,8 @@ from ..sensor_log import SensorLog
 from .files import sha256_of, write_text
 from .folders import check_free, mend, refuse_foreign, replacing_folder
 from .g2o import write_g2o
+from .graph_file import plain_edges
 from .map_server import trinary_image, write_map
-from .plain_edges import plain_edges
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
 from .result_text import (

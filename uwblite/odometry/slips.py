@@ -5,7 +5,7 @@ tells of its neighbours, too: the posterior of each step follows from that of al
 two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989).
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,16 @@ EVERY, LASTS = 600.0, 2.0
 SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as
 people walk. They count at most all of their motion too much."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SoundWheels:
+    """The odometry as if its wheels did not slip, and where they did."""
+
+    edges: OdometryEdges
+    """With the noise of wheels that do not slip."""
+    slips: Floats | None = None
+    """(e,) probability of a slip over each step by what is no scan; None = nothing tells."""
 
 
 def slip_sigma(wheels: OdometryEdges) -> Floats:

@@ -15,9 +15,10 @@ from ..graph.calibration import BIAS, ODOMETRY, OMNI, RADIO, RANGE_SCALE, with_f
 from ..graph.graph import Graph, edge_cost
 from ..graph.robust import SQUARED
 from ..graph.solver import Optimizer, SolverSummary
+from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
-from ..odometry.slips import slipped, with_slips
+from ..odometry.slips import SoundWheels, slipped, with_slips
 from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
@@ -25,7 +26,6 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import assumed, short_term_sigma
-from ..work import Work
 from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -142,7 +142,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
-        estimate = replace(estimate, sound=wheels)
+        estimate = replace(estimate, sound=SoundWheels(wheels, slips))
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:

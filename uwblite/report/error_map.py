@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import Canvas, rgb
-from .picture import PictureAnchor, draw_map, shaded
-from .picture_frame import FLOOR, INK
+from .picture import FLOOR, INK, PictureAnchor, draw_map, shaded
 
 _STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
 """m; bounds of the colours."""

@@ -7,13 +7,19 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-from .picture_frame import round_length
+from .picture import round_length
 from .printable import sigma_text
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
 _NAME = 0.12
 """Room to the right of an anchor for its name, as a share of the map's size on a phone."""
+_SHOWN = (360.0, 900.0)
+"""Pixels that the map's longer side has on a phone and on a desk."""
+_LETTER, _LINE = 9.0, 14.0
+"""Width of a letter and height of a name, pixels."""
+_SIDES = {"right": (10.0, 4.0), "left": (-10.0, 4.0), "below": (0.0, 22.0), "above": (0.0, -12.0)}
+"""Where a name stands beside its anchor, the first that is free of walls, and the foot of its line, pixels, y downwards."""
 MOST_CLOSURES = 1500
 """Rejected closures drawn and listed at most; accepted ones all are."""
 
@@ -56,6 +62,9 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     """Return the map with its switches and buttons as HTML."""
     x, y, width, height = _extent(result)
     size = max(width, height)
+    walls = np.zeros((0, 2)) if result.grid is None else result.grid.occupied_points() * (1.0, -1.0)
+    frame = np.array([[x, y], [x + width, y + height]])
+    marks = [_anchor_mark(a, size, _free_side(a.position * (1.0, -1.0), len(a.id), walls, frame)) for a in result.anchors]
     parts = []
     if grid_png is not None and result.grid is not None:
         geometry = result.grid.geometry
@@ -71,7 +80,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     paths += [("doubted", path) for path in result.doubted_paths()]
     lines = [f'<polyline class="{kind}" points="{_coordinates(p[thin(len(p), MOST_POINTS)])}"/>' for kind, p in paths]
     parts += ['<g class="trajectory">', *lines, *(_end_marks(result, recording, size) for recording in recordings), "</g>"]
-    parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
+    parts.append(f'<g class="anchors">{"".join(marks)}</g>')
     bar = round_length(size / 5.0)
     svg = (
         f'<svg id="map-view" viewBox="{x:.3f} {y:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map"'
@@ -107,7 +116,31 @@ def _switch(name: str, text: str, on: bool) -> str:
     return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
 
 
-def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
+def _free_side(place: Floats, letters: int, walls: Floats, frame: Floats) -> str:
+    """Return on which side of an anchor its name covers the fewest walls, within the map where that is possible.
+
+    Parameters
+    ----------
+    place : the anchor (2,), m, y downwards, as all that follows.
+    letters : of the name.
+    walls : occupied cells (n, 2), m.
+    frame : lower and upper corner of the map (2, 2), m.
+    """
+    size, wide = float(np.ptp(frame, axis=0).max()), _LETTER * letters
+    near = walls[np.abs(walls - place).max(axis=1, initial=0.0) < (wide + 2.0 * _LINE) * size / _SHOWN[0]]
+
+    def cost(side: str) -> tuple[int, int]:
+        x, foot = _SIDES[side]
+        left = {"right": x, "left": x - wide}.get(side, -wide / 2.0)
+        box = np.array([[left, foot - _LINE], [left + wide, foot]])
+        boxes = [place + box * size / pixels for pixels in _SHOWN]
+        outside = sum(bool((b[0] < frame[0]).any() or (b[1] > frame[1]).any()) for b in boxes)
+        return outside, sum(int(((near >= b[0]) & (near <= b[1])).all(axis=1).sum()) for b in boxes)
+
+    return min(_SIDES, key=cost)
+
+
+def _anchor_mark(anchor: AnchorEstimate, size: float, side: str) -> str:
     if not np.isfinite(anchor.position).all():
         return ""
     cx, cy = float(anchor.position[0]), -float(anchor.position[1])
@@ -119,7 +152,8 @@ def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
     state = "ok" if anchor.status == "ok" else "doubt"
     mark = (
         f'<g class="anchor {state}"><title>{escape(label.strip())}</title>{_ellipse(anchor, cx, cy)}'
-        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/><text>{escape(anchor.id)}</text></g>'
+        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/>'
+        f'<text class="{side}">{escape(anchor.id)}</text></g>'
     )
     if anchor.alternative is not None and np.isfinite(anchor.alternative).all():
         mark += f'<circle class="mirror" cx="{anchor.alternative[0]:.3f}" cy="{-anchor.alternative[1]:.3f}" r="{r:.3f}"/>'

@@ -10,9 +10,9 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
+from uwblite.graph.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 from uwblite.io.carmen import read_log
 from uwblite.mapping import build_map
-from uwblite.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 
 USUAL = {
     "all sensors": {
