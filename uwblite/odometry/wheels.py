@@ -12,9 +12,9 @@ import numpy as np
 from .. import se2
 from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread, spread_about_median, weighted_median
 from ..config import setting
-from ..graph.added_unknown import added_unknown
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
+from ..graph.marginals import added_unknown
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.robust import Kernel
 from ..sensor_log import Odometry
