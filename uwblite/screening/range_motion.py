@@ -248,8 +248,8 @@ class DelayPolicy:
 def without_delay(log: SensorLog, policy: DelayPolicy = DelayPolicy()) -> tuple[SensorLog, list[Fact]]:
     """Move the stamps of a radio whose clock is off by seconds, as its ranges show along the path that the wheels count.
 
-    In each window the ranges to one anchor are those from the path to one place, at the right offset alone. A window that
-    contradicts the offset of most shows that it is none (wheels that stood still, anchors that were moved).
+    In each window the ranges to one anchor are those from the path to one place, at the right offset alone. No window alone
+    decides, and one that contradicts the offset of the others shows that it is none (wheels that stood still, anchors moved).
     """
     if log.ranges is None:
         return log, []
@@ -266,7 +266,8 @@ def without_delay(log: SensorLog, policy: DelayPolicy = DelayPolicy()) -> tuple[
     likely = np.concatenate(parts)
     total = likely.sum(axis=0)
     weights, gains = np.exp(total - total.max()), likely[:, np.argmax(total)] - likely[:, len(offsets) // 2]
-    if gains.sum() + np.log(weights.mean() * policy.prior) < 0.0 or gains.min() < np.log(policy.contradicts):
+    most = gains.sum() - gains.max()
+    if most + np.log(weights.mean() * policy.prior) < 0.0 or gains.min() < np.log(policy.contradicts):
         return log, []
     by = float(np.average(offsets, weights=weights))
     moved = replace(log.ranges, stamps=log.ranges.stamps + by)
