@@ -24,10 +24,6 @@ def age(stamps):
     return (stamps - stamps[0]) / np.ptp(stamps)
 
 
-def test_a_sound_recording_drifts_in_nothing(sound):
-    assert not build_map(sound).doubts
-
-
 def test_ranges_that_grow(sound):
     ranges = sound.ranges
     (found,) = drifts(replace(sound, ranges=replace(ranges, ranges=ranges.ranges + 0.6 * age(ranges.stamps))))
