@@ -95,9 +95,6 @@ INGREDIENTS: dict[str, LeftOut] = {
         ("pipeline.surface_adjustment.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
     )),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
-    "noise of wheels by residuals": LeftOut(patches=(
-        ("pipeline.final_stages.with_noise_shown", lambda graph, certainty: graph),
-    )),
     "points between beams": LeftOut(patches=(("lidar.beam_gaps.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),

@@ -13,7 +13,7 @@ the weight of a few, and pairs keep their weight. On columns they get hardly any
 it, to the side from which it is seen, so that pairs err along the path by what the robot passes of them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,22 +169,8 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RaysOfGraph:
-    """Information of the rays about a graph's unknowns, for covariances."""
-
-    sums: RaySums
-    surfaces: Surfaces
-    graph: Graph
-    lidar: "_Lidar"
-
-    def equations(self, unknowns: Unknowns) -> Blocks:
-        """Return the normal equations of the rays by the numbers of the graph's unknowns."""
-        return _blocks(self.sums, self.surfaces, self.graph, self.lidar, unknowns)
-
-
-def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, RaysOfGraph]:
-    """Return a graph, and the information of the rays about it, for covariances.
+def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
+    """Return a graph, and the normal equations of the rays by the numbers of its unknowns, for covariances.
 
     Rays have the weight of the adjustment. Pairs of clouds contain the same points, and others: they get half their weight.
     """
@@ -194,7 +180,7 @@ def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
     sums = weighted_sums(found, lidar.sensors, graph.poses, _KERNEL)
-    return replace(graph, edges=tuple(edges)), RaysOfGraph(sums, found.surfaces, graph, lidar)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _blocks(sums, found.surfaces, graph, lidar, unknowns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
