@@ -133,13 +133,3 @@ def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, m
     found = adjust_surfaces(before, around["task"])
     assert found.surfaces is None
     assert before.problem.chi2() > found.problem.chi2() >= optimize(found.problem)[0].chi2() * (1.0 - 1e-6)
-
-
-def test_where_all_surfaces_turn_out_to_be_none_pairs_are_left_alone(around, monkeypatch):
-    def nothing(measured, *_):
-        return replace(measured, rays=measured.rays.rows(slice(0))).shown()
-
-    monkeypatch.setattr(surface_adjustment, "with_round_columns", nothing)
-    found = adjust_surfaces(around["before"], around["task"])
-    assert found.surfaces is None
-    np.testing.assert_array_equal(found.joint.T_i_j, around["before"].joint.T_i_j)

@@ -207,22 +207,6 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
     return learnt_noise(residual, place, rays.surface, surfaces.round)
 
 
-def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
-    """Return the rms residual (s,) of the rays of each surface, relative to the learnt noise; 1 where the surface has the
-    assumed shape."""
-    many = len(found.surfaces.facing)
-    count, squares = np.zeros(many), np.zeros(many)
-    for rays in found.rays.in_parts(found.surfaces):
-        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.ratio
-        count += np.bincount(rays.surface, minlength=many)
-        squares += np.bincount(rays.surface, np.minimum(residual**2, _CLIP**2), many)
-    return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
-
-
-_CLIP = 5.0
-"""Standard deviations of a residual beyond which it does not count."""
-
-
 def _shown(
     rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -31,7 +31,7 @@ from ..graph.unknowns import Unknowns, moved
 from ..graph.work import RAYS
 from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
-from ..lidar.ray_equations import RaySums, misfit, noise_of, weighted_sums
+from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.ray_noise import UNLEARNT, RayNoise
 from ..lidar.surface_rays import (
     NEAR,
@@ -53,16 +53,6 @@ from .recordings import Recording
 
 _AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
-
-
-def with_round_columns(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> MeasuredSurfaces:
-    """Return the surfaces without columns that are not round; for the parameters see ray_equations.linearized."""
-    none = found.surfaces.round & (misfit(found, sensors, poses) > _MISFIT)
-    return replace(found, rays=found.rays.rows(~none[found.rays.surface])).shown()
-
-
-_MISFIT = 1.3
-"""Rms residual of the rays of a column, relative to their noise, beyond which it is not round; that of a circle is 1."""
 
 
 _ON_RIM = 0.06
@@ -229,7 +219,6 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
         if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
-            found, order = with_round_columns(found, lidar.sensors, poses), None
             kind = points_on(estimate.lidar.clouds, found, lidar.sensors)
         if not len(found.rays.keyframe):
             break
