@@ -141,16 +141,6 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
     assert np.abs(found).max() > 1e-3
 
 
-def test_redundancy_is_the_diagonal_of_the_dense_projection():
-    graph, _ = calibrated_loop(n=40)
-    jacobian, _, parts = dense_jacobian(graph)
-    checked = 1.0 - np.einsum("mu,uv,mv->m", jacobian, np.linalg.inv(jacobian.T @ jacobian), jacobian)
-    found = marginals(graph)
-    for edges, part in zip(graph.edges, parts, strict=True):
-        np.testing.assert_allclose(found.redundancy(edges).ravel(), checked[part], atol=1e-7)
-    assert checked.sum() == pytest.approx(len(checked) - jacobian.shape[1])
-
-
 def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
     """Errors drawn from a covariance of no structure, small beside the path; a similarity is z -> a z + b."""
     rng = np.random.default_rng(2)

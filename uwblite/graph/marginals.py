@@ -178,23 +178,6 @@ class Marginals:
         ends = np.cumsum([part.size for part in rows.values()])[:-1]
         return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
 
-    def redundancy(self, edges: Edges) -> Floats:
-        """Return the redundancy of each residual (e, d) of some of the graph's edges: 0 = not checked by others, 1 = fully.
-
-        1 - w j H^-1 j^T for each row j of the Jacobian (W. Baarda, A testing procedure for use in geodetic networks, 1968):
-        the sum over residuals is what the sum of their squares is expected to be.
-        """
-        blocks = edges.linearize(self._graph).blocks
-        number = np.concatenate([self.unknowns.number[name][index] for name, index, _ in blocks], axis=1)
-        jacobian = np.concatenate([own for *_, own in blocks], axis=2)
-        row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
-        free = (row >= 0) & (column >= 0)
-        covariance = np.zeros(row.shape)
-        covariance[free] = selected_inverse(self._factor, row[free], column[free])
-        explained = np.einsum("edk,ekl,edl->ed", jacobian, covariance, jacobian)
-        # In undetermined directions the covariance is rounding error.
-        return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
-
     def solve(self, right: Floats) -> Floats:
         """Return H^-1 times right (size, m)."""
         return np.asarray(self._factor.solve(right))
