@@ -69,6 +69,18 @@ def test_clouds_judge_the_slips_that_ranges_show(walk):
     assert not without.any()
 
 
+def test_that_ranges_show_no_slip_is_no_evidence_against_one(walk):
+    """A path of few ranges follows the wheels, slips and all."""
+    truth, clouds, exact = walk
+    stated = exact.copy()
+    slips = np.arange(8, 14)
+    stated[slips] += [0.25, 0.0, 0.2]
+    found = [tracked(truth, clouds, stated, shown).slips for shown in (None, np.full(len(exact), 1e-6))]
+    np.testing.assert_array_equal(*found)
+    # The first may be a turn as the wheels can make it.
+    assert np.isin(slips[1:], np.flatnonzero(found[1] > 0.5)).all()
+
+
 def test_slips_are_found_by_a_search(walk):
     """Wheels so bad that they miss by up to 0.3 m and 0.35 rad a step: the clouds show it, and the noise is re-estimated."""
     truth, clouds, exact = walk

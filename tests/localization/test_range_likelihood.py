@@ -16,7 +16,8 @@ def some_ranges(seed):
     places, tags = rng.uniform(-5, 5, (12, 2)), rng.uniform(-1, 1, (12, 2))
     pose = np.array([0.3, -0.4, 0.7])
     true = np.hypot(*(pose[:2] + se2.rotate(pose[2], tags) - places).T)
-    return pose, Ranges(np.arange(12) % 3, places, tags, true + rng.normal(0, 0.2, 12), rng.uniform(0.1, 0.3, 12))
+    noise = rng.uniform(0.1, 0.3, 12), np.arange(12.0), np.full(12, 0.08), np.full(12, 1.5)
+    return pose, Ranges(np.arange(12) % 3, places, tags, true + rng.normal(0, 0.2, 12), *noise)
 
 
 def test_factors_of_ranges_are_the_numeric_gradient_of_their_cost():
@@ -26,7 +27,8 @@ def test_factors_of_ranges_are_the_numeric_gradient_of_their_cost():
 
         def cost(x, ranges=ranges):
             error = range_likelihood.range_errors(x[None], ranges)[0][0]
-            return 2.0 * range_likelihood.INDEPENDENT_RANGES * np.log1p(np.square(error / (2.0 * ranges.sigma))).sum()
+            share = range_likelihood.series(ranges).share
+            return 2.0 * (share * np.log1p(np.square(error / (2.0 * ranges.sigma)))).sum()
 
         steps = np.eye(3) * 1e-6
         gradient = [(cost(pose + s) - cost(pose - s)) / 2e-6 for s in steps]
@@ -57,8 +59,45 @@ def test_likelihoods_in_single_precision_are_those_in_double_to_a_thousandth():
     error = range_likelihood._misfits(poses, ranges)
     z = error / ranges.sigma
     terms = 0.7 * np.exp(-0.5 * z**2) + 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z) + gross_share(ranges.sigma)
-    expected = range_likelihood.INDEPENDENT_RANGES * np.log(terms).sum(axis=1)
+    # One after another: the error stays what it was, or is drawn anew.
+    chain = range_likelihood.series(ranges)
+    for k in range(3, 12):
+        jump, stay = (error[:, k] - error[:, k - 3]) / chain.change[k], chain.stay[k]
+        terms[:, k] = (1.0 - stay) * terms[:, k] + stay * ranges.sigma[k] / chain.change[k] * np.exp(-0.5 * jump**2)
+    expected = np.log(terms).sum(axis=1)
     np.testing.assert_allclose(range_likelihood.range_likelihood(poses, ranges), expected, rtol=1e-3, atol=0.01)
+
+
+def test_an_error_that_lasts_costs_once_and_one_that_jumps_costs_each_time():
+    pose, ranges = some_ranges(3)
+    near = replace(ranges, way=0.1 * np.arange(12), tags=np.zeros((12, 2)), values=np.hypot(*(pose[:2] - ranges.places).T))
+    costs = []
+    for times in ((0,), (0, 3, 6, 9), (3, 9)):
+        late = np.isin(np.arange(12), times) * 0.8
+        costs.append(float(range_likelihood.range_likelihood(pose[None], replace(near, values=near.values + late))[0]))
+    exact = float(range_likelihood.range_likelihood(pose[None], near)[0])
+    # It comes and goes once; it comes once; it comes and goes twice.
+    once, lasting, twice = (exact - cost for cost in costs)
+    assert 0.0 < lasting < once < 0.6 * twice
+
+
+def test_the_stay_is_the_renewal_law_whatever_the_steps_are():
+    """The probability that an error has lasted over several ranges is that over their whole way, less gross errors."""
+    _, ranges = some_ranges(1)
+    still = replace(ranges, tags=np.zeros((12, 2)))
+    many = range_likelihood.series(still).stay[3::3].prod()
+    one = range_likelihood.series(still.rows(np.array([0, 9]))).stay[1]
+    np.testing.assert_allclose(many / 0.95**3, one / 0.95, rtol=1e-9)
+    first = range_likelihood.series(replace(still, way=0.1 * still.way))
+    np.testing.assert_array_equal(first.before[:4], [0, 1, 2, 0])
+    np.testing.assert_array_equal(first.share[:3], 1.0)
+    assert (first.share[3:] < 1.0).all()
+
+
+def test_two_tags_that_measure_at_once_are_two_places():
+    _, ranges = some_ranges(1)
+    two = replace(ranges.rows(np.array([0, 3])), way=np.zeros(2), tags=np.array([[0.0, 0.0], [0.4, 0.0]]))
+    np.testing.assert_allclose(range_likelihood.series(two).stay[1], 0.95 * np.exp(-0.4 / 1.5))
 
 
 def test_a_common_error_moves_the_pose_as_its_effect_says():

@@ -55,6 +55,7 @@ def test_repeated_ranges_count_as_the_mean_of_their_correlated_errors_varies():
     fact = RangeFacts(0, np.zeros(2), 1.0, 0.0, sigma, 0.0, RangeErrors(np.zeros((0, 2)), np.zeros(0), noise))
     away = every * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     variance = noise.white**2 / count + noise.slow**2 * np.exp(-away / noise.length).mean()
-    np.testing.assert_allclose(repeated(fact, every) * sigma**2 / count, variance, rtol=0.02)
-    assert repeated(fact, np.inf) == 1.0
-    assert repeated(fact, 0.0) > 50.0
+    white = (fact.white / sigma) ** 2
+    np.testing.assert_allclose(repeated(white, fact.length, every) * sigma**2 / count, variance, rtol=0.02)
+    assert repeated(white, fact.length, np.inf) == 1.0
+    assert repeated(white, fact.length, 0.0) > 50.0

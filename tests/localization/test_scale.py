@@ -74,7 +74,8 @@ def ranges_at(poses, factor, moved=0.0):
     tags = np.repeat(se2.between(poses[-1], poses)[:, :2], len(places), axis=0)
     true = np.hypot(*(poses[:, None, :2] - places - [moved, 0.0] * (np.arange(4) == 1)[:, None]).reshape(-1, 2).T)
     where = np.tile(places * factor, (len(poses), 1))
-    return Ranges(np.tile(np.arange(4), len(poses)), where, tags, true, np.full(len(true), 0.1))
+    noise = np.full(len(true), 0.1), np.arange(len(true)) / 4.0, np.full(len(true), 0.07), np.full(len(true), 1.5)
+    return Ranges(np.tile(np.arange(4), len(poses)), where, tags, true, *noise)
 
 
 def test_ranges_measure_it_too_and_a_moved_anchor_is_no_other_unit():

@@ -10,7 +10,7 @@ from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
 
 BOUNDS = (np.array([-1.0, -1.0]), np.array([6.0, 5.0]))
-NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((5, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,8 @@ def ranges_at(pose, anchors, tag):
     """Return exact ranges of a tag (2,) on the base to anchors (m, 2)."""
     there = se2.transform(np.asarray(pose), np.asarray(tag))
     count = len(anchors)
-    return Ranges(np.arange(count), anchors, np.tile(tag, (count, 1)), np.hypot(*(anchors - there).T), np.full(count, 0.15))
+    noise = np.full(count, 0.15), np.zeros(count), np.full(count, 0.1), np.full(count, 1.5)
+    return Ranges(np.arange(count), anchors, np.tile(tag, (count, 1)), np.hypot(*(anchors - there).T), *noise)
 
 
 def test_a_few_points_of_walls_give_the_heading_where_ranges_fix_the_place(room):

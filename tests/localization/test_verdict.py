@@ -6,7 +6,7 @@ import pytest
 from uwblite.localization import hypotheses
 from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, map_odds, needed, nowhere, undecided, vague
 
-MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4), RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
+MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4, 6.0), RangeFit(3, 1.0, 2, 1.5), RangeFit(3, 1.0, 1, 1.5)
 ENDS, RAYS = 3.0 * FEW_ENDS, 30.0
 
 
@@ -35,7 +35,7 @@ def test_what_one_kind_alone_says_needs_two_metres_of_the_same_place(ends, fitti
 
 
 def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agree_for_long():
-    few = RangeFit(12, 0.7, 3)
+    few = RangeFit(12, 0.7, 3, 6.0)
     for agreed in (0.0, 1.0):
         assert "scans" in nowhere(map_odds(-0.6, ENDS, RAYS, -6.0, few, agreed), few)
         assert "ranges" in nowhere(map_odds(-0.3, ENDS, RAYS, -20.0, few, agreed), few)
@@ -46,12 +46,12 @@ def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agr
 
 def test_neither_scans_nor_agreement_outweigh_ranges_that_contradict():
     # An aisle that looks like the robot's own, which is not in the map.
-    half = RangeFit(16, 0.4, 2)
+    half = RangeFit(16, 0.4, 2, 8.0)
     assert "ranges" in nowhere(map_odds(-0.07, ENDS, 75.0, -35.0, half, 6.0), half)
 
 
 def test_ranges_alone_of_which_one_in_four_disagrees_are_of_another_building():
-    odd = RangeFit(20, 0.75, 3)
+    odd = RangeFit(20, 0.75, 3, 10.0)
     assert "ranges" in nowhere(map_odds(0.0, 0.0, 0.0, -6.0, odd, 5.0), odd)
 
 

@@ -116,3 +116,13 @@ def test_pieces_of_a_step_have_its_variance_together(exact):
     whole, pieces = covariances(estimate.odometry), covariances(dense.odometry)
     for k, (first, last) in enumerate(pairwise(number)):
         np.testing.assert_allclose(pieces[first:last].sum(axis=0), whole[k], rtol=1e-4)
+
+
+def test_pieces_of_a_step_slip_as_it_does(exact):
+    recordings, estimate = exact
+    slips = np.linspace(0.0, 1.0, len(estimate.odometry))
+    slipping = replace(estimate, odometry=replace(estimate.odometry, slips=slips))
+    dense = with_keyframes(slipping, recordings, denser(recordings, CUT, 2))
+    number = np.searchsorted(dense.recordings.stamps, recordings.stamps)
+    for k, (first, last) in enumerate(pairwise(number)):
+        np.testing.assert_array_equal(dense.odometry.slips[first:last], slips[k])

@@ -219,8 +219,12 @@ class ScanEdges(EdgeTable):
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
     ROWS: ClassVar[Mapping[str, Shape]] = {
-        "T_i_j": (3,), "sqrt_information": (3, 3), "twist_i": (3,), "twist_j": (3,), "calibration": (4,),
-    }  # fmt: skip
+        "T_i_j": (3,),
+        "sqrt_information": (3, 3),
+        "twist_i": (3,),
+        "twist_j": (3,),
+        "calibration": (4,),
+    }
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
     i: Ints

@@ -23,7 +23,7 @@ from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood, matched_by_chance
 from .pair_alignment import align_pairs
 from .registration import Placed, Prior, Registration, RegistrationConfig, of_fallible
-from .scan_matching import match, measured, pair_points
+from .scan_matching import PairPoints, match, measured, pair_points
 from .step_search import StepSearch
 from .visibility import nearest_by_bearing
 
@@ -138,10 +138,12 @@ def follow(
     points, mean = pair_points(clouds, i + 1, config.points), noise.corrected(graph)
     chance = matched_by_chance(clouds, raster, i, points, mean)
     registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma, chance)
-    sound = covariance_of(noise, graph)
-    prior = Prior(mean, sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
+    registration.objects.learn_moves(i[steps.enough], PairPoints(points.row[steps.enough]), steps.pose[steps.enough])
+    usual = covariance_of(noise, graph)
+    prior = Prior(mean, usual, usual + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
     found = registration.register(i, i + 1, points, prior, steps.pose)
-    prior_odds = 0.0 if wheels.slips is None else of_fallible(logit(wheels.slips), RegistrationConfig.useless)
+    # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
+    prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
     slips = posterior(found.log_odds + prior_odds, wheels.duration)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)

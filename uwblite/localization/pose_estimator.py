@@ -106,7 +106,8 @@ class PoseEstimator:
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
-        share = 1.0 / repeated(fact, self._way - self._range_way[fact.anchor])
+        driven = self._way - self._range_way[fact.anchor]
+        share = 1.0 / float(repeated((fact.white / fact.sigma) ** 2, fact.length, driven))
         self._range_way[fact.anchor] = self._way
         bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm, share)
         self.work += 8 * bank.covariance.size
@@ -269,7 +270,9 @@ class PoseEstimator:
         undecided = verdict.undecided(self._bank, best, found.complete, certain)
         agreed = self._agreed(None if undecided else pose)
         fit, likelihood = float(found.fit[best]), float(found.by_ranges[best])
-        odds = verdict.map_odds(fit, known, found.independent, likelihood, fitting, agreed)
+        # Rays that end beyond the map say nothing about it.
+        rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
+        odds = verdict.map_odds(fit, known, rays, likelihood, fitting, agreed)
         self._reason = (
             undecided
             or verdict.nowhere(odds, fitting)

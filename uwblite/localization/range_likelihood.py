@@ -1,16 +1,15 @@
 """Likelihood of a window's ranges at poses of the map, and the pose that they determine."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
-from .range_update import gross_share
-from .window import Ranges
+from ..arrays import Floats, Ints
+from .range_update import WILD, gross_share, repeated
+from .window import DRIFT, Ranges
 
-INDEPENDENT_RANGES = 0.5
-"""Share of the window's ranges that count as independent: they are a quarter of a metre apart, and a part of their errors is
-correlated over 1.5 m."""
-PER_RANGE = 25
+PER_RANGE = 35
 """Operations on elements of arrays for the likelihood of a range at a pose."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
@@ -38,10 +37,40 @@ def _misfits(poses: Floats, ranges: Ranges) -> Floats:
     return np.asarray(ranges.values - np.sqrt(dx * dx + dy * dy))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """Each range beside the one before it to the same anchor."""
+
+    before: Ints
+    """(m,) its number; a first range's own."""
+    stay: Floats
+    """(m,) probability, 0..1, that its error is still the same but for the white noise; 0 of a first one. Gross errors do not
+    last."""
+    change: Floats
+    """(m,) m, standard deviation of the difference then."""
+    share: Floats
+    """(m,) of the information of an independent range that it has, 0..1; 1 of a first one."""
+
+
+def series(ranges: Ranges) -> Series:
+    """Return how the ranges to each anchor follow one another: errors by multipath and shadows last for some metres."""
+    order = np.argsort(ranges.anchor, kind="stable")
+    follows = np.diff(ranges.anchor[order], prepend=-1) == 0
+    before = np.arange(len(ranges))
+    before[order[follows]] = order[np.flatnonzero(follows) - 1]
+    again = before != np.arange(len(ranges))
+    # Two tags are apart where the robot has not moved.
+    driven = np.maximum(ranges.way - ranges.way[before], np.hypot(*(ranges.tags - ranges.tags[before]).T))
+    stay = np.where(again, (1.0 - WILD) * np.exp(-driven / ranges.length), 0.0)
+    change = np.sqrt(2.0 * ranges.white**2 + (DRIFT * driven) ** 2)
+    many = repeated((ranges.white / ranges.sigma) ** 2, ranges.length, driven)
+    return Series(before, stay, change, np.where(again, 1.0 / many, 1.0))
+
+
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
 
-    Errors of ranges to one anchor are correlated, see INDEPENDENT_RANGES.
+    The error of ranges to one anchor stays what it was, with a probability that fades with the way, or is drawn anew.
 
     Parameters
     ----------
@@ -54,7 +83,15 @@ def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Float
     gross, z = gross_share(sigma).astype(np.float32), error / sigma.astype(np.float32)
     square = z * z
     late = 0.15 * np.exp(-2.0 * np.maximum(error, 0.0)) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
-    return INDEPENDENT_RANGES * np.log(0.7 * np.exp(-0.5 * square) + late + gross).sum(axis=1, dtype=np.float64)
+    fresh = 0.7 * np.exp(-0.5 * square) + late + gross
+    chain = series(ranges)
+    again = np.flatnonzero(chain.stay)
+    change = (chain.change + wider)[again]
+    jump = (error[:, again] - error[:, chain.before[again]]) / change.astype(np.float32)
+    stay = chain.stay[again].astype(np.float32)
+    same = (sigma[again] / change).astype(np.float32) * np.exp(-0.5 * jump * jump)
+    fresh[:, again] += stay * (same - fresh[:, again])
+    return np.asarray(np.log(fresh).sum(axis=1, dtype=np.float64))
 
 
 def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
@@ -79,7 +116,8 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     few = np.unique(np.linspace(0, len(ranges) - 1, _MOST_MOMENTS).astype(np.intp))
     some, parts = ranges.rows(few), np.array_split(pose + off, len(off) // _AT_ONCE)
-    weight = np.concatenate([range_likelihood(part, some) for part in parts]) * (len(ranges) / len(few))
+    weight = np.concatenate([range_likelihood(part, some) for part in parts])
+    weight *= series(ranges).share.sum() / series(some).share.sum()
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     mean = weight @ off
@@ -113,5 +151,5 @@ def _linear(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
     distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 0.05)
     unit = offset / distance[..., None]
     jacobian = np.concatenate([unit, (unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1])[..., None]], axis=-1)
-    weight = INDEPENDENT_RANGES / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+    weight = series(ranges).share / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
     return jacobian, jacobian * weight[..., None], error

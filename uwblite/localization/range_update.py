@@ -10,7 +10,7 @@ from ..arrays import Floats
 from ..radio.range_errors import RangeErrors, pattern_waves
 from .hypotheses import FIRST_ANCHOR, PATTERN, Hypotheses, symmetric
 
-_TAIL, _DETOUR, _WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0
+_TAIL, _DETOUR, WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0
 """Share of ranges with a detour and its mean, m; share of gross errors and their width, m: the mixture of radio.nlos_mixture.
 The map's own ranges have a tail of 0.15 and 0.25 m where its robot drove, those of another robot on another path 0.22 and 0.28
 m in the middle of eleven buildings; how many of them are late in a place that is new differs, so that more are expected."""
@@ -37,16 +37,33 @@ class RangeFacts:
     errors: RangeErrors | None = None
     """By the tag's place, from the map."""
 
+    @property
+    def white(self) -> float:
+        """Standard deviation of the part of the noise that is new in every range, m."""
+        noise = self.errors.noise if self.errors is not None else None
+        return float(np.sqrt(0.5)) * self.sigma if noise is None else min(noise.white, self.sigma)
 
-def repeated(fact: RangeFacts, driven: float) -> float:
-    """Return how many ranges have the information of one independent one, so many metres after the last one to the anchor.
+    @property
+    def length(self) -> float:
+        """Correlation length of the rest, m."""
+        noise = self.errors.noise if self.errors is not None else None
+        return _LENGTH if noise is None else noise.length
 
+
+def repeated(white: Floats | float, length: Floats | float, driven: Floats | float) -> Floats:
+    """Return how many ranges (...) to one anchor have the information of one independent one.
+
+    Parameters
+    ----------
+    white : (...) share of the variance that is new in every range, 0..1. length : (...) correlation length of the rest, m.
+    driven : (...) m since the last range to the anchor.
+
+    Notes
+    -----
     Multipath and shadows, which are the same until the tag has moved: the mean of errors with covariance ``exp(-d / length)``
     every d has the variance of independent ones every ``2 length``. The white part of the noise is new every time.
     """
-    noise = fact.errors.noise if fact.errors is not None else None
-    white, length = (0.5, _LENGTH) if noise is None else (min(noise.white**2 / fact.sigma**2, 1.0), noise.length)
-    return white + (1.0 - white) * max(2.0 * length / max(driven, _SAME_PLACE), 1.0)
+    return np.asarray(white + (1.0 - white) * np.maximum(2.0 * length / np.maximum(driven, _SAME_PLACE), 1.0))
 
 
 _LENGTH, _SAME_PLACE = 1.5, 0.01
@@ -102,7 +119,7 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) 
 def _judged(error: Floats, sigma: Floats) -> tuple[Floats, Floats]:
     """Return the weights (h,) of errors (h,) with standard deviations (h,) and their log-likelihoods, 0 = the likeliest."""
     z = error / sigma
-    core = (1.0 - _TAIL - _WILD) * np.exp(-0.5 * z**2)
+    core = (1.0 - _TAIL - WILD) * np.exp(-0.5 * z**2)
     ratio = sigma / _DETOUR
     late = _TAIL * ratio * np.sqrt(2.0 * np.pi) * np.exp(np.minimum(0.5 * ratio**2 - error / _DETOUR, 50.0)) * ndtr(z - ratio)
     total = core + late + gross_share(sigma)
@@ -111,4 +128,4 @@ def _judged(error: Floats, sigma: Floats) -> tuple[Floats, Floats]:
 
 def gross_share(sigma: Floats) -> Floats:
     """Return the density (...) of gross errors, that of a normal error of 0 with standard deviations (...), m, being 1."""
-    return np.asarray(_WILD * np.sqrt(2.0 * np.pi) / _WIDTH * sigma)
+    return np.asarray(WILD * np.sqrt(2.0 * np.pi) / _WIDTH * sigma)

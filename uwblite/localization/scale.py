@@ -6,7 +6,7 @@ is matched once more together with two scales, one of the lidar's (or the radio'
 measurements, which belongs to the wheels and absorbs their error.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
     x, hessian = np.zeros(5 + len(names)), np.diag(prior)
     for _ in range(_ITERATIONS):
         tags = ranges.tags * (1.0 + x[3])
-        now = Ranges(ranges.anchor, ranges.places, tags, ranges.values * (1.0 + x[4]) - own @ x[5:], ranges.sigma)
+        now = replace(ranges, tags=tags, values=ranges.values * (1.0 + x[4]) - own @ x[5:])
         error, offset, lever = (v[0] for v in range_errors((pose + x[:3])[None], now))
         unit = offset / np.maximum(np.hypot(*offset.T), 0.05)[:, None]
         turned = unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1]

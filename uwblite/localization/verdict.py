@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import Floats
 from . import hypotheses
 from .hypotheses import Hypotheses
-from .range_likelihood import INDEPENDENT_RANGES, range_errors
+from .range_likelihood import range_errors, series
 from .scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
 from .walls import Rays, Walls
 from .window import Ranges
@@ -99,7 +99,7 @@ def map_odds(fit: float, ends: float, rays: float, likelihood: float, fitting: "
     fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
     likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven over which searches agree.
     """
-    ranges = likelihood - INDEPENDENT_RANGES * fitting.count * ELSEWHERE[1]
+    ranges = likelihood - fitting.independent * ELSEWHERE[1]
     sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
     scans = rays * (fit - (ELSEWHERE[0] if ranged else _ELSEWHERE_ALONE)) if sees else 0.0
     return MapOdds(scans, ranges, agreed, not (sees and ranged))
@@ -151,6 +151,8 @@ class RangeFit:
     """Share of the ranges that agree, 0..1."""
     anchors: int
     """Anchors whose ranges agree."""
+    independent: float
+    """Independent ranges whose information they all have."""
 
     @property
     def enough(self) -> bool:
@@ -160,10 +162,10 @@ class RangeFit:
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
     if not len(ranges):
-        return RangeFit(0, 0.0, 0)
+        return RangeFit(0, 0.0, 0, 0.0)
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
     anchors = len(np.unique(ranges.anchor[agree]))
-    return RangeFit(len(ranges), float(agree.mean()), anchors)
+    return RangeFit(len(ranges), float(agree.mean()), anchors, float(series(ranges).share.sum()))
 
 
 def too_little(rays: Rays, ranges: Ranges) -> str:

@@ -69,6 +69,12 @@ class Ranges(Table):
     """(m,) horizontal distances, m."""
     sigma: Floats
     """(m,) m; including the drift since then."""
+    way: Floats
+    """(m,) odometer at each, m; ascending."""
+    white: Floats
+    """(m,) m; the part of it that is new in every range."""
+    length: Floats
+    """(m,) correlation length of the rest, m."""
 
     def __len__(self) -> int:
         return len(self.values)
@@ -136,14 +142,15 @@ class Window:
         ago = np.array([way - r.way for r in rows])
         measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
         level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
-        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + _SLOW**2 + (_DRIFT * ago) ** 2)
+        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + _SLOW**2 + (DRIFT * ago) ** 2)
         anchor = np.array([r.fact.anchor for r in rows], dtype=np.intp)
-        return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma)
+        noise = np.array([(r.fact.white, r.fact.length) for r in rows]).reshape(-1, 2).T
+        return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma, way - ago, *noise)
 
 
 _SLOW = 0.1
 """m; common error of ranges to one anchor."""
-_DRIFT = 0.03
+DRIFT = 0.03
 """m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 
 

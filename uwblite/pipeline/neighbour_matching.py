@@ -18,7 +18,7 @@ from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..odometry.wheels import reestimate_wheel_noise
 from ..problem.solution import rough
-from . import clock_offset, scan_clouds, turn_checks
+from . import calibration_checks, scan_clouds
 from .estimate import Estimate, Task
 from .keyframe_changes import with_keyframes
 from .lidar_stages import pairs, refine
@@ -49,13 +49,14 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    track = _followed(estimate, steps, task)
-    if estimate.odometry.slips is None:
+    track, shown = _followed(estimate, steps, task), estimate.odometry.slips
+    if shown is None:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
-        estimate = replace(estimate, odometry=track.slipped)
-        estimate = _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
-    return _with_slips(estimate, track, task.following(estimate))
+        estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
+    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
+        return estimate
+    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=shown)), track, task.following(estimate))
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
@@ -67,7 +68,7 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
     corrected = np.inf
     for _ in range(_RETIMINGS):
         shown = _solved_with(steps, estimate, task)
-        late = clock_offset.late(shown, task)
+        late = calibration_checks.late(shown, task)
         settled = late == 0.0
         if settled and estimate.lidar.delay == 0.0:
             return estimate, steps
@@ -102,11 +103,13 @@ def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
     Without ranges nothing judges them afterwards, and the steps as measured stay.
+
+    Parameters
+    ----------
+    estimate : its odometry has the noise of sound wheels, and the slips that ranges show.
     """
-    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
-        return estimate
     track = _followed(estimate, _steps(estimate, task), task)
-    cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
+    cut = _with_keyframes_where(estimate, track.slips > _LIKELY, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task), task)
@@ -225,7 +228,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
     )  # fmt: skip
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
-    return turn_checks.with_constant_turn_scales(estimate, task)
+    return calibration_checks.with_constant_turn_scales(estimate, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:

@@ -6,12 +6,13 @@ from itertools import combinations
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
-from ..constraints import Clock
+from ..arrays import Bools, Floats, Ints, require_type
+from ..constraints import Clock, Constraints
 from ..errors import DataError
 from ..odometry import keyframes
 from ..odometry.keyframes import KeyframeConfig, Keyframes
 from ..sensor_log import SensorLog
+from .mapping_config import MappingConfig
 
 _APART = 1000.0
 """Travelled distance assumed between the end of a recording and the start of the next, m: they are different visits."""
@@ -105,15 +106,21 @@ class Recordings:
 
 
 def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
-    """Choose the keyframes of all recordings and number them through.
-
-    Raises
-    ------
-    DataError : there is no recording.
-    """
-    if not logs:
-        raise DataError("no recording to map; give one or more")
+    """Choose the keyframes of one or more recordings and number them through."""
     return _joined(logs, [keyframes.of(log, config) for log in logs])
+
+
+def require_types(logs: object, config: object, constraints: object) -> None:
+    """Raise DataError where what is to be mapped, or how, is of another type, or there is no recording."""
+    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else None
+    for k, log in enumerate([logs] if several is None else several):
+        require_type(log, "logs" if several is None else f"logs[{k}]", SensorLog)
+    if several is not None and not several:
+        raise DataError("there is no recording to map: logs is empty")
+    if config is not None:
+        require_type(config, "config", MappingConfig)
+    if constraints is not None:
+        require_type(constraints, "constraints", Constraints)
 
 
 def check_distinct(logs: Sequence[SensorLog]) -> None:
@@ -162,9 +169,11 @@ def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
         own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
-        added = [np.zeros(0)] if log.scans is None else [
-            _spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()
-        ]
+        added = (
+            [np.zeros(0)]
+            if log.scans is None
+            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+        )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
         alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))
