@@ -127,7 +127,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate]) -> Iterator[Finding]:
         if anchor.status != "ok":
             add = doubt if anchor.status == "mirror-ambiguous" and unclear else warning
             text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
-            yield add(f"anchor-{anchor.status}", text, anchor=anchor.id)
+            yield replace(add(f"anchor-{anchor.status}", text, anchor=anchor.id), anchor=anchor.id)
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone; drive curves near the anchors"
         yield doubt("no-anchor", text)
