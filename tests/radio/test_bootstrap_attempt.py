@@ -9,7 +9,7 @@ from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, Measured
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 
 
@@ -97,10 +97,9 @@ def along_a_line(poses=12, sigma=0.1):
     pose, anchor = np.repeat(np.arange(poses), 2), np.tile([0, 1], poses)
     distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
     graph = Graph(truth, anchors)
-    attempt = Attempt(
-        graph, chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma), np.arange(float(poses)),
-        BootstrapConfig(range_sigma=sigma), TrilaterationConfig(),
-    )  # fmt: skip
+    wheels, radio = chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma)
+    measured = Measured(wheels, radio, np.arange(float(poses)))
+    attempt = Attempt(graph, measured, BootstrapConfig(range_sigma=sigma), TrilaterationConfig())
     attempt.placed[:] = True
     return attempt, truth
 
@@ -158,10 +157,8 @@ def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
 
     truth = np.column_stack([np.arange(41.0), np.zeros((41, 2))])
     ranges_to = plain_ranges(np.arange(41), np.arange(41) % 2, np.ones(41), 0.1)
-    attempt = Seeded(
-        Graph(truth, np.zeros((2, 2))), chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0),
-        BootstrapConfig(range_sigma=0.1), TrilaterationConfig(),
-    )  # fmt: skip
+    measured = Measured(chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0))
+    attempt = Seeded(Graph(truth, np.zeros((2, 2))), measured, BootstrapConfig(range_sigma=0.1), TrilaterationConfig())
     length = attempt._seed()
     # 25 m at both ends and between, then 10 and 4 m, then all: none is worth 0.35 for each of two anchors.
     assert [(low, high) for low, high, _ in tried[:2]] == [(0, 26), (15, 41)]

@@ -73,13 +73,29 @@ class BootstrapResult:
     """(e,) probability that the wheels slipped over each step; empty = not sought."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What a bootstrap rests on."""
+
+    odometry: OdometryEdges
+    """Between consecutive poses."""
+    ranges: RangeEdges
+    """All; those that cannot be distances have weight 0."""
+    path: Floats
+    """(k,) travelled distance at each pose, m."""
+
+
 class Attempt:
     """The poses in [low, high) are known, the anchors in `placed` have a position."""
 
     def __init__(
-        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
-        search: TrilaterationConfig, without: Sequence[tuple[int, int]] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        graph: Graph,
+        measured: Measured,
+        config: BootstrapConfig,
+        search: TrilaterationConfig,
+        without: Sequence[tuple[int, int]] | None = None,
+    ) -> None:
         """Take what is known.
 
         Parameters
@@ -87,12 +103,12 @@ class Attempt:
         without : stretches, of poses first <= k < last, none of which the first one overlaps; wheels may slip then. None = they
             do not.
         """
-        self.seeks, self.without = without is not None, without or ()
-        self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
-        self.config, self.search = config, search
-        self.live = ranges.alive
-        self.wheels, self.slips = odometry, np.zeros(len(odometry))
-        self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
+        self.seeks, self.without, self.first = without is not None, without or (), (0, 0)
+        self.odometry, self.ranges, self.path = measured.odometry, measured.ranges, measured.path
+        self.graph, self.config, self.search = graph, config, search
+        self.live = self.ranges.alive
+        self.wheels, self.slips = self.odometry, np.zeros(len(self.odometry))
+        self.poses = se2.chain(graph.poses[0], self.odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
         self.sigma = np.full(len(graph.anchors), config.range_sigma)
