@@ -35,7 +35,9 @@ def option(name: str, help_text: str, kind: Callable[[str], Any] = str, default:
     word, _, metavar = name.partition(" ")
     if metavar:
         more |= {"metavar": metavar, "type": kind, "default": default}
-    elif word.startswith("-") and not more:
+    elif more or default is not None:
+        more |= {"default": default}
+    elif word.startswith("-"):
         more = {"action": "store_true"}
     return lambda parser: parser.add_argument(word, help=help_text, **more)
 

@@ -18,7 +18,7 @@ from ..graph.solver import Optimizer, SolverSummary
 from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
-from ..odometry.slips import SoundWheels, slipped, with_slips
+from ..odometry.slips import slipped, with_slips
 from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
@@ -127,8 +127,10 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
     assumed_noise = wheels = estimate.odometry
-    slips, factors = estimate.bootstrap.slips, np.ones(3)
-    slips = slips if len(slips) else np.zeros(len(wheels))
+    slips, factors = np.zeros(len(wheels)), np.ones(3)
+    # Recordings that were joined have their slips in their odometry.
+    if len(estimate.bootstrap.slips) and not estimate.alone:
+        slips = estimate.bootstrap.slips
     optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
@@ -144,7 +146,8 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
-        estimate = replace(estimate, sound=SoundWheels(wheels, slips))
+        # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
+        estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
