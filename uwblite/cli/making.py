@@ -56,8 +56,8 @@ def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> Rec
     began = time.perf_counter()
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
-    told = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
-    logs = [replace(log, notes=notes) for log, notes in zip(logs, told, strict=True)]
+    worded = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
+    logs = [replace(log, notes=notes) for log, notes in zip(logs, worded, strict=True)]
     return Recordings(logs, time.perf_counter() - began)
 
 
@@ -116,10 +116,10 @@ def _check_cost(
 ) -> None:
     """Refuse a map that will not fit in memory; note what may not, and what will take long."""
     whole = together([expected_cost(log, config) for log in logs])
-    found = shortage(whole["megabytes"], maps)
-    if found is not None and found.hopeless and not ignore:
-        raise ConfigError(f"{found.text}; --ignore-memory tries all the same")
-    for text in (found and found.text, long_wait(whole["seconds"])):
+    lack = shortage(whole["megabytes"], maps)
+    if lack is not None and lack.hopeless and not ignore:
+        raise ConfigError(f"{lack.text}; --ignore-memory tries all the same")
+    for text in (lack and lack.text, long_wait(whole["seconds"])):
         if text and note is not None:
             note(f"uwblite: {text}")
 
