@@ -28,23 +28,11 @@ def age(stamps):
     return (stamps - stamps[0]) / np.ptp(stamps)
 
 
-def test_a_sound_recording_drifts_in_nothing(sound):
-    assert not build_map(sound).doubts
-
-
 def test_ranges_that_grow(sound):
     ranges = sound.ranges
     (found,) = drifts(replace(sound, ranges=replace(ranges, ranges=ranges.ranges + 0.6 * age(ranges.stamps))))
     assert "all ranges seem to grow by 0." in found.text
     assert found.figures["value"] == pytest.approx(0.6, abs=0.15)
-
-
-def test_ranges_that_are_late(sound):
-    """To first order: ways are bent where the robot turns within the delay, so less than all of it is found."""
-    ranges = sound.ranges
-    (found,) = drifts(replace(sound, ranges=replace(ranges, stamps=ranges.stamps + 0.8)))
-    assert "s or more" in found.text
-    assert -0.9 < found.figures["value"] < -0.5
 
 
 def test_wheels_that_lose_air(sound):

@@ -13,6 +13,8 @@ import pytest
 from helpers.results import EVIL, small_result
 
 from uwblite.graph.graph import UnknownKey
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
 from uwblite.report import svg_map
 from uwblite.report.html import Heading, render
@@ -159,18 +161,25 @@ def test_works_without_lidar_and_without_radio():
     assert "<image" not in text
 
 
+def side_of(place, walls=()):
+    """Return where the name 5C0B stands beside a place of a map of 20 x 20 m with walls at points."""
+    geometry = GridGeometry(0.1, FRAME[0], 200, 200)
+    log_odds = np.full((200, 200), -4.0, dtype=np.float32)
+    log_odds[geometry.cell_of(np.array(walls, dtype=float).reshape(-1, 2))] = 4.0
+    return svg_map.free_sides([("5C0B", np.array(place))], OccupancyGrid(geometry, log_odds, 1), FRAME, (14.0 / 360.0,))[0]
+
+
 @pytest.mark.parametrize(("walls", "free"), [("", "right"), ("r", "left"), ("rl", "below"), ("rlb", "above"), ("lba", "right")])
 def test_the_name_of_an_anchor_stands_where_no_wall_is(walls, free):
-    """A map of 20 m, on a phone 18 pixels a metre; y is downwards."""
-    middles = {"r": (1.5, 0.0), "l": (-1.5, 0.0), "b": (0.0, 0.8), "a": (0.0, -1.0)}
-    points = np.array([middles[side] for side in walls]).reshape(-1, 2)
-    assert svg_map._free_side(np.zeros(2), 4, points, FRAME) == free
+    """As on a phone, 18 pixels a metre."""
+    middles = {"r": (1.5, 0.0), "l": (-1.5, 0.0), "b": (0.0, -0.8), "a": (0.0, 1.0)}
+    assert side_of((0.0, 0.0), [middles[side] for side in walls]) == free
 
 
 def test_a_name_leaves_the_map_on_no_side():
-    nothing = np.zeros((0, 2))
-    assert svg_map._free_side(np.array([9.8, 0.0]), 4, nothing, FRAME) == "left"
-    assert svg_map._free_side(np.array([np.nan, np.nan]), 4, nothing, FRAME) == "right"
+    assert side_of((9.8, 0.0)) == "left"
+    assert side_of((np.nan, np.nan)) == "right"
+    assert svg_map.free_sides([("5C0B", np.zeros(2))], None, FRAME, (0.03, 0.01)) == ["right"]
 
 
 def test_an_unplaced_anchor_is_listed_and_not_drawn():

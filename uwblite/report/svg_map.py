@@ -1,11 +1,13 @@
 """The zoomable map of the HTML report: an SVG with path, anchors and closures over the picture of the grid."""
 
 import base64
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
 from .picture import round_length
 from .printable import sigma_text
@@ -14,12 +16,12 @@ MOST_POINTS = 4000
 """Points of one line drawn at most."""
 _NAME = 0.12
 """Room to the right of an anchor for its name, as a share of the map's size on a phone."""
-_SHOWN = (360.0, 900.0)
-"""Pixels that the map's longer side has on a phone and on a desk."""
-_LETTER, _LINE = 9.0, 14.0
-"""Width of a letter and height of a name, pixels."""
-_SIDES = {"right": (10.0, 4.0), "left": (-10.0, 4.0), "below": (0.0, 22.0), "above": (0.0, -12.0)}
-"""Where a name stands beside its anchor, the first that is free of walls, and the foot of its line, pixels, y downwards."""
+_HEIGHTS = 14.0 / 360.0, 14.0 / 900.0
+"""Height of a name on a phone and on a desk, as a share of the map's longer side."""
+_LETTER = 0.7
+"""Width of a letter, in heights of a line, as the next ones."""
+_SIDES = {"right": (0.75, 0.3), "left": (-0.75, 0.3), "below": (0.0, 1.6), "above": (0.0, -0.85)}
+"""Where a name stands beside its anchor, in this order, and the foot of its line, y downwards."""
 MOST_CLOSURES = 1500
 """Rejected closures drawn and listed at most; accepted ones all are."""
 
@@ -62,9 +64,9 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     """Return the map with its switches and buttons as HTML."""
     x, y, width, height = _extent(result)
     size = max(width, height)
-    walls = np.zeros((0, 2)) if result.grid is None else result.grid.occupied_points() * (1.0, -1.0)
-    frame = np.array([[x, y], [x + width, y + height]])
-    marks = [_anchor_mark(a, size, _free_side(a.position * (1.0, -1.0), len(a.id), walls, frame)) for a in result.anchors]
+    frame = np.array([[x, -y - height], [x + width, -y]])
+    sides = free_sides([(a.id, a.position) for a in result.anchors], result.grid, frame, _HEIGHTS)
+    marks = [_anchor_mark(a, size, side) for a, side in zip(result.anchors, sides, strict=True)]
     parts = []
     if grid_png is not None and result.grid is not None:
         geometry = result.grid.geometry
@@ -116,28 +118,33 @@ def _switch(name: str, text: str, on: bool) -> str:
     return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
 
 
-def _free_side(place: Floats, letters: int, walls: Floats, frame: Floats) -> str:
-    """Return on which side of an anchor its name covers the fewest walls, within the map where that is possible.
+def free_sides(
+    names: Sequence[tuple[str, Floats]], grid: OccupancyGrid | None, frame: Floats, heights: Sequence[float]
+) -> list[str]:
+    """Return on which side of its mark each name covers the fewest walls, within the map where that is possible.
 
     Parameters
     ----------
-    place : the anchor (2,), m, y downwards, as all that follows.
-    letters : of the name.
-    walls : occupied cells (n, 2), m.
+    names : each with the place (2,) that it belongs to, m.
     frame : lower and upper corner of the map (2, 2), m.
+    heights : of a line of text, as shares of the map's longer side; more than one where it is shown in several sizes.
+
+    Returns
+    -------
+    "right", "left", "below" or "above", the first of those that are equally good.
     """
-    size, wide = float(np.ptp(frame, axis=0).max()), _LETTER * letters
-    near = walls[np.abs(walls - place).max(axis=1, initial=0.0) < (wide + 2.0 * _LINE) * size / _SHOWN[0]]
+    walls, size = np.zeros((0, 2)) if grid is None else grid.occupied_points(), float(np.ptp(frame, axis=0).max())
 
-    def cost(side: str) -> tuple[int, int]:
+    def cost(side: str, letters: int, place: Floats) -> tuple[int, int]:
         x, foot = _SIDES[side]
-        left = {"right": x, "left": x - wide}.get(side, -wide / 2.0)
-        box = np.array([[left, foot - _LINE], [left + wide, foot]])
-        boxes = [place + box * size / pixels for pixels in _SHOWN]
+        left = {"right": x, "left": x - _LETTER * letters}.get(side, -0.5 * _LETTER * letters)
+        box = np.array([[left, -foot], [left + _LETTER * letters, 1.0 - foot]])
+        boxes = [place + box * size * height for height in heights]
         outside = sum(bool((b[0] < frame[0]).any() or (b[1] > frame[1]).any()) for b in boxes)
-        return outside, sum(int(((near >= b[0]) & (near <= b[1])).all(axis=1).sum()) for b in boxes)
+        return outside, sum(int(((walls >= b[0]) & (walls <= b[1])).all(axis=1).sum()) for b in boxes)
 
-    return min(_SIDES, key=cost)
+    costs = [{side: cost(side, len(name), place) for side in _SIDES} for name, place in names]
+    return [min(each, key=each.__getitem__) for each in costs]
 
 
 def _anchor_mark(anchor: AnchorEstimate, size: float, side: str) -> str:
