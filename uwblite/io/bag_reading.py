@@ -387,7 +387,10 @@ def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
             raise FormatError(_damaged(error, path.name), str(path)) from None
         unclosed = UnclosedBag(named)
         if not unclosed.message_count:
-            why = f"it was not closed, or is damaged ({_words(error, 120)}), and no message of it is complete"
+            # What Python says of a record that breaks off means nothing.
+            of_python = type(error).__module__ == "builtins"
+            detail = "a record breaks off, or states a length that cannot be" if of_python else _words(error, 120)
+            why = f"it was not closed, or is damaged ({detail}), and no message of it is complete"
             raise FormatError(f"cannot be read as a ROS bag: {why}; {repair} may save more", str(path)) from None
     notes.append(f"{path.name}: the recording was not closed (recorder killed, or power lost; {repair} mends it)")
     return unclosed

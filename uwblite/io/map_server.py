@@ -203,7 +203,7 @@ def _parse_yaml(text: str, path: str) -> Settings:
             continue
         match = re.match(r"([A-Za-z_]+)\s*:(?:\s+(.*))?$", line)
         if not match:
-            raise FormatError("is not 'key: value'", path, number)
+            raise FormatError("is not 'key: value', as the lines of a map's YAML file are", path, number)
         key, value = match[1], (match[2] or "").strip()
         if value.startswith("["):
             settings[key] = [item.strip() for item in value.strip("[]").split(",")]
