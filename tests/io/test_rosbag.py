@@ -298,6 +298,6 @@ def replace_ranges(message):
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a file system in which nothing can be made")
 def test_an_error_names_the_bag_that_was_asked_for():
-    with pytest.raises(OSError, match="uwblite.mcap") as refused:
+    with pytest.raises(OSError, match="uwblite") as refused:
         write_bag("/proc/uwblite.mcap", recording())
     assert refused.value.filename == "/proc/uwblite.mcap"
