@@ -12,14 +12,12 @@ from functools import partial
 from typing import NamedTuple
 
 from ..config import differences, override, to_toml
-from ..constraints import Constraints
 from ..errors import ConfigError
-from ..io.constraints_file import parse_constraints, read_anchors
+from ..io.constraints_file import read_constraints
 from ..io.files import sha256_of
 from ..io.formats import read_recording
 from ..io.result_text import RunRecord, base_name
 from ..io.results import write_result
-from ..io.source import read_settings
 from ..map_result import MapResult
 from ..mapping import MappingConfig, Progress, Stage, build_map
 from ..pipeline.mapping_config import preset
@@ -81,7 +79,7 @@ def make(
     ------
     ConfigError : the map needs more than twice the memory there is, and args.ignore_memory is not set.
     """
-    config, constraints, freed = settings(args), known(args), FreedMemory()
+    config, constraints, freed = settings(args), read_constraints(args.constraints, args.anchors_from), FreedMemory()
     logs, reading = recordings
 
     def report(stage: Stage, done: int, total: int) -> object:
@@ -147,13 +145,6 @@ def settings(args: argparse.Namespace) -> MappingConfig:
 def changed_settings(args: argparse.Namespace, config: MappingConfig) -> tuple[str, ...]:
     """Return the settings that differ from those of the command line's preset, as --set takes them."""
     return tuple(differences(config, preset(args.preset) if args.preset else MappingConfig()))
-
-
-def known(args: argparse.Namespace) -> Constraints:
-    earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
-    if not args.constraints:
-        return earlier
-    return earlier + parse_constraints(read_settings(args.constraints), args.constraints)
 
 
 def repeat_command(args: argparse.Namespace, config: MappingConfig) -> str:

@@ -13,6 +13,7 @@ from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
 from ..sensor_log.sensors import last_places
 from .csv_table import read_csv
+from .source import read_settings
 
 _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
     "anchor": (GivenAnchor, "anchors", ("id", "position")),
@@ -24,6 +25,12 @@ _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
     "forbidden_closure": (known.ForbiddenClosure, "forbidden", ("stamps",)),
 }
 """Class, field of Constraints and needed fields of each table."""
+
+
+def read_constraints(path: str | None, anchors_from: str | None) -> Constraints:
+    """Return what is known beforehand: the constraints of a file and the anchors of an earlier map, where they are named."""
+    earlier = read_anchors(anchors_from) if anchors_from else Constraints()
+    return earlier + parse_constraints(read_settings(path), path) if path else earlier
 
 
 def parse_constraints(text: str, path: str = "") -> Constraints:
