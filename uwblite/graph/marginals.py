@@ -247,11 +247,6 @@ _COLUMNS_AT_ONCE = 16
 
 
 def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats]:
-    """Return values and standard deviations of further unknowns; see added_unknown_and_moves."""
-    return added_unknown_and_moves(graph, edges, shifts)[:2]
-
-
-def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats, Floats]:
     """Estimate, each alone, further unknowns of some edges of an optimised graph, to first order.
 
     With J, r and W of the whole graph and s the change of the residuals by one unit of the unknown: its value is -b / a and its
@@ -264,8 +259,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
 
     Returns
     -------
-    (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly. And
-    (k, p, 2) the changes of the poses' places with each value, m.
+    (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly.
     """
     normal = filled(graph, subtrees=True)
     lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
@@ -281,9 +275,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
     score = np.einsum("ked,ed->k", weighted, lin.residuals) - solved.T @ normal.gradient
     seen = left > _ROUNDING * total
     divisor = np.where(seen, left, 1.0)
-    values = np.where(seen, -score / divisor, 0.0)
-    places = np.append(solved, np.zeros((1, len(shifts))), axis=0)[normal.unknowns.number["poses"][:, :2]]
-    return values, np.where(seen, 1.0 / np.sqrt(divisor), np.inf), -values[:, None, None] * np.moveaxis(places, 2, 0)
+    return np.where(seen, -score / divisor, 0.0), np.where(seen, 1.0 / np.sqrt(divisor), np.inf)
 
 
 _ROUNDING = 1e-9
