@@ -159,8 +159,8 @@ def _did_you_mean(where: tuple[str, ...], cls: type, root: type) -> str:
     if not near:
         by_end = {name.rpartition(".")[2]: name for name in reversed(known)}
         near = [by_end[end] for end in get_close_matches(where[-1], by_end, n=1, cutoff=0.7)]
-    there = ", ".join(".".join((*where[:-1], f.name)) for f in dataclasses.fields(cls))
-    return f"; did you mean {near[0]!r}?" if near else f"; there are {there}"
+    siblings = ", ".join(".".join((*where[:-1], f.name)) for f in dataclasses.fields(cls))
+    return f"; did you mean {near[0]!r}?" if near else f"; there are {siblings}"
 
 
 def _convert(value: Any, hint: Any, where: tuple[str, ...]) -> Any:
@@ -255,8 +255,8 @@ def _shown(value: Any) -> str:
 
 def differences(config: Any, base: Any) -> list[str]:
     """Return the settings that differ from those of a base, as `override` takes them."""
-    theirs = dict(flat(to_dict(base)))
-    return [f"{name}={toml_value(v)}" for name, v in flat(to_dict(config)) if v != theirs.get(name)]
+    defaults = dict(flat(to_dict(base)))
+    return [f"{name}={toml_value(v)}" for name, v in flat(to_dict(config)) if v != defaults.get(name)]
 
 
 def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: bool = True) -> str:

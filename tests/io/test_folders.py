@@ -127,3 +127,10 @@ def test_a_broken_replacement_is_finished_and_nothing_else_is_taken_for_one(tmp_
     assert texts(folder) == {"our_b": "2", "our_c": "2", "theirs": "theirs"}
     assert not mend(folder, owned)
     assert not mend(tmp_path / "nowhere", owned)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a file system in which nothing can be made")
+def test_an_error_names_the_folder_that_was_asked_for():
+    with pytest.raises(OSError, match="uwblite_map") as refused, replacing_folder("/proc/uwblite_map", owned):
+        pass
+    assert refused.value.filename == "/proc/uwblite_map"

@@ -1,6 +1,7 @@
 """Bags: round trips through both storages, a real one against its published log, messages of all kinds, broken files."""
 
 import dataclasses
+import os
 import sqlite3
 from dataclasses import replace
 from types import SimpleNamespace
@@ -293,3 +294,10 @@ def test_scans_of_another_number_of_beams_are_resampled():
 def replace_ranges(message):
     """The message without readings."""
     return SimpleNamespace(**{**vars(message), "ranges": np.zeros(0, dtype=np.float32)})
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a file system in which nothing can be made")
+def test_an_error_names_the_bag_that_was_asked_for():
+    with pytest.raises(OSError, match="uwblite") as refused:
+        write_bag("/proc/uwblite.mcap", recording())
+    assert refused.value.filename == "/proc/uwblite.mcap"

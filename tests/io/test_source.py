@@ -49,3 +49,9 @@ def test_small_files_are_small(tmp_path):
         (tmp_path / "a").write_bytes(bytes(most + 1))
         with pytest.raises(FormatError, match=f"is larger than {size},"):
             read_bounded(str(tmp_path / "a"), most)
+
+
+def test_line_ends_of_old_macintosh_programs_are_named(tmp_path):
+    (tmp_path / "old.log").write_bytes(b"ODOM 0 0 0 0 0 0 1 h 1\r" * 3)
+    with pytest.raises(FormatError, match="its lines end in CR alone"), open_source(tmp_path / "old.log") as source:
+        list(source.blocks())

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import ConfigError
+from ..io.constraints_file import read_constraints
 from ..io.files import sha256_of, write_text
 from ..io.folders import refuse_foreign, sole_writer, unmarked
 from ..io.results import check_target
 from ..report.batch import BatchRow, row_of, table_csv, table_html
 from . import console, failure
 from .inputs import bag_choices, name_recordings_once
-from .making import config_text, given_files, known, make, read_logs, repeat_command, settings
+from .making import config_text, given_files, make, read_logs, repeat_command, settings
 from .workers import cluster, processes, versions
 
 
@@ -53,7 +54,7 @@ def tasks_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     ------
     UsageError, ConfigError : settings or files that no map could be made with, or two folders of the same name.
     """
-    settings(args), known(args), bag_choices(args)
+    settings(args), read_constraints(args.constraints, args.anchors_from), bag_choices(args)
     absolute = {name: os.path.abspath(value) for name in _FILES if (value := getattr(args, name))}
     return [
         argparse.Namespace(**{**vars(args), **absolute, "logs": [os.path.abspath(log)], "out": os.path.abspath(folder)})

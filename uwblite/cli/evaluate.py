@@ -73,7 +73,7 @@ def _comparisons(args: argparse.Namespace, folder: Path) -> Iterator[tuple[str, 
     yield "trajectory", *_shown_trajectory(trajectory, len(together[2]), "together" if several else "trajectory")
     if several:
         alone = [(evaluate_trajectory(*r, max_gap=args.max_gap, rpe_delta=args.delta), len(r[2])) for r in recordings]
-        shown = [_shown_trajectory(*own, f"recording {k} alone") for k, own in enumerate(alone, 1)]
+        shown = [_shown_trajectory(*errors, f"recording {k} alone") for k, errors in enumerate(alone, 1)]
         yield "recordings", [figures for figures, _ in shown], [line for _, lines in shown for line in lines]
     if args.anchors:
         yield "anchors", *_shown_anchors(_anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map))
@@ -91,8 +91,8 @@ def _surfaces(
     truth, pairs = read_landmarks(args.landmarks) if args.landmarks else (None, None)
     if truth is not None:
         if grid is not None and occupied is not None:
-            found = find_columns(occupied, truth, search_radius=args.search_radius, cell=grid.geometry.resolution)
-            yield "landmarks", *_shown_landmarks(landmark_errors(found, truth, pairs), "columns in the map")
+            columns = find_columns(occupied, truth, search_radius=args.search_radius, cell=grid.geometry.resolution)
+            yield "landmarks", *_shown_landmarks(landmark_errors(columns, truth, pairs), "columns in the map")
         if trajectory.heading is not None:
             estimate = se2.interpolate_trajectory(stamps, poses, true_stamps[trajectory.matched])
             drawn = landmark_errors_along(truth, true_poses[trajectory.matched], estimate, pairs)
@@ -112,16 +112,16 @@ def _relations(folder: Path, path: str, number: int) -> Shown:
     if number > len(result.trajectories):
         raise ConfigError(f"{folder} is a map of {len(result.trajectories)} recordings, not of {number}")
     trajectory = _in_order(*result.trajectories[number - 1])
-    found = evaluate_relations(*trajectory, Relations(*read_relations(path)), result.laser_delay)
-    return _shown_relations(found, result.laser_delay)
+    errors = evaluate_relations(*trajectory, Relations(*read_relations(path)), result.laser_delay)
+    return _shown_relations(errors, result.laser_delay)
 
 
 def _recording(folder: Path, truth: str, number: int) -> Timed:
     """Return stamps and poses of a recording in a result, and the true ones."""
-    own = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
-    if number > 1 and folder.is_dir() and not own.exists():
-        raise ConfigError(f"{folder} has no {own.name}: it is a map of fewer recordings")
-    return (*_in_order(*read_tum(own)), *_in_order(*read_tum(truth)))
+    estimate = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
+    if number > 1 and folder.is_dir() and not estimate.exists():
+        raise ConfigError(f"{folder} has no {estimate.name}: it is a map of fewer recordings")
+    return (*_in_order(*read_tum(estimate)), *_in_order(*read_tum(truth)))
 
 
 def _one_after_another(recordings: Sequence[Timed]) -> Timed:
@@ -182,16 +182,16 @@ def _row(name: str, s: ErrorStatistics, unit: str, scale: float = 1.0) -> str:
     return f"{name:<24}" + "".join(f"{scale * v:11.4f}" for v in (s.rmse, s.mean, s.median, s.max)) + f"  {unit}"
 
 
-def _shown_relations(found: RelationErrors, laser_delay: float) -> Shown:
-    count, missing = len(found.answered), int((~found.answered).sum())
-    t, r = found.translations, found.rotations
-    summary: dict[str, Any] = {"count": count, "not_answered": missing, "share_far": found.far, "laser_delay": laser_delay}
+def _shown_relations(errors: RelationErrors, laser_delay: float) -> Shown:
+    count, missing = len(errors.answered), int((~errors.answered).sum())
+    t, r = errors.translations, errors.rotations
+    summary: dict[str, Any] = {"count": count, "not_answered": missing, "share_far": errors.far, "laser_delay": laser_delay}
     summary |= {"translation": _plain(t), "rotation": _plain(r)}
     return summary, [
         f"{'relations':<24}{'mean':>11}{'sd':>11}{'median':>11}{'max':>11}",
         f"{'  translation':<24}{t.mean:11.4f}{t.std:11.4f}{t.median:11.4f}{t.max:11.4f}  m",
         f"{'  rotation':<24}" + "".join(f"{_DEGREES * v:11.4f}" for v in (r.mean, r.std, r.median, r.max)) + "  deg",
-        f"{count} relations, {missing} not answered; {found.far:.1%} beyond {FAR:g} m or not answered; "
+        f"{count} relations, {missing} not answered; {errors.far:.1%} beyond {FAR:g} m or not answered; "
         f"asked at the lidar's clock {laser_delay:+.3f} s",
     ]
 

@@ -67,7 +67,7 @@ def apply_mounting(log: SensorLog, args: argparse.Namespace) -> SensorLog:
 
 def mounted(mounting: SensorMounting, args: argparse.Namespace) -> SensorMounting:
     """Return a mounting with what the command line says in place of its own."""
-    said = {
+    stated = {
         "T_base_laser": None if args.laser_pose is None else np.array(args.laser_pose),
         "laser_is_base": None if args.laser_pose is None else False,
         "laser_flipped": args.laser_flipped or None,
@@ -75,7 +75,7 @@ def mounted(mounting: SensorMounting, args: argparse.Namespace) -> SensorMountin
         "anchor_height": args.anchor_height,
         "anchor_heights": None if args.anchor_height is None else {},
     }
-    return dataclasses.replace(mounting, **{name: value for name, value in said.items() if value is not None})
+    return dataclasses.replace(mounting, **{name: value for name, value in stated.items() if value is not None})
 
 
 def mounting_words(args: argparse.Namespace) -> list[str]:

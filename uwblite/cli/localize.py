@@ -38,18 +38,18 @@ def run(args: argparse.Namespace) -> int:
     known = from_result(earlier)
     log = recording(args, args.log).without(uwb=not config.use_uwb, lidar=not config.use_lidar)
     with closing(console.Progress()) as progress:
-        found = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
-    summary = _summary(found, list(files.values()))
+        localization = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
+    summary = _summary(localization, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
     anchors, caption = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors], os.path.basename(args.log)
-    picture = draw_map(earlier.grid, found.trajectory, Overlay(anchors), caption=caption) if "picture" in files else None
+    picture = draw_map(earlier.grid, localization.trajectory, Overlay(anchors), caption=caption) if "picture" in files else None
     with _together(files, args.out) as places:
-        _write(places, found, picture, json_lines(about | summary))
+        _write(places, localization, picture, json_lines(about | summary))
     if args.json:
         console.say_json(summary)
     else:
-        _say(found, list(files.values()))
-    return 3 if found.doubts else 0
+        _say(localization, list(files.values()))
+    return 3 if localization.doubts else 0
 
 
 @contextmanager
@@ -64,10 +64,10 @@ def _together(files: dict[str, str], folder: str) -> Iterator[dict[str, str]]:
         yield files | {what: str(waiting / name) for what, name in inside.items()}
 
 
-def _write(places: dict[str, str], found: Localization, picture: Any, report: str) -> None:
-    write_tum(places["trajectory"], found.stamps, found.trajectory)
+def _write(places: dict[str, str], localization: Localization, picture: Any, report: str) -> None:
+    write_tum(places["trajectory"], localization.stamps, localization.trajectory)
     if "covariance" in places:
-        write_text(places["covariance"], covariance_csv(found.stamps, found.covariances))
+        write_text(places["covariance"], covariance_csv(localization.stamps, localization.covariances))
     if "picture" in places:
         write_png(places["picture"], picture)
     if "report" in places:
@@ -90,34 +90,34 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
     if os.path.exists(os.path.join(args.out, "map.yaml")):
         raise ConfigError(f"{args.out} holds a map, which a localisation does not replace; choose another folder")
     names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
-    own = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
-    return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
+    files = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
+    return files | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
 
 
-def _summary(found: Localization, files: list[str]) -> dict[str, Any]:
+def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
     """Return what was found, ready for JSON."""
     return {
         "files": files,
-        "poses": len(found.stamps),
-        "localized": found.localized,
-        "overlap": found.overlap if found.overlap == found.overlap else None,
-        "warnings": notices(found.warnings),
-        "doubts": notices(found.doubts),
-        "exit_code": 3 if found.doubts else 0,
+        "poses": len(localization.stamps),
+        "localized": localization.localized,
+        "overlap": localization.overlap if localization.overlap == localization.overlap else None,
+        "warnings": notices(localization.warnings),
+        "doubts": notices(localization.doubts),
+        "exit_code": 3 if localization.doubts else 0,
     }
 
 
-def _say(found: Localization, files: list[str]) -> None:
-    start = found.trajectory[0]
-    sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in found.covariances)[len(found.covariances) // 2]
-    console.say(f"{len(found.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
-    console.say(f"{100 * found.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m")
-    if found.overlap == found.overlap:
-        console.say(f"{100 * found.overlap:.0f} % of the lidar's points in known space lie on walls of the map")
+def _say(localization: Localization, files: list[str]) -> None:
+    start = localization.trajectory[0]
+    sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in localization.covariances)[len(localization.covariances) // 2]
+    console.say(f"{len(localization.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
+    console.say(f"{100 * localization.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m")
+    if localization.overlap == localization.overlap:
+        console.say(f"{100 * localization.overlap:.0f} % of the lidar's points in known space lie on walls of the map")
     else:
         console.say("no walls to compare: the position rests on the anchors")
-    for text in found.warnings:
+    for text in localization.warnings:
         console.say(f"warning: {text}")
-    for text in found.doubts:
+    for text in localization.doubts:
         console.say(f"DOUBT: {text}")
     console.say("files: " + " ".join(files))

@@ -12,14 +12,12 @@ from functools import partial
 from typing import NamedTuple
 
 from ..config import differences, override, to_toml
-from ..constraints import Constraints
 from ..errors import ConfigError
-from ..io.constraints_file import parse_constraints, read_anchors
+from ..io.constraints_file import read_constraints
 from ..io.files import sha256_of
 from ..io.formats import read_recording
 from ..io.result_text import RunRecord, base_name
 from ..io.results import write_result
-from ..io.source import read_settings
 from ..map_result import MapResult
 from ..mapping import MappingConfig, Progress, Stage, build_map
 from ..pipeline.mapping_config import preset
@@ -56,8 +54,8 @@ def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> Rec
     began = time.perf_counter()
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
-    told = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
-    logs = [replace(log, notes=notes) for log, notes in zip(logs, told, strict=True)]
+    worded = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
+    logs = [replace(log, notes=notes) for log, notes in zip(logs, worded, strict=True)]
     return Recordings(logs, time.perf_counter() - began)
 
 
@@ -81,7 +79,7 @@ def make(
     ------
     ConfigError : the map needs more than twice the memory there is, and args.ignore_memory is not set.
     """
-    config, constraints, freed = settings(args), known(args), FreedMemory()
+    config, constraints, freed = settings(args), read_constraints(args.constraints, args.anchors_from), FreedMemory()
     logs, reading = recordings
 
     def report(stage: Stage, done: int, total: int) -> object:
@@ -116,10 +114,10 @@ def _check_cost(
 ) -> None:
     """Refuse a map that will not fit in memory; note what may not, and what will take long."""
     whole = together([expected_cost(log, config) for log in logs])
-    found = shortage(whole["megabytes"], maps)
-    if found is not None and found.hopeless and not ignore:
-        raise ConfigError(f"{found.text}; --ignore-memory tries all the same")
-    for text in (found and found.text, long_wait(whole["seconds"])):
+    lack = shortage(whole["megabytes"], maps)
+    if lack is not None and lack.hopeless and not ignore:
+        raise ConfigError(f"{lack.text}; --ignore-memory tries all the same")
+    for text in (lack and lack.text, long_wait(whole["seconds"])):
         if text and note is not None:
             note(f"uwblite: {text}")
 
@@ -147,13 +145,6 @@ def settings(args: argparse.Namespace) -> MappingConfig:
 def changed_settings(args: argparse.Namespace, config: MappingConfig) -> tuple[str, ...]:
     """Return the settings that differ from those of the command line's preset, as --set takes them."""
     return tuple(differences(config, preset(args.preset) if args.preset else MappingConfig()))
-
-
-def known(args: argparse.Namespace) -> Constraints:
-    earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
-    if not args.constraints:
-        return earlier
-    return earlier + parse_constraints(read_settings(args.constraints), args.constraints)
 
 
 def repeat_command(args: argparse.Namespace, config: MappingConfig) -> str:

@@ -101,8 +101,8 @@ def _dry_run(args: argparse.Namespace) -> int:
     summary = {"recordings": rows, "expected cost of map": whole, "exit_code": 0}
     lines = [_cost_line(log, cost) for log, cost in zip(args.logs, costs, strict=True)]
     console.report(args.json, summary, [*lines, _cost_line("all together", whole)] if len(lines) > 1 else lines)
-    found = shortage(whole["megabytes"])
-    for text in (found and found.text, long_wait(whole["seconds"])):
+    lack = shortage(whole["megabytes"])
+    for text in (lack and lack.text, long_wait(whole["seconds"])):
         if text:
             console.note(f"uwblite: {text}")
     return 0
@@ -150,8 +150,8 @@ def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
     lines += [anchor_line(a) for a in result.anchors]
     shown = (c for c in result.calibration if c.state == "estimated" and c.key.anchor is None and abs(c.value) > 2.0 * c.sigma)
     lines += [calibration_line(c) for c in shown]
-    told = sorted(folded(result.findings), key=lambda group: any(f.severity == DOUBT for f in (group[0], *group[1])))
-    for cause, explains in told:
+    groups = sorted(folded(result.findings), key=lambda group: any(f.severity == DOUBT for f in (group[0], *group[1])))
+    for cause, explains in groups:
         lines.append(f"{_LABELS[cause.severity]}: {cause}")
         lines += [f"  {cause.cure}"] if cause.severity == DOUBT and cause.cure else []
         lines += [f"  explains {_LABELS[other.severity]}: {other}" for other in explains]

@@ -74,10 +74,10 @@ def _needed(megabytes: float, limit: Limit) -> float:
 
 def limits() -> list[Limit]:
     """Return the limits that this system sets; what cannot be read sets none."""
-    found = [Limit("this computer's memory", total)] if (total := _memory("MemTotal", "SwapTotal")) else []
+    limits = [Limit("this computer's memory", total)] if (total := _memory("MemTotal", "SwapTotal")) else []
     if sys.maxsize < _ADDRESSES:
-        found.append(Limit("what a 32-bit system can address", _ADDRESSES, of_addresses=True))
-    return found + shell_limits() + ([Limit("the limit of this control group", group)] if (group := group_limit()) else [])
+        limits.append(Limit("what a 32-bit system can address", _ADDRESSES, of_addresses=True))
+    return limits + shell_limits() + ([Limit("the limit of this control group", group)] if (group := group_limit()) else [])
 
 
 def shell_limits() -> list[Limit]:
@@ -87,9 +87,9 @@ def shell_limits() -> list[Limit]:
     except ImportError:
         return []
     addresses, data = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA))
-    found = [Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True)]
-    found.append(Limit("the limit of the data (ulimit -d)", data, of_data=True))
-    return [limit for limit in found if limit.bytes != resource.RLIM_INFINITY]
+    limits = [Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True)]
+    limits.append(Limit("the limit of the data (ulimit -d)", data, of_data=True))
+    return [limit for limit in limits if limit.bytes != resource.RLIM_INFINITY]
 
 
 @contextmanager
@@ -127,7 +127,7 @@ def within_limits() -> Iterator[None]:
 
 def allowed() -> str:
     """Return what to say after "out of memory" of the limits that end a process by an error."""
-    shell = [f"; the shell allows {at.bytes / 1e6:.0f} MB ({at.name.rpartition('(')[2]}" for at in shell_limits()]
+    shell = [f"; the shell allows {limit.bytes / 1e6:.0f} MB ({limit.name.rpartition('(')[2]}" for limit in shell_limits()]
     group = group_limit()
     return "".join(shell) + (f"; this control group allows {group / 1e6:.0f} MB" if group else "")
 

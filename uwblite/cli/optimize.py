@@ -63,10 +63,10 @@ def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> tuple
     if not args.from_odometry:
         forgotten = file.from_odometry()
         further = chain(further, starts(forgotten.graph, forgotten.chains, best.start.placed(best.graph).anchors))
-    for found in search.solved(further):
-        as_many = len(found.start.unplaced) <= len(best.start.unplaced)
-        if as_many and found.summary.chi2 < (1.0 - search.config.relative_decrease) * best.summary.chi2:
-            best, known = found, search.certificate(found)
+    for rival in search.solved(further):
+        as_many = len(rival.start.unplaced) <= len(best.start.unplaced)
+        if as_many and rival.summary.chi2 < (1.0 - search.config.relative_decrease) * best.summary.chi2:
+            best, known = rival, search.certificate(rival)
     return best, known
 
 
@@ -156,9 +156,9 @@ _OF_SUMMARY = ("chi2_initial", "chi2", "dof", "chi2_per_dof", "iterations", "con
 
 def _closures(graph: Graph, names: tuple[str, ...]) -> dict[str, Any]:
     """Return how many loop closures there are, how many are far off, and the poses of the worst."""
-    found = misfit(graph)
-    worst = [names[k] for k in found.worst] if found.closures else None
-    return {"count": found.closures, "far_off": found.off, "worst": worst, "contradict": found.most}
+    closures = misfit(graph)
+    worst = [names[k] for k in closures.worst] if closures.closures else None
+    return {"count": closures.closures, "far_off": closures.off, "worst": worst, "contradict": closures.most}
 
 
 _WITHIN = " within the work that is allowed for a graph of its size"

@@ -65,11 +65,11 @@ def _table(figures: dict[str, Any]) -> str:
 def _picture(result: StoredResult, plan: AnchorPlan, from_nothing: bool) -> Any:
     """Return the map today and with the new anchors, side by side, coloured by the expected error."""
     assert result.grid is not None
-    there = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
+    standing = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
     new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]
     about = "Expected error of a position"
     shown = [
-        (plan.errors[0], there, f"{about}, {len(there)} anchors"),
-        (plan.errors[-1], [*there, *new], f"{about}, {len(new)} more"),
+        (plan.errors[0], standing, f"{about}, {len(standing)} anchors"),
+        (plan.errors[-1], [*standing, *new], f"{about}, {len(new)} more"),
     ]
     return side_by_side([draw_errors(result.grid, plan.points, *panel) for panel in shown])

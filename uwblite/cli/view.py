@@ -48,18 +48,18 @@ def run(args: argparse.Namespace) -> int:
 def _recordings(named: Sequence[str], results: Sequence[StoredResult]) -> dict[str, Path]:
     """Return the recordings at hand by the SHA-256 of their bytes: those that are named, and those the results name."""
     wanted = {str(i.get("sha256")) for r in results for i in r.report.get("inputs") or ()}
-    found: dict[str, Path] = {}
+    recordings: dict[str, Path] = {}
     for name in named:
         if not os.path.exists(name):
             raise ConfigError(f"{name}: no such file or folder")
-        found[sha256_of(name)] = Path(name).resolve()
-    if named and wanted and not wanted & found.keys():
+        recordings[sha256_of(name)] = Path(name).resolve()
+    if named and wanted and not wanted & recordings.keys():
         raise ConfigError(f"{named[0]} is not the recording that the map was made of (its bytes differ)")
     for result in results:
         for entry in result.report.get("inputs") or ():
             source, key = str(entry.get("source", "")), str(entry.get("sha256"))
             places = (Path(source), result.folder.parent / source, result.folder.parent / os.path.basename(source))
             file = next((p for p in places if source and p.exists()), None)
-            if key not in found and file is not None and sha256_of(file) == key:
-                found[key] = file.resolve()
-    return found
+            if key not in recordings and file is not None and sha256_of(file) == key:
+                recordings[key] = file.resolve()
+    return recordings

@@ -38,10 +38,10 @@ def with_options(text: str) -> str:
     return re.sub(r"`([\w.]+)(=[^`]*)?`", _option, text) if "`" in text else text
 
 
-def _option(found: "re.Match[str]") -> str:
-    name, value = found[1], found[2] or ""
+def _option(match: "re.Match[str]") -> str:
+    name, value = match[1], match[2] or ""
     option = OPTIONS.get(name + value) or (OPTIONS[name] + value if name in OPTIONS else "")
-    return f"`{option}`" if " " in option else option or found[0]
+    return f"`{option}`" if " " in option else option or match[0]
 
 
 def findings_with_options(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":

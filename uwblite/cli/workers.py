@@ -81,17 +81,17 @@ def cluster(address: str) -> Iterator[Executor]:
 
 def _compare_versions(client: Any) -> None:
     """Refuse workers whose uwblite is another one; other libraries may change the last digits, which is said."""
-    ours = versions()
-    found = client.run(versions, on_error="return")
-    if not found:
+    local = versions()
+    answers = client.run(versions, on_error="return")
+    if not answers:
         console.note("uwblite: the scheduler has no worker yet; waiting for one (`dask worker ADDRESS`)")
-    for worker, theirs in found.items():
-        if isinstance(theirs, BaseException):
-            raise ConfigError(f"worker {worker} cannot import this uwblite ({theirs}); install it there")
-        if theirs["uwblite"] != ours["uwblite"]:
-            raise ConfigError(f"worker {worker} has uwblite {theirs['uwblite']}, this is {ours['uwblite']}; install the same")
-        if theirs != ours:
-            differ = ", ".join(f"{name} {theirs[name]} for {ours[name]}" for name in ours if theirs[name] != ours[name])
+    for worker, remote in answers.items():
+        if isinstance(remote, BaseException):
+            raise ConfigError(f"worker {worker} cannot import this uwblite ({remote}); install it there")
+        if remote["uwblite"] != local["uwblite"]:
+            raise ConfigError(f"worker {worker} has uwblite {remote['uwblite']}, this is {local['uwblite']}; install the same")
+        if remote != local:
+            differ = ", ".join(f"{name} {remote[name]} for {local[name]}" for name in local if remote[name] != local[name])
             console.note(f"uwblite: worker {worker} has {differ}: last digits may differ")
 
 

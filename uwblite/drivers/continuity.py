@@ -165,12 +165,12 @@ class RangeGuard:
 
     def _forgotten(self, stamp: float) -> list[Ranged]:
         """Return what has waited for too long."""
-        found: list[Ranged] = []
+        forgotten: list[Ranged] = []
         for name, series in list(self._anchors.items()):
             if series.waiting and stamp - series.waiting[-1][0].stamp > FORGET:
-                found, series.waiting = found + series.waiting, []
+                forgotten, series.waiting = forgotten + series.waiting, []
                 if series.last is None:
                     del self._anchors[name]
         while len(self._anchors) > MOST_ANCHORS:
-            found += self._anchors.pop(next(iter(self._anchors))).waiting
-        return found
+            forgotten += self._anchors.pop(next(iter(self._anchors))).waiting
+        return forgotten

@@ -110,6 +110,7 @@ class DeviceKind:
     silent: str = "it does not answer: check its power and its cable, unplug it and plug it in again"
     """What to do when it does not answer."""
     options: Mapping[str, Option] = field(default_factory=dict)
+    """By name."""
 
     def driver(self, given: Mapping[str, str], setup: Setup) -> Driver:
         """Return the driver with the options that were given.

@@ -102,11 +102,11 @@ def _parse(line: RawLine) -> list[Event]:
     text = line.data.decode("latin-1").rstrip()
     broken: Corrupt | None = None
     for find in (_find_lec, _find_les, _find_position, _find_text):
-        at, event = find(text, line.stamp_at)
+        start, event = find(text, line.stamp_at)
         if isinstance(event, Corrupt):
             broken = broken or event
         elif event is not None:
-            before = line.data[:at]
+            before = line.data[:start]
             return [*([corrupt(before, "noise before a line")] if before.strip() else []), event]
     return [broken or corrupt(line.data, "not a line of the shell")]
 
@@ -123,14 +123,14 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
     head = re.match(r"DIST,(?:([1-4]),|(0),?$)", text[start:])
     if not head:
         return start, bad
-    at, readings = start + head.end(), []
+    place, readings = start + head.end(), []
     for index in range(int(head[1] or 0)):
-        row = _LEC_ROW.match(text, at)
+        row = _LEC_ROW.match(text, place)
         if not row or int(row[1]) != index:
             return start, bad
         readings.append(RangeReading(row[2], float(row[3]), 100))
-        at = row.end()
-    if head[1] and (at < len(text) or text.endswith(",")) and not _LEC_END.match(text, at):
+        place = row.end()
+    if head[1] and (place < len(text) or text.endswith(",")) and not _LEC_END.match(text, place):
         return start, bad
     return start, _checked(RangeLine(stamp_at(start), tuple(readings), "lec"), text)
 

@@ -211,25 +211,25 @@ class TlvProtocol(HeadedFrames):
         """Recognise the head of an answer by the type and length of the block behind it."""
         return 3 if _may_begin(head) else -1
 
-    def measure(self, at: int) -> int:
-        """Return the size of the head or block at `at`; 0 = wait for more bytes; -n = the first n bytes are noise."""
+    def measure(self, offset: int) -> int:
+        """Return the size of the head or block at `offset`; 0 = wait for more bytes; -n = the first n bytes are noise."""
         buffer = self.pending.data
-        if buffer[at] == self.lead:
+        if buffer[offset] == self.lead:
             # Bytes that were taken already are accepted as a head only together with the block that follows.
-            want = 5 if at < self.taken else 3
-            head = bytes(buffer[at : at + want])
+            want = 5 if offset < self.taken else 3
+            head = bytes(buffer[offset : offset + want])
             return (3 if len(head) == want else 0) if _may_begin(head) else self._noise(-1)
-        if not self._inside or at < self.taken:
-            following = buffer.find(self.lead, at + 1)
-            return self._noise(at - (following if following >= 0 else len(buffer)))
-        length = block_length(bytes(buffer[at : at + 3]))
+        if not self._inside or offset < self.taken:
+            following = buffer.find(self.lead, offset + 1)
+            return self._noise(offset - (following if following >= 0 else len(buffer)))
+        length = block_length(bytes(buffer[offset : offset + 3]))
         if length < 0:
             return self._noise(-1)
-        end = at + 2 + length if length else len(buffer) + 1
-        broken = self.head_inside(at + 1, min(end, len(buffer)))
+        end = offset + 2 + length if length else len(buffer) + 1
+        broken = self.head_inside(offset + 1, min(end, len(buffer)))
         if broken:
-            return self._noise(at - broken)
-        return 0 if end > len(buffer) else end - at
+            return self._noise(offset - broken)
+        return 0 if end > len(buffer) else end - offset
 
     def decode(self, frame: bytes, stamp: float) -> Event:
         """Decode a head or a block."""

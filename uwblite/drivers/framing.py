@@ -30,13 +30,13 @@ class StampedBuffer:
 
     def stamp_at(self, offset: int) -> float:
         """Return the arrival of the byte at `offset`, s."""
-        return next(when for at, when in reversed(self._marks) if at <= offset)
+        return next(when for first, when in reversed(self._marks) if first <= offset)
 
     def marks(self, start: int, end: int) -> tuple[tuple[int, float], ...]:
         """Return (offset from `start`, arrival, s) of the pieces between two offsets."""
         if len(self._marks) == 1:
             return ((0, self._marks[0][1]),)
-        inner = [(at - start, when) for at, when in self._marks if start < at < end]
+        inner = [(first - start, when) for first, when in self._marks if start < first < end]
         return ((0, self.stamp_at(start)), *inner)
 
     def drop(self, count: int) -> None:
@@ -44,7 +44,7 @@ class StampedBuffer:
         if count >= len(self.data):
             self.clear()
         elif count:
-            self._marks = [(0, self.stamp_at(count))] + [(at - count, when) for at, when in self._marks if at > count]
+            self._marks = [(0, self.stamp_at(count))] + [(first - count, when) for first, when in self._marks if first > count]
             del self.data[:count]
 
     def clear(self) -> None:
@@ -74,8 +74,8 @@ class FrameReader(ABC):
         """Return the event that a frame of the right size holds, or Corrupt; `stamp` s, arrival of its first byte."""
 
     @abstractmethod
-    def measure(self, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+    def measure(self, offset: int) -> int:
+        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
 
     def overlap(self, frame: bytes) -> int:
         """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
@@ -101,25 +101,25 @@ class FrameReader(ABC):
         self.taken = self._told = 0
 
     def _scan(self, events: list[Any]) -> None:
-        buffer, at, noise = self.pending.data, 0, 0
-        while at < len(buffer) and (size := self.measure(at)):
+        buffer, offset, noise = self.pending.data, 0, 0
+        while offset < len(buffer) and (size := self.measure(offset)):
             if size < 0:
-                at -= size
+                offset -= size
                 continue
-            self._report(noise, at, events)
-            frame = bytes(buffer[at : at + size])
-            event = self.decode(frame, self.pending.stamp_at(at))
+            self._report(noise, offset, events)
+            frame = bytes(buffer[offset : offset + size])
+            event = self.decode(frame, self.pending.stamp_at(offset))
             events.append(event)
-            self._told = at + size
+            self._told = offset + size
             if isinstance(event, Corrupt):
-                at = self.taken = at + 1
+                offset = self.taken = offset + 1
             else:
-                at = self.taken = at + size
-                at -= self.overlap(frame)
-            noise = at
-        self._report(noise, at, events)
-        self.pending.drop(at)
-        self.taken, self._told = max(0, self.taken - at), max(0, self._told - at)
+                offset = self.taken = offset + size
+                offset -= self.overlap(frame)
+            noise = offset
+        self._report(noise, offset, events)
+        self.pending.drop(offset)
+        self.taken, self._told = max(0, self.taken - offset), max(0, self._told - offset)
 
     def _report(self, start: int, end: int, events: list[Any]) -> None:
         start = max(start, self._told)
@@ -147,26 +147,26 @@ class HeadedFrames(FrameReader):
         head : the first `head_size` bytes, or as many as have come.
         """
 
-    def measure(self, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+    def measure(self, offset: int) -> int:
+        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
-        size = self.frame_size(bytes(buffer[at : at + self.head_size]))
+        size = self.frame_size(bytes(buffer[offset : offset + self.head_size]))
         if size < 0:
-            following = buffer.find(self.lead, at + 1)
-            return at - (following if following >= 0 else len(buffer))
-        end = at + size if size else len(buffer) + 1
-        broken = self.head_inside(at + 1, min(end, len(buffer)))
+            following = buffer.find(self.lead, offset + 1)
+            return offset - (following if following >= 0 else len(buffer))
+        end = offset + size if size else len(buffer) + 1
+        broken = self.head_inside(offset + 1, min(end, len(buffer)))
         if broken:
-            return at - broken
+            return offset - broken
         return size if end <= len(buffer) else 0
 
     def head_inside(self, start: int, end: int) -> int:
         """Return where a whole head stands between two offsets, 0 = nowhere."""
-        buffer, at = self.pending.data, start
-        while 0 <= (at := buffer.find(self.lead, at, end)) <= end - self.head_size:
-            if self.frame_size(bytes(buffer[at : at + self.head_size])) >= 0:
-                return at
-            at += 1
+        buffer, offset = self.pending.data, start
+        while 0 <= (offset := buffer.find(self.lead, offset, end)) <= end - self.head_size:
+            if self.frame_size(bytes(buffer[offset : offset + self.head_size])) >= 0:
+                return offset
+            offset += 1
         return 0
 
     def overlap(self, frame: bytes) -> int:
@@ -186,23 +186,23 @@ class PacketReader(FrameReader):
     """Bytes of the smallest frame, before which nobody looks for one."""
 
     @abstractmethod
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the good frame that begins at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+    def size_at(self, buffer: bytearray, offset: int) -> int:
+        """Return the size of the good frame at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
 
     def is_checked(self, lead: int) -> bool:
         """Return whether frames that begin with this byte have a check."""
         return True
 
-    def measure(self, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+    def measure(self, offset: int) -> int:
+        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
-        size, behind = self.size_at(buffer, at), at + 1
-        end = len(buffer) if size == 0 else at + size if size > 0 and not self.is_checked(buffer[at]) else at
+        size, behind = self.size_at(buffer, offset), offset + 1
+        end = len(buffer) if size == 0 else offset + size if size > 0 and not self.is_checked(buffer[offset]) else offset
         while behind + self.smallest <= end:
-            found = self.size_at(buffer, behind)
-            if found > 0 and behind + found <= end:
-                return at - behind
-            behind += max(1, -found)
+            inner = self.size_at(buffer, behind)
+            if inner > 0 and behind + inner <= end:
+                return offset - behind
+            behind += max(1, -inner)
         return size
 
 
@@ -222,11 +222,11 @@ class FixedPackets(PacketReader):
     def is_good(self, packet: bytearray) -> bool:
         """Return whether a whole packet with the right head has a right check, and holds what the device can send."""
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the good packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != self.head[0]:
-            return to_next(buffer, at, self.head[0])
-        packet = buffer[at : at + self.size]
+    def size_at(self, buffer: bytearray, offset: int) -> int:
+        """Return the size of the good packet at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[offset] != self.head[0]:
+            return to_next(buffer, offset, self.head[0])
+        packet = buffer[offset : offset + self.size]
         if packet[: len(self.head)] != self.head[: len(packet)]:
             return -1
         if len(packet) < self.size:
@@ -234,10 +234,10 @@ class FixedPackets(PacketReader):
         return self.size if self.is_good(packet) else -1
 
 
-def to_next(buffer: bytearray, at: int, *firsts: int) -> int:
-    """Return -n, the distance from `at` to the next byte after it that can begin a frame, for `size_at`."""
-    found = [place for first in firsts if (place := buffer.find(first, at + 1)) >= 0]
-    return at - min(found, default=len(buffer))
+def to_next(buffer: bytearray, place: int, *firsts: int) -> int:
+    """Return -n, the distance from `place` to the next byte after it that can begin a frame, for `size_at`."""
+    places = [offset for first in firsts if (offset := buffer.find(first, place + 1)) >= 0]
+    return place - min(places, default=len(buffer))
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +254,7 @@ class RawLine:
 
     def stamp_at(self, offset: int) -> float:
         """Return the arrival of the byte at `offset`, s."""
-        return next(when for at, when in reversed(self.marks) if at <= offset)
+        return next(when for first, when in reversed(self.marks) if first <= offset)
 
 
 class LineReader:
@@ -286,21 +286,21 @@ class LineReader:
             return lines
         begin = max(0, self.pending - self._look_back)
         self._pending.append(data, stamp)
-        at = 0
+        offset = 0
         for match in self._ends.finditer(bytes(self._pending.data), begin):
-            cut = at
+            cut = offset
             while match.start() - cut > self._most:
                 lines.append(self._too_long(cut))
                 cut += self._step
             text = bytes(self._pending.data[cut : match.start()])
             lines.append(RawLine(text, match[0], self._pending.marks(cut, match.end()), self._cut))
-            at, self._cut = match.end(), False
-        while self.pending - at > self._most:
-            lines.append(self._too_long(at))
-            at += self._step
-        self._pending.drop(at)
+            offset, self._cut = match.end(), False
+        while self.pending - offset > self._most:
+            lines.append(self._too_long(offset))
+            offset += self._step
+        self._pending.drop(offset)
         return lines
 
-    def _too_long(self, at: int) -> Corrupt:
+    def _too_long(self, offset: int) -> Corrupt:
         self._cut = True
-        return corrupt(bytes(self._pending.data[at : at + self._step]), "line too long")
+        return corrupt(bytes(self._pending.data[offset : offset + self._step]), "line too long")

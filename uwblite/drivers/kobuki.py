@@ -99,12 +99,12 @@ class KobukiProtocol(HeadedFrames):
 
 def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
     """Yield (id, data), and (None, b"") if the last one does not end with the payload."""
-    at = 0
-    while at + 2 <= len(payload):
-        end = at + 2 + payload[at + 1]
-        yield payload[at], payload[at + 2 : end]
-        at = end
-    if at != len(payload):
+    place = 0
+    while place + 2 <= len(payload):
+        end = place + 2 + payload[place + 1]
+        yield payload[place], payload[place + 2 : end]
+        place = end
+    if place != len(payload):
         yield None, b""
 
 

@@ -279,14 +279,14 @@ def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
 
 def doubts(links: list[Link], start: float, end: float) -> list[str]:
     """Return why a recording should not be trusted; empty when it can be."""
-    seconds, found = max(end - start, 1e-9), []
+    seconds, doubts = max(end - start, 1e-9), []
     for link in links:
         counts = link.counts
         silent, total = link.silent_time(start, end), counts.messages + counts.lost
         if not counts.messages:
-            found.append(f"{link.name}: no data at all")
+            doubts.append(f"{link.name}: no data at all")
         elif silent > 0.1 * seconds:
-            found.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
+            doubts.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
         elif counts.lost > 0.1 * total:
-            found.append(f"{link.name}: lost {counts.lost} of {total}")
-    return found
+            doubts.append(f"{link.name}: lost {counts.lost} of {total}")
+    return doubts

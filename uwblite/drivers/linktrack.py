@@ -43,11 +43,11 @@ class Bu03Protocol(PacketReader):
 
     noise, smallest = "no range frame", BU03_SHORT
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != BU03_HEAD[0]:
-            return to_next(buffer, at, BU03_HEAD[0])
-        frame = bytes(buffer[at : at + BU03_SIZE])
+    def size_at(self, buffer: bytearray, offset: int) -> int:
+        """Return the size of the frame at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[offset] != BU03_HEAD[0]:
+            return to_next(buffer, offset, BU03_HEAD[0])
+        frame = bytes(buffer[offset : offset + BU03_SIZE])
         if frame[:3] != BU03_HEAD[: len(frame)] or any(any(frame[i : i + 2]) for i in range(5, min(len(frame), BU03_SHORT), 4)):
             return -1
         if frame[BU03_SHORT:] == BU03_HEAD[:2]:

@@ -94,13 +94,13 @@ class RpLidarProtocol(PacketReader):
         """Return whether frames that begin with this byte have a check; replies have none."""
         return lead != SYNC
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] == SYNC and (size := reply_size(buffer, at, KINDS)) >= 0:
+    def size_at(self, buffer: bytearray, offset: int) -> int:
+        """Return the size of the frame at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[offset] == SYNC and (size := reply_size(buffer, offset, KINDS)) >= 0:
             return size
         if self._stream == EXPRESS_REPLY:
-            return _capsule_size(buffer, at)
-        return _nodes_size(buffer, at) if self._stream == STANDARD_REPLY else to_next(buffer, at, SYNC)
+            return _capsule_size(buffer, offset)
+        return _nodes_size(buffer, offset) if self._stream == STANDARD_REPLY else to_next(buffer, offset, SYNC)
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Reply | None:
         """Decode a capsule, sixteen nodes or a reply; None where a capsule waits for the next one."""
@@ -146,8 +146,8 @@ class RpLidarProtocol(PacketReader):
         return Samples(stamp + (TOGETHER - 1) * self.periods[0], None, self.periods[0], turned, turned, ranges)
 
 
-def _capsule_size(buffer: bytearray, at: int) -> int:
-    capsule = buffer[at : at + CAPSULE]
+def _capsule_size(buffer: bytearray, offset: int) -> int:
+    capsule = buffer[offset : offset + CAPSULE]
     if capsule[0] >> 4 != 0xA or (len(capsule) > 1 and capsule[1] >> 4 != 0x5):
         return -1
     if len(capsule) < CAPSULE:
@@ -156,17 +156,17 @@ def _capsule_size(buffer: bytearray, at: int) -> int:
     return CAPSULE if reduce(xor, capsule[2:]) == total else -1
 
 
-def _nodes_size(buffer: bytearray, at: int) -> int:
+def _nodes_size(buffer: bytearray, offset: int) -> int:
     """Sixteen nodes in a row with right check bits whose angles rise."""
     last = None
-    for start in range(at, min(at + NODE * TOGETHER, len(buffer) - NODE + 1), NODE):
+    for start in range(offset, min(offset + NODE * TOGETHER, len(buffer) - NODE + 1), NODE):
         flags, angle, _ = struct.unpack_from("<BHH", buffer, start)
         if (flags & 1) == (flags >> 1 & 1) or not angle & 1 or angle >> 1 >= TURN + 64:
             return -1
         if last is not None and ((angle >> 1) - (last >> 1)) % TURN > MOST_NODE_STEP:
             return -1
         last = angle
-    return NODE * TOGETHER if at + NODE * TOGETHER <= len(buffer) else 0
+    return NODE * TOGETHER if offset + NODE * TOGETHER <= len(buffer) else 0
 
 
 def _decode_capsule(capsule: bytes, stamp: float, first: int, step: float, period: float) -> Samples:

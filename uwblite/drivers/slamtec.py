@@ -52,15 +52,15 @@ def request(command: int, payload: bytes = b"") -> bytes:
     return body + bytes([total])
 
 
-def reply_size(buffer: bytearray, at: int, kinds: dict[int, int]) -> int:
+def reply_size(buffer: bytearray, offset: int, kinds: dict[int, int]) -> int:
     """Return the size of a reply for `FrameFinder`: 0 = wait, -1 = none begins here.
 
     Parameters
     ----------
-    buffer, at : begins with A5 or nothing begins.
+    buffer, offset : begins with A5 or nothing begins.
     kinds : type -> length of its payload.
     """
-    head = bytes(buffer[at : at + DESCRIPTOR])
+    head = bytes(buffer[offset : offset + DESCRIPTOR])
     if head[:2] != HEAD[: len(head)]:
         return -1
     if len(head) < DESCRIPTOR:
@@ -71,7 +71,7 @@ def reply_size(buffer: bytearray, at: int, kinds: dict[int, int]) -> int:
     if kinds.get(kind) != length or (streams and kind in (INFO_REPLY, HEALTH_REPLY)):
         return -1
     size = DESCRIPTOR + (0 if streams else length)
-    return size if at + size <= len(buffer) else 0
+    return size if offset + size <= len(buffer) else 0
 
 
 def decode_reply(data: bytes, stamp: float) -> Reply:

@@ -106,8 +106,8 @@ class SweepAssembler:
     def _seam(self, time: float, turned: float) -> float:
         """Return when the motor passed zero between the last reading and this one, s."""
         assert self._last is not None
-        before, at = self._last
-        return before + (time - before) * (1.0 - at) / (1.0 - at + turned) if turned + 1.0 > at else time
+        before, angle = self._last
+        return before + (time - before) * (1.0 - angle) / (1.0 - angle + turned) if turned + 1.0 > angle else time
 
     def _close(self, end: float, after: tuple[float, float]) -> LaserScan | None:
         begin = self._begin
@@ -143,8 +143,8 @@ def _resample(samples: list[tuple[float, float]], rays: int, spacing: float) -> 
     bearings = [bearing for bearing, _ in samples]
     ranges, known = [math.nan] * rays, 0
     for index in range(rays):
-        at = index * spacing
-        right = bisect_right(bearings, at)
+        direction = index * spacing
+        right = bisect_right(bearings, direction)
         if right == 0 or right == len(samples):
             continue
         (b0, r0), (b1, r1) = samples[right - 1], samples[right]
@@ -152,7 +152,7 @@ def _resample(samples: list[tuple[float, float]], rays: int, spacing: float) -> 
         if width > GAP * spacing:
             continue
         known += 1
-        share = (at - b0) / width if width > 0.0 else 0.0
+        share = (direction - b0) / width if width > 0.0 else 0.0
         if abs(r1 - r0) <= max(NOISE, 2.0 * math.pi * width * min(r0, r1) / GRAZING):
             ranges[index] = 1.0 / ((1.0 - share) / r0 + share / r1)
         else:

@@ -42,10 +42,10 @@ def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, st
     -------
     dict of column -> text; a str says why the line is damaged; None = it has another prefix and is not meant.
     """
-    at = text.rfind(prefix) if prefix else 0
-    if at < 0:
+    start = text.rfind(prefix) if prefix else 0
+    if start < 0:
         return None
-    fields = re.split(r"[,;\s]+", text[at + len(prefix) :].strip(" ,;\t"))
+    fields = re.split(r"[,;\s]+", text[start + len(prefix) :].strip(" ,;\t"))
     if len(fields) != len(columns):
         return f"{len(fields)} columns instead of {len(columns)}"
     return {name: field for name, field in zip(columns, fields, strict=True) if name != "-"}

@@ -300,11 +300,11 @@ def plugged_in() -> list[PluggedIn]:
     pyserial()
     from serial.tools.list_ports import comports
 
-    found = []
+    ports = []
     for port in sorted(comports()):
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
         if not usb and port.device not in ("/dev/ttyAMA0", "/dev/ttyS0", "/dev/serial0"):
             continue
         text = " ".join(str(part) for part in (port.manufacturer, port.product) if part) or str(port.description)
-        found.append(PluggedIn(stable_name(port.device) or port.device, text, usb))
-    return found
+        ports.append(PluggedIn(stable_name(port.device) or port.device, text, usb))
+    return ports

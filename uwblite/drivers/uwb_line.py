@@ -69,8 +69,8 @@ def _each(whole: str, row: str, part: str, unit: float = 1.0, number: str = "$^"
     def parse(line: str) -> Ranges | Refused | str | None:
         if whole_form.fullmatch(line):
             stated = number_form.search(line)
-            found = tuple(reading(anchor, float(reach) * unit) for anchor, reach in row_form.findall(line) if reach)
-            return Ranges(found, round=int(stated[1]) if stated else None)
+            ranges = tuple(reading(anchor, float(reach) * unit) for anchor, reach in row_form.findall(line) if reach)
+            return Ranges(ranges, round=int(stated[1]) if stated else None)
         if part_form.search(line):
             return DAMAGED
         return Refused("positions or angles") if _NO_RANGE.search(line) else None
@@ -96,8 +96,8 @@ def _at_range(line: str) -> Ranges | str | None:
     if len(names) != len(centimetres):
         return "as many ranges as anchors were expected"
     pairs = [(name, int(text)) for name, text in zip(names, centimetres, strict=True) if name and text]
-    found = tuple(reading(name, cm / 100) for name, cm in pairs if cm > 0 and int(name) >= 0)
-    return Ranges(found, tag=match[1], round=int(match[2]), modulus=256)
+    readings = tuple(reading(name, cm / 100) for name, cm in pairs if cm > 0 and int(name) >= 0)
+    return Ranges(readings, tag=match[1], round=int(match[2]), modulus=256)
 
 
 _SESSION_ROW = r'\[mac_address=0x([0-9A-Fa-f]{4}), status="[A-Z_]+"(?:, distance\[cm\]=(-?\d+))?(?:, [\w\[\]]+=-?[\d.]+)*\]'
@@ -205,8 +205,8 @@ def by_columns(form: LineColumns) -> Parse:
         if wrong:
             return f"column {wrong} is not a number"
         quality = numbers.get("quality") or 0.0 if "quality" in numbers else 100.0
-        found = [(k[6:] or values["id"], v) for k, v in numbers.items() if k.startswith("range") and v is not None]
-        return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in found), numbers.get("t"), values.get("tag", ""))
+        ranges = [(k[6:] or values["id"], v) for k, v in numbers.items() if k.startswith("range") and v is not None]
+        return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in ranges), numbers.get("t"), values.get("tag", ""))
 
     return parse
 

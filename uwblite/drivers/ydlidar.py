@@ -58,21 +58,21 @@ class YdLidarProtocol(PacketReader):
         """Return whether frames that begin with this byte have a check; replies have none."""
         return lead != SYNC
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the packet or reply at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] == SYNC:
-            return reply_size(buffer, at, KINDS)
-        if buffer[at] != HEAD[0]:
-            return to_next(buffer, at, HEAD[0], SYNC)
-        head = buffer[at : at + HEADER]
+    def size_at(self, buffer: bytearray, offset: int) -> int:
+        """Return the size of the packet or reply at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[offset] == SYNC:
+            return reply_size(buffer, offset, KINDS)
+        if buffer[offset] != HEAD[0]:
+            return to_next(buffer, offset, HEAD[0], SYNC)
+        head = buffer[offset : offset + HEADER]
         if head[:2] != HEAD[: len(head)] or (len(head) > 3 and not head[3]):
             return -1
         if (len(head) > 4 and not head[4] & 1) or (len(head) > 6 and not head[6] & 1):
             return -1
         size = HEADER + 2 * head[3] if len(head) == HEADER else 0
-        if not size or at + size > len(buffer):
+        if not size or offset + size > len(buffer):
             return 0
-        return size if reduce(xor, struct.unpack_from(f"<{size // 2}H", buffer, at)) == 0 else -1
+        return size if reduce(xor, struct.unpack_from(f"<{size // 2}H", buffer, offset)) == 0 else -1
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Reply:
         """Decode a packet or a reply."""

@@ -45,10 +45,10 @@ class BagClock:
 
     def warnings(self) -> list[str]:
         """Return what is odd about the times."""
-        found = [f"{self.unstamped} messages carry no time; the time of recording is used"] if self.unstamped else []
+        warnings = [f"{self.unstamped} messages carry no time; the time of recording is used"] if self.unstamped else []
         delay = float(np.median(np.concatenate(list(self.late.values())))) if self.late else 0.0
         moved = {sensor: off for sensor in self.late if (off := self.offset(sensor))}
-        found += [
+        warnings += [
             f"the stamps of the {sensor} are of another clock than the odometry's, {abs(off):.1f} s"
             f" {'behind' if off > 0.0 else 'ahead'}: by the time of recording they were moved by {off:+.1f} s"
             for sensor, off in moved.items()
@@ -57,8 +57,8 @@ class BagClock:
             why = "the sensors' computers have other clocks"
             if self._earliest < _SIMULATED < self._earliest + delay:
                 why = "the stamps are of a simulation, or count since a computer was started"
-            found.append(f"headers and recording differ by {delay:.1f} s: {why}")
-        return found
+            warnings.append(f"headers and recording differ by {delay:.1f} s: {why}")
+        return warnings
 
 
 class Frames:
@@ -180,8 +180,8 @@ class MovingFrames:
 
     def best(self, base: str = "") -> tuple[tuple[str, str], OdometryReadings] | None:
         """Return the frames and poses that come most often, of a base where one is given; None where none moves."""
-        found = [(pair, r) for pair, r in self.pairs.items() if len(r) > 1 and (not base or pair[1] == base)]
-        return max(found, key=lambda row: (len(row[1]), row[0])) if found else None
+        moving = [(pair, r) for pair, r in self.pairs.items() if len(r) > 1 and (not base or pair[1] == base)]
+        return max(moving, key=lambda row: (len(row[1]), row[0])) if moving else None
 
 
 def no_odometry(topics: Sequence[tuple[str, str]], truths: Sequence[str], frames: Sequence[str]) -> str:

@@ -102,12 +102,12 @@ def _uint32(raw: bytes) -> int:
 
 def _fields(head: bytes) -> dict[bytes, bytes]:
     """Return the fields of a record's header."""
-    found, at = dict[bytes, bytes](), 0
-    while at < len(head):
-        end = at + 4 + _uint32(head[at : at + 4])
-        name, _, found[name] = head[at + 4 : end].partition(b"=")
-        at = end
-    return found
+    fields, place = dict[bytes, bytes](), 0
+    while place < len(head):
+        end = place + 4 + _uint32(head[place : place + 4])
+        name, _, fields[name] = head[place + 4 : end].partition(b"=")
+        place = end
+    return fields
 
 
 def _of_mcap(stream: BinaryIO, size: int, add: Add, schemas: dict[int, tuple[str, Any]] | None = None) -> Iterator[Message]:
@@ -139,14 +139,14 @@ def _uint16(raw: bytes) -> int:
     return int(struct.unpack_from("<H", raw)[0])
 
 
-def _strings(data: bytes, at: int, count: int) -> list[str]:
+def _strings(data: bytes, start: int, count: int) -> list[str]:
     """Return so many texts, each behind its length."""
-    found = []
+    texts = []
     for _ in range(count):
-        end = at + 4 + _uint32(data[at : at + 4])
-        found.append(data[at + 4 : end].decode())
-        at = end
-    return found
+        end = start + 4 + _uint32(data[start : start + 4])
+        texts.append(data[start + 4 : end].decode())
+        start = end
+    return texts
 
 
 def _unpacked(compression: bytes, data: bytes) -> bytes:
@@ -184,12 +184,12 @@ class OpenBag:
 
     def topics(self) -> tuple[BagTopic, ...]:
         """Return the topics by name."""
-        found: dict[str, BagTopic] = {}
+        topics: dict[str, BagTopic] = {}
         for c in self.connections:
-            before = found.get(c.topic, BagTopic(c.topic, c.msgtype or "?", 0))
+            before = topics.get(c.topic, BagTopic(c.topic, c.msgtype or "?", 0))
             kind = before.type if before.type == c.msgtype else "?"
-            found[c.topic] = BagTopic(c.topic, kind, before.count + c.msgcount)
-        return tuple(found[name] for name in sorted(found))
+            topics[c.topic] = BagTopic(c.topic, kind, before.count + c.msgcount)
+        return tuple(topics[name] for name in sorted(topics))
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time of recording, ns, and message of every message of some topics, in the order of recording.
@@ -252,14 +252,14 @@ class OpenBag:
 
 def _with_parts(kind: str, fielddefs: Any) -> list[str]:
     """Return a type and those that its fields are of; raise KeyError where one is not known."""
-    found, left = list[str](), [kind]
+    parts, left = list[str](), [kind]
     while left:
-        if (name := left.pop()) not in found:
-            found.append(name)
+        if (name := left.pop()) not in parts:
+            parts.append(name)
             for _, (node, detail) in fielddefs[name][1]:
                 inner = detail if node.name == "NAME" else detail[0][1] if node.name != "BASE" else None
                 left += [inner] if isinstance(inner, str) else []
-    return found
+    return parts
 
 
 def _words(error: Exception, most: int) -> str:
@@ -387,7 +387,10 @@ def _of_file(path: Path, stack: ExitStack, notes: list[str]) -> Any:
             raise FormatError(_damaged(error, path.name), str(path)) from None
         unclosed = UnclosedBag(named)
         if not unclosed.message_count:
-            why = f"it was not closed, or is damaged ({_words(error, 120)}), and no message of it is complete"
+            # What Python says of a record that breaks off means nothing.
+            of_python = type(error).__module__ == "builtins"
+            detail = "a record breaks off, or states a length that cannot be" if of_python else _words(error, 120)
+            why = f"it was not closed, or is damaged ({detail}), and no message of it is complete"
             raise FormatError(f"cannot be read as a ROS bag: {why}; {repair} may save more", str(path)) from None
     notes.append(f"{path.name}: the recording was not closed (recorder killed, or power lost; {repair} mends it)")
     return unclosed

@@ -232,8 +232,8 @@ class RangeReadings:
 
         Messages name the tag's frame, or the anchor's; then the usual names are tried.
         """
-        found, unknown = np.zeros((len(tags), 3)), []
-        for place, tag in zip(found, tags, strict=True):
+        positions, unknown = np.zeros((len(tags), 3)), []
+        for place, tag in zip(positions, tags, strict=True):
             named = [name for name, _ in self._frames.get(tag, Counter[str]()).most_common(1)]
             usual = [f"uwb_{tag}", f"tag_{tag}", tag] if len(tags) > 1 else list(_USUAL_FRAMES)
             poses = (frames.pose(base, name) for name in (*named, *usual) if name)
@@ -250,7 +250,7 @@ class RangeReadings:
                 "no transform to the UWB tag: it is taken to sit in the middle of the robot, on the floor;"
                 " give `mounting.tag_position`"
             )
-        return found
+        return positions
 
 
 def _of_the_robot(every: list[tuple[float, Reading, str]], kind: str, warnings: list[str]) -> list[tuple[float, Reading]]:
@@ -262,12 +262,12 @@ def _of_the_robot(every: list[tuple[float, Reading, str]], kind: str, warnings: 
     rows = [(t, r) for t, r, k in every if k == kind]
     by_tag, anchors = Counter(r.tag for _, r in rows), {r.anchor for _, r in rows}
     ranked = sorted(by_tag, key=lambda tag: (-by_tag[tag], tag))
-    own = ([tag for tag in ranked if tag not in anchors] or ranked[:1])[:_MOST_TAGS]
-    others = Counter(f"{r.tag} to {r.anchor}" for _, r in rows if r.tag not in own)
+    robot = ([tag for tag in ranked if tag not in anchors] or ranked[:1])[:_MOST_TAGS]
+    others = Counter(f"{r.tag} to {r.anchor}" for _, r in rows if r.tag not in robot)
     if others:
         shown = ", ".join(name for name, _ in others.most_common(3))
         warnings.append(
             f"{others.total()} ranges between other nodes ({shown}{' ...' if len(others) > 3 else ''}) were left out: the tag"
-            f" on the robot is taken to be {', '.join(sorted(own))}"
+            f" on the robot is taken to be {', '.join(sorted(robot))}"
         )
-    return [(t, r) for t, r in rows if r.tag in own]
+    return [(t, r) for t, r in rows if r.tag in robot]

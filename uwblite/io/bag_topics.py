@@ -102,8 +102,8 @@ def plan_topics(
     for name, kind, what in ((odometry, ODOMETRY, "odometry"), (scan, SCAN, "scans"), (imu, IMU, "headings")):
         if name and not (by_tf and name == odometry) and (given := _topic(topics, name)).type != kind:
             fit = [t.name for t in topics if t.type == kind]
-            there = f"; of that type: {', '.join(fit)}" if fit else ", of which the bag has none"
-            raise ConfigError(f"{name} is of type {short_type(given.type)}; {what} are read from {short_type(kind)}{there}")
+            fits = f"; of that type: {', '.join(fit)}" if fit else ", of which the bag has none"
+            raise ConfigError(f"{name} is of type {short_type(given.type)}; {what} are read from {short_type(kind)}{fits}")
     for name in asked.uwb:
         _topic(topics, name)
     others = (t for t in topics if t.name not in (odometry, scan) and t.type not in (IMU, TRANSFORMS))
@@ -112,8 +112,8 @@ def plan_topics(
     uwb, unread = {}, {}
     for t in rest:
         chosen = t.name in asked.uwb or not asked.uwb
-        if chosen and (found := _usable(t, samples, mappings)):
-            uwb[t.name] = found
+        if chosen and (usable := _usable(t, samples, mappings)):
+            uwb[t.name] = usable
         elif (guess := suggested(t.name, t.type, samples)) is not None:
             unread[t.name] = guess
         if t.name in asked.uwb and t.name not in uwb:
@@ -153,8 +153,8 @@ def unread_warning(plan: TopicPlan) -> str:
 
 def _usable(topic: BagTopic, samples: Samples, mappings: Sequence[UwbMapping]) -> tuple[UwbMapping, ...]:
     """Return the mappings by which a topic is read: the user's, or known ones whose fields its messages have."""
-    if own := fitting(topic.name, topic.type, mappings):
-        return own
+    if given := fitting(topic.name, topic.type, mappings):
+        return given
     known = fitting(topic.name, topic.type, KNOWN)
     try:
         for message in samples(topic.name) if known else ():
@@ -166,11 +166,11 @@ def _usable(topic: BagTopic, samples: Samples, mappings: Sequence[UwbMapping]) -
 
 def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
     """Return the topic of a name, or raise ConfigError."""
-    found = next((t for t in topics if t.name == name), None)
-    if found is None:
+    topic = next((t for t in topics if t.name == name), None)
+    if topic is None:
         names = [t.name for t in topics]
         raise ConfigError(f"the bag has no topic {name}; {did_you_mean(name, names)}it has {', '.join(names)}")
-    return found
+    return topic
 
 
 def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) -> None:
@@ -238,9 +238,9 @@ def suggested(topic: str, message_type: str, samples: Callable[[str], Sequence[A
         return None
     for message in list(samples(topic))[:_MOST_SAMPLES]:
         for path, reading in _readings(message):
-            if (found := _mapping(reading, kind, hinted)) is not None:
+            if (mapping := _mapping(reading, kind, hinted)) is not None:
                 stamp = "header.stamp" if hasattr(message, "header") else ""
-                return UwbMapping(topic, kind, path, **found, stamp=stamp)
+                return UwbMapping(topic, kind, path, **mapping, stamp=stamp)
     return UwbMapping(topic, kind, anchor="?", range="?") if hinted and not kind.startswith("std_msgs/") else None
 
 

@@ -102,16 +102,16 @@ class LogReader:
 
     def feed(self, block: bytes) -> None:
         """Take a block of whole lines."""
-        found = Block.of(block)
-        block, gaps = found.text, found.gaps
-        ends = gaps[found.array[gaps] == 10]
+        lines = Block.of(block)
+        block, gaps = lines.text, lines.gaps
+        ends = gaps[lines.array[gaps] == 10]
         starts = np.concatenate([[0], ends[:-1] + 1])
         line_numbers, count = self.lines + 1 + np.arange(len(starts)), len(starts)
         if len(written := np.flatnonzero(ends > starts)) < count:
             starts, ends, line_numbers = starts[written], ends[written], line_numbers[written]
         first_gap = np.searchsorted(gaps, starts)
         name_ends = gaps[first_gap]
-        self.laser.begin(found)
+        self.laser.begin(lines)
         broken: list[tuple[int, str]] = []
         rows = zip(line_numbers.tolist(), starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
         for number, start, name_end, end, gap in rows:
@@ -204,8 +204,8 @@ class LogReader:
         gyro = self._finish_gyro(clock, warnings)
         others = {name: self.skipped[name] for name in _LIDARS if name in self.skipped}
         if self.scan_message and scans is None:
-            there = f"; it has {', '.join(others)}" if others else ""
-            raise ConfigError(f"the log has no scans of {self.scan_message}{there}")
+            held = f"; it has {', '.join(others)}" if others else ""
+            raise ConfigError(f"the log has no scans of {self.scan_message}{held}")
         if scans is not None and others:
             counts = ", ".join(f"{count} of {name}" for name, count in others.items())
             text = f"a map uses one lidar, here {self.scan_message or 'the first'}; scans of others are left out ({counts})"

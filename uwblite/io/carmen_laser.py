@@ -183,9 +183,9 @@ class LaserMessages:
 
     def _tail(self, name: bytes, number: int, tail: list[bytes]) -> float:
         """Read what follows the readings; remember the poses, return the stamp."""
-        at, stamp = split_tail(name, tail, self.ipc_left_out)
+        poses, stamp = split_tail(name, tail, self.ipc_left_out)
         if name != b"RAWLASER1":
-            self._poses.extend((stamp, *numbers(tail[at : at + 6], name.decode(), 6)))
+            self._poses.extend((stamp, *numbers(tail[poses : poses + 6], name.decode(), 6)))
             self._pose_lines.append(number)
         return stamp
 

@@ -70,9 +70,10 @@ class LiveReader:
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
         poses, turns = np.array(reader.odometry).reshape(-1, 5)[:, :4], np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
-        found = [Measured("odometry", float(row[0]), float(row[0]), row[1:]) for row in poses]
-        found += [*self._ranges(reader), *self._scans(reader), *(Measured("gyro", t, t, heading) for t, heading in turns)]
-        return sorted(found, key=lambda measured: measured.order)
+        measurements = [Measured("odometry", float(row[0]), float(row[0]), row[1:]) for row in poses]
+        measurements += [*self._ranges(reader), *self._scans(reader)]
+        measurements += (Measured("gyro", t, t, heading) for t, heading in turns)
+        return sorted(measurements, key=lambda measured: measured.order)
 
     def _ranges(self, reader: LogReader) -> list[Measured]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}

@@ -81,16 +81,16 @@ def judged(
         return odometry, AS_WRITTEN
     rows, lines = np.concatenate([odometry, laser]), np.concatenate([odometry_lines, laser_lines])
     order = np.argsort(lines, kind="stable")
-    rows, lines, own = rows[order], lines[order], order < len(odometry)
+    rows, lines, wheels = rows[order], lines[order], order < len(odometry)
     again = np.zeros(len(rows), dtype=bool)
-    again[1:] = own[1:] & ~own[:-1] & np.all(rows[1:, 1:] == rows[:-1, 1:], axis=1)
+    again[1:] = wheels[1:] & ~wheels[:-1] & np.all(rows[1:, 1:] == rows[:-1, 1:], axis=1)
     made = stand_still(rows[~again, 0], _travelled(rows[~again]))
     # The laser may have another clock, but where all of the odometry repeats it there is no other order.
-    others = own & ~again if (own & ~again).any() else ~own
+    others = wheels & ~again if (wheels & ~again).any() else ~wheels
     before, after = _neighbours(lines, lines[others], rows[others, 0])
     unset = again & (made | ((before <= after) & ((rows[:, 0] < before) | (rows[:, 0] > after))))
     corrected = int(unset.sum()) > max(len(laser) // 2, _IN_A_ROW)
-    used = ~own | ~unset if corrected else own if made else own & ~unset
+    used = ~wheels | ~unset if corrected else wheels if made else wheels & ~unset
     if corrected:
         warnings.append(
             f"this log was corrected, as by GMapping: {int(unset.sum())} ODOM messages repeat the pose of the laser message"
@@ -102,11 +102,11 @@ def judged(
             f"{int(unset.sum())} ODOM messages repeat the pose of the laser message before them with a stamp never set;"
             " they are left out"
         )
-    rows, lines, own = rows[used].copy(), lines[used], own[used]
+    rows, lines, wheels = rows[used].copy(), lines[used], wheels[used]
     if corrected:
         # What moves between two laser messages is the wheels', uncorrected; a robot that stands keeps its place meanwhile.
         stands = np.append(False, np.all(np.diff(rows[:, 1:], axis=0) == 0.0, axis=1))
-        rows[:, 1:], kept = _without_leaps(rows[:, 1:], own), ~own | (stands & (not made))
+        rows[:, 1:], kept = _without_leaps(rows[:, 1:], wheels), ~wheels | (stands & (not made))
         rows, lines = rows[kept], lines[kept]
     if made:
         still = int(np.sum((np.diff(rows[:, 0]) <= 0.0) & (np.diff(_travelled(rows)) > 0.0)))
@@ -121,15 +121,15 @@ def judged(
     return rows, LineClock(lines, rows[:, 0], _travelled(rows), made, made or corrected)
 
 
-def _without_leaps(poses: Floats, own: Bools) -> Floats:
+def _without_leaps(poses: Floats, wheels: Bools) -> Floats:
     """Return the poses (n, 3) of a corrected log without leaps; some (n,) are the odometry's own, the others of laser messages.
 
     Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
     X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
     """
-    laser, number = np.flatnonzero(~own), np.arange(len(own))
+    laser, number = np.flatnonzero(~wheels), np.arange(len(wheels))
     following = np.searchsorted(laser, number)
-    before, between = own & (following == 0), own & (following > 0) & (following < len(laser))
+    before, between = wheels & (following == 0), wheels & (following > 0) & (following < len(laser))
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     i = number[between]
     start, goal = laser[following[i] - 1], laser[following[i]]
@@ -137,11 +137,11 @@ def _without_leaps(poses: Floats, own: Bools) -> Floats:
     share = (i - start) / (goal - 1 - start)
     np.divide(way[i] - way[start], length, out=share, where=length > 0.0)
     change = se2.log(se2.between(poses[goal - 1], poses[goal]))
-    found = poses.copy()
-    found[i] = se2.compose(poses[i], se2.exp(share[:, None] * change))
+    smooth = poses.copy()
+    smooth[i] = se2.compose(poses[i], se2.exp(share[:, None] * change))
     if before.any():
-        found[before] = se2.compose(se2.compose(poses[laser[0]], se2.inverse(poses[laser[0] - 1])), poses[before])
-    return found
+        smooth[before] = se2.compose(se2.compose(poses[laser[0]], se2.inverse(poses[laser[0] - 1])), poses[before])
+    return smooth
 
 
 def _travelled(rows: Floats) -> Floats:
@@ -160,8 +160,8 @@ def _neighbours(lines: Ints, other_lines: Ints, other_stamps: Floats) -> tuple[F
     """Return the stamps, s, of the others (m,) before and behind each line (n,); infinite where there is none."""
     place = np.searchsorted(other_lines, lines)
     padded = np.concatenate([[-np.inf], other_stamps, [np.inf]])
-    own = np.append(other_lines, -1)[np.minimum(place, len(other_lines))] == lines
-    return padded[place], padded[place + 1 + own]
+    same = np.append(other_lines, -1)[np.minimum(place, len(other_lines))] == lines
+    return padded[place], padded[place + 1 + same]
 
 
 def false_stamps(stamps: Floats) -> Bools:

@@ -13,6 +13,7 @@ from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
 from ..sensor_log.sensors import last_places
 from .csv_table import read_csv
+from .source import read_settings
 
 _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
     "anchor": (GivenAnchor, "anchors", ("id", "position")),
@@ -26,6 +27,12 @@ _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {
 """Class, field of Constraints and needed fields of each table."""
 
 
+def read_constraints(path: str | None, anchors_from: str | None) -> Constraints:
+    """Return what is known beforehand: the constraints of a file and the anchors of an earlier map, where they are named."""
+    earlier = read_anchors(anchors_from) if anchors_from else Constraints()
+    return earlier + parse_constraints(read_settings(path), path) if path else earlier
+
+
 def parse_constraints(text: str, path: str = "") -> Constraints:
     """Return the constraints of a TOML text; path is its name for error messages.
 
@@ -37,15 +44,15 @@ def parse_constraints(text: str, path: str = "") -> Constraints:
     ConfigError : a table or field is unknown, missing or of the wrong kind.
     """
     data = parse_toml(text, path)
-    found: dict[str, tuple[Any, ...]] = {}
+    entries: dict[str, tuple[Any, ...]] = {}
     for name, tables in data.items():
         if name not in _TABLES or not isinstance(tables, list):
             tables_known = ", ".join(f"[[{k}]]" for k in _TABLES)
             raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {tables_known}")
         kind, field, needed = _TABLES[name]
         where = f"{path or 'constraints'}: [[{name}]] number"
-        found[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))
-    return Constraints(**found)
+        entries[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))
+    return Constraints(**entries)
 
 
 def _entry(kind: type, needed: tuple[str, ...], table: Any, where: str) -> Any:
@@ -80,12 +87,12 @@ def read_anchors(path: str | os.PathLike[str]) -> Constraints:
         table.texts(column)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", default=np.nan)
     status = table.texts("status", default="ok")
-    found: dict[str, tuple[tuple[float, float], float]] = {}
+    placed: dict[str, tuple[tuple[float, float], float]] = {}
     for name, (x, y, sigma_x, sigma_y), state in zip(names, values.tolist(), status, strict=True):
         if np.isfinite(x) and np.isfinite(y) and state == "ok":
             sigma = float(np.nanmax([sigma_x, sigma_y, 0.02]))
-            found[name] = (x, y), sigma
-    last = {radio: name for radio, name in last_places(names).items() if name in found}
+            placed[name] = (x, y), sigma
+    last = {radio: name for radio, name in last_places(names).items() if name in placed}
     if not last:
         raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
-    return Constraints(anchors=tuple(GivenAnchor(radio, *found[name], movable=True) for radio, name in last.items()))
+    return Constraints(anchors=tuple(GivenAnchor(radio, *placed[name], movable=True) for radio, name in last.items()))

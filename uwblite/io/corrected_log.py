@@ -92,8 +92,8 @@ def _corrected(blocks: Iterator[bytes], poses_at: PosesAt) -> Iterator[tuple[lis
             elif line.startswith(tuple(name + b" " for name in _LASER)):
                 try:
                     words = line.split()
-                    at, stamp = _poses_in(words, ipc_left_out)
-                    kept.append((words, at))
+                    place, stamp = _poses_in(words, ipc_left_out)
+                    kept.append((words, place))
                     stamps.append(stamp)
                 except (ValueError, IndexError):
                     broken += 1
@@ -104,8 +104,8 @@ def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
     """Return the word at which the poses of a laser message begin, and its stamp, s."""
     name = words[0]
     behind = HEAD[name] + int(words[HEAD[name] - 1])
-    at, stamp = split_tail(name, words[behind:], ipc_left_out)
-    return behind + at, stamp
+    place, stamp = split_tail(name, words[behind:], ipc_left_out)
+    return behind + place, stamp
 
 
 def _with_poses(
@@ -118,11 +118,11 @@ def _with_poses(
         if isinstance(entry, bytes):
             lines.append(entry)
             continue
-        words, at = entry
+        words, place = entry
         corrected = laser[scan] if words[0] == b"FLASER" else np.concatenate([laser[scan], robot[scan]])
         scan += 1
         if np.isfinite(corrected).all():
-            words[at : at + len(corrected)] = [b"%.6f" % value for value in corrected.tolist()]
+            words[place : place + len(corrected)] = [b"%.6f" % value for value in corrected.tolist()]
             lines.append(b" ".join(words) + b"\n")
         else:
             broken += 1

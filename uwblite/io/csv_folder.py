@@ -163,11 +163,11 @@ def _is_header(row: list[str]) -> bool:
 def _places(row: list[str], names: tuple[str, ...], path: Path, line: int) -> list[int]:
     """Return where the named columns stand by a table's first row, -1 = not there."""
     header = [cell.strip().lower() for cell in row] if _is_header(row) else []
-    found = [header.index(name) if name in header else -1 for name in names]
+    places = [header.index(name) if name in header else -1 for name in names]
     needed = [k for k, name in enumerate(names) if name != "quality"]
-    if all(found[k] >= 0 for k in needed):
-        return found
-    elsewhere = any(place not in (-1, k) for k, place in enumerate(found))
+    if all(places[k] >= 0 for k in needed):
+        return places
+    elsewhere = any(place not in (-1, k) for k, place in enumerate(places))
     if elsewhere or not len(needed) <= len(row) <= len(names):
         raise FormatError(f"{len(row)} columns, expected {','.join(names)}", str(path), line)
     return [k if k < len(row) else -1 for k in range(len(names))]

@@ -26,8 +26,8 @@ class CsvTable:
     def texts(self, column: str, *, default: str | None = None) -> tuple[str, ...]:
         """Return a column as text; `default` stands for one that is absent, None = it must be there."""
         if column in self.header:
-            at = self.header.index(column)
-            return tuple(row[at] for row in self.rows)
+            place = self.header.index(column)
+            return tuple(row[place] for row in self.rows)
         if default is None:
             raise FormatError(f"has no column {column!r}; its header is {','.join(self.header)!r}", self.path, 1)
         return (default,) * len(self.rows)

@@ -86,8 +86,8 @@ def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
     for left in [p for p in home.iterdir() if p.name.startswith(prefix)]:  # of killed writers
         shutil.rmtree(left, ignore_errors=True)
     waiting = home / f"{prefix}{secrets.token_hex(4)}"
-    waiting.mkdir()
     try:
+        waiting.mkdir()
         yield waiting
         sync_files(waiting)
         if not (beside and _in_one_step(waiting, folder, owned)):
@@ -100,8 +100,9 @@ def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
             sync_folder(folder)
             _repair(folder, owned)
     except OSError as error:
-        if error.filename is not None and (path := Path(os.fsdecode(error.filename))).parent == waiting:
-            error.filename = os.fspath(folder / path.name)
+        # Nobody asked for the folder that waits.
+        if error.filename is not None and (path := Path(os.fsdecode(error.filename))).is_relative_to(waiting):
+            error.filename = os.fspath(folder / path.relative_to(waiting))
         raise
     finally:
         shutil.rmtree(waiting, ignore_errors=True)

@@ -171,7 +171,7 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
         return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
     except FormatError as error:
         content = format_of_content(path)
-        what = _GRAPH_ALONE if kind in ("g2o", "pyfg") else _NO_RECORDING.get(content, "")
+        what = _GRAPH_ALONE if content in ("g2o", "pyfg") else _NO_RECORDING.get(content, "")
         raise FormatError(what, path) if what else error from None
 
 
@@ -222,6 +222,8 @@ def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
         return read_pyfg(path, from_odometry=from_odometry)
     if kind in ("bag", "log", "csv", "librsf"):
         raise FormatError("is a recording, no pose graph: uwblite map makes a map of it, with graph.g2o", path)
+    if kind in ("tum", "kitti"):
+        raise FormatError("is a trajectory, no pose graph", path)
     if kind == "map":
         raise FormatError(f"is a result; its pose graph is {os.path.join(path, 'graph.g2o')}", path)
     return read_g2o(path, from_odometry=from_odometry)

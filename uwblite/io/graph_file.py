@@ -70,15 +70,15 @@ def plain_edges(graph: Graph) -> dict[str, Measured]:
     zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out. Directions that
     an edge does not measure get an information too small to matter (see `definite`).
     """
-    found: dict[str, list[Measured]] = {kind: [] for kind in ENDS}
+    kinds: dict[str, list[Measured]] = {kind: [] for kind in ENDS}
     for edges in graph.edges:
         if isinstance(edges, PriorEdges) and edges.block == "calibration":
             continue
         kind, ends, value, L = _plain(edges, graph)
         on = (edges.own_weights > 0) & np.isfinite(value).all(axis=1)
         root = L[on] * np.sqrt(edges.own_weights[on])[:, None, None]
-        found[kind].append(Measured(tuple(end[on] for end in ends), value[on], np.swapaxes(root, 1, 2) @ root))
-    joined = {kind: measured(kind, parts) for kind, parts in found.items()}
+        kinds[kind].append(Measured(tuple(end[on] for end in ends), value[on], np.swapaxes(root, 1, 2) @ root))
+    joined = {kind: measured(kind, parts) for kind, parts in kinds.items()}
     return {kind: m._replace(information=definite(m.information)) for kind, m in joined.items()}
 
 
@@ -139,14 +139,14 @@ def definite(information: Floats) -> Floats:
     if len(information) == 0:
         return information
     # The trace is at least the largest eigenvalue, so that the determinant is at most the least one times its powers.
-    size, found = np.trace(information, axis1=1, axis2=2), information.copy()
+    size, definite = np.trace(information, axis1=1, axis2=2), information.copy()
     doubtful = np.flatnonzero(~(np.linalg.det(information) > 2.0 * _FLATTEST * size ** information.shape[1]))
     values, vectors = np.linalg.eigh(information[doubtful])
     least = np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny)
     raised = (vectors * np.maximum(values, least)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     flat = values[:, 0] < least[:, 0]
-    found[doubtful[flat]] = raised[flat]
-    return found
+    definite[doubtful[flat]] = raised[flat]
+    return definite
 
 
 def root(information: Floats) -> Floats:
@@ -353,8 +353,8 @@ def assembled(
     (seer, seen), (one, other), (first, second) = (plain[kind].ends for kind in _DISTANCES)
     metres = {kind: plain[kind].value[:, 0] for kind in _DISTANCES}
     sigma = {kind: 1.0 / L[kind][:, 0, 0] for kind in _DISTANCES}
-    flat, nowhere, at = np.zeros((len(seer), 2)), np.zeros((len(one), 2)), np.zeros(len(seer))
-    uncalibrated = flat, at, flat, np.zeros(2), at, np.full((len(seer), 6), -1, dtype=np.intp)
+    flat, nowhere, bias = np.zeros((len(seer), 2)), np.zeros((len(one), 2)), np.zeros(len(seer))
+    uncalibrated = flat, bias, flat, np.zeros(2), bias, np.full((len(seer), 6), -1, dtype=np.intp)
     edges = (
         RelativePoseEdges(i, j, T_i_j, L["relative"]),
         LandmarkEdges(pose, anchor, position, L["observation"]),

@@ -79,8 +79,8 @@ def _continues(path: str) -> tuple[int, str]:
             head = file.read(HEAD_BYTES)
     except (OSError, EOFError, zlib.error):
         return 1, ""
-    found = re.search(rb"^COMMENT part (\d{1,6}), continues (\S+)$", head, re.MULTILINE)
-    return (int(found[1]), found[2].decode("utf-8", "replace")) if found else (1, "")
+    match = re.search(rb"^COMMENT part (\d{1,6}), continues (\S+)$", head, re.MULTILINE)
+    return (int(match[1]), match[2].decode("utf-8", "replace")) if match else (1, "")
 
 
 def _goes_on(path: str) -> bool:

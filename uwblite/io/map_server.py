@@ -100,7 +100,7 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
     ------
     FormatError : a file is missing or is not what it should be.
     """
-    name, said = os.fspath(path), [] if warnings is None else warnings
+    name, remarks = os.fspath(path), [] if warnings is None else warnings
     settings = _parse_yaml(read_bounded(name, _MOST_YAML_BYTES).decode("utf-8-sig", errors="replace"), name)
     pixels = _read_picture(os.path.join(os.path.dirname(name), _text(settings, "image", name)))[::-1]
     origin, numbers = _origin(settings, name), ("resolution", "occupied_thresh", "free_thresh")
@@ -113,7 +113,7 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
     negate = str(settings.get("negate", "0")).lower() in ("1", "true")
     log_odds = _log_odds(pixels, negate, occupied, free, mode)
     if mode == "trinary" and not negate and (count := _keep_unknown(log_odds, pixels, free)):
-        said.append(
+        remarks.append(
             f"{count} cells have the grey of unknown ones ({PIXEL_UNKNOWN}), which free_thresh {free:g} would make free: they"
             " stay unknown (free_thresh: 0.196 says so to every program)"
         )
@@ -156,14 +156,14 @@ def _turned(grid: OccupancyGrid, yaw: float, name: str) -> OccupancyGrid:
     cols, rows = np.ceil((corners.max(axis=0) - low) / g.resolution - 1e-6).astype(int).tolist()
     if rows * cols > MOST_PIXELS:
         raise FormatError("is too large to be turned as its origin says; turn the picture and set the yaw to 0", name)
-    found = np.zeros((rows, cols), dtype=np.float32)
+    turned = np.zeros((rows, cols), dtype=np.float32)
     x = low[0] + g.resolution * (np.arange(cols) + 0.5)
     for row, y in enumerate((low[1] + g.resolution * (np.arange(rows) + 0.5)).tolist()):
         col = np.floor((turn[0, 0] * x + turn[1, 0] * y) / g.resolution + 1e-6).astype(np.intp)
         line = np.floor((turn[0, 1] * x + turn[1, 1] * y) / g.resolution + 1e-6).astype(np.intp)
         inside = np.flatnonzero((col >= 0) & (col < g.cols) & (line >= 0) & (line < g.rows))
-        found[row, inside] = grid.log_odds[line[inside], col[inside]]
-    return OccupancyGrid(GridGeometry(g.resolution, g.origin + low, rows, cols), found)
+        turned[row, inside] = grid.log_odds[line[inside], col[inside]]
+    return OccupancyGrid(GridGeometry(g.resolution, g.origin + low, rows, cols), turned)
 
 
 def _log_odds(pixels: Image, negate: bool, occupied: float, free: float, mode: str) -> NDArray[np.float32]:
@@ -203,7 +203,7 @@ def _parse_yaml(text: str, path: str) -> Settings:
             continue
         match = re.match(r"([A-Za-z_]+)\s*:(?:\s+(.*))?$", line)
         if not match:
-            raise FormatError("is not 'key: value'", path, number)
+            raise FormatError("is not 'key: value', as the lines of a map's YAML file are", path, number)
         key, value = match[1], (match[2] or "").strip()
         if value.startswith("["):
             settings[key] = [item.strip() for item in value.strip("[]").split(",")]

@@ -107,10 +107,10 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     lines |= {"pose_range": meetings, "landmark_range": surveys}
     plain = {}
     for kind, of in lines.items():
-        found = measurements(of, kind, index, content, "covariance")
-        inverse, least = _inverted(found.information)
+        measured = measurements(of, kind, index, content, "covariance")
+        inverse, least = _inverted(measured.information)
         check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
-        plain[kind] = found._replace(information=inverse)
+        plain[kind] = measured._replace(information=inverse)
     poses = given_places(vertices, pose_of, len(pose_ids), content)
     anchors = given_places(landmarks, landmark_of, len(landmark_ids), content)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
@@ -172,8 +172,8 @@ def _lines(
         m = plain[kind]
         ends = [names[end][index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
         # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
-        at = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
-        when = stamps[at[-1 if kind == "relative" else 0]] if at else np.full(len(m.value), stamps[first])
+        indices = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
+        when = stamps[indices[-1 if kind == "relative" else 0]] if indices else np.full(len(m.value), stamps[first])
         covariances = upper_triangle(_inverted(m.information)[0])
         yield rows_of(tag, " %.6f" + " %s" * len(ends), [when, *ends], m.value, covariances)
 
@@ -198,10 +198,10 @@ def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ..
             raise content.error(f"{shown!r} is not a name: a letter and a number, L for landmarks")
         listed[match[1] == b"L"].append((match[1], int(match[2]), place))
     names = []
-    for kind, found in zip(index, listed, strict=True):
-        found.sort()
-        kind[[place for _, _, place in found]] = np.arange(len(found))
-        names.append(tuple(content.names[place].decode() for _, _, place in found))
+    for kind, numbers in zip(index, listed, strict=True):
+        numbers.sort()
+        kind[[place for _, _, place in numbers]] = np.arange(len(numbers))
+        names.append(tuple(content.names[place].decode() for _, _, place in numbers))
     return names[0], index[0], names[1], index[1]
 
 

@@ -84,10 +84,10 @@ def resampled(ranges: NDArray[np.float32], have: ScanGeometry, want: ScanGeometr
     with np.errstate(invalid="ignore"):
         change = second - first
         joint = np.abs(change) <= _STEEPEST * abs(step) * np.minimum(first, second) + _NOISE
-        found = np.where(joint, first + share * change, np.where(share < 0.5, first, second))
+        resampled = np.where(joint, first + share * change, np.where(share < 0.5, first, second))
     if not have.full_turn:
-        found[:, (place < -0.5) | (place > have.beams - 0.5)] = np.nan
-    return found.astype(np.float32)
+        resampled[:, (place < -0.5) | (place > have.beams - 0.5)] = np.nan
+    return resampled.astype(np.float32)
 
 
 def resampling_warning(resized: int, scans: int, beams: int) -> str:

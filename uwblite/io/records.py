@@ -88,10 +88,10 @@ def read_records(source: TextSource, layouts: Mapping[str, Layout]) -> RecordFil
                 rows.setdefault(tokens[0], []).append((number, tokens))
             else:
                 _count(result, tokens[0], number)
-        for tag, found in rows.items():
-            parts[tag].append(_table(found, known[tag], names, result))
+        for tag, lines in rows.items():
+            parts[tag].append(_table(lines, known[tag], names, result))
     result.names = list(names)
-    result.records = {tag.decode(): _joined(found, known[tag]) for tag, found in parts.items()}
+    result.records = {tag.decode(): _joined(lines, known[tag]) for tag, lines in parts.items()}
     return result
 
 

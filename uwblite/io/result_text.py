@@ -157,9 +157,9 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
     return ready
 
 
-def notices(found: Sequence[Finding]) -> list[dict[str, Any]]:
+def notices(findings: Sequence[Finding]) -> list[dict[str, Any]]:
     """Return warnings or doubts as JSON-ready records."""
-    values = ({name: getattr(n, name) for name in _FINDING_FIELDS} for n in found)
+    values = ({name: getattr(n, name) for name in _FINDING_FIELDS} for n in findings)
     return [{name: list(v) if isinstance(v, tuple) else v for name, v in fields.items()} for fields in values]
 
 

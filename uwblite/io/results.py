@@ -110,8 +110,8 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     check_target(folder, force=True)
     with replacing_folder(folder, is_of_result) as waiting:
         for number in np.unique(result.recording).tolist():
-            mine, name = result.recording == number, f"trajectory_{number + 1}.tum" if number else "trajectory.tum"
-            write_tum(waiting / name, result.stamps[mine], result.trajectory[mine])
+            chosen, name = result.recording == number, f"trajectory_{number + 1}.tum" if number else "trajectory.tum"
+            write_tum(waiting / name, result.stamps[chosen], result.trajectory[chosen])
         stamps, recording = result.keyframe_stamps, result.keyframe_recording
         table = covariance_csv(stamps, result.keyframe_covariances, recording, result.trusted(stamps, recording))
         write_text(waiting / "trajectory_covariance.csv", table)

@@ -54,13 +54,13 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings
     with open_bag(path) as bag:
         held = bag.topics()
         plan = plan_topics(held, partial(bag.samples, most=_SAMPLES), topics, mappings)
-        found = Collector(plan, topics.base_frame)
+        collector = Collector(plan, topics.base_frame)
         wanted = {plan.odometry, plan.scan, plan.imu, *plan.uwb, *plan.tf} - {""}
         for topic, recorded, message in bag.messages(wanted):
-            found.take(topic, recorded / 1e9, message)
+            collector.take(topic, recorded / 1e9, message)
         if topics.base_frame:
-            found.frames.check(topics.base_frame)
-        return found.log(os.fspath(path), sha256_of(path), held, bag.notes)
+            collector.frames.check(topics.base_frame)
+        return collector.log(os.fspath(path), sha256_of(path), held, bag.notes)
 
 
 @dataclass(slots=True)
@@ -158,5 +158,5 @@ class Collector:
     def _warnings(self) -> list[str]:
         chosen = {name for text in self.plan.choices for name in self.plan.passed_over if name in text}
         rest = [name for name in self.plan.passed_over if name not in chosen]
-        found = [*self.plan.choices, *([f"not used: {', '.join(rest)}"] if rest else [])]
-        return [*found, *([unread_warning(self.plan)] if self.plan.unread else [])]
+        warnings = [*self.plan.choices, *([f"not used: {', '.join(rest)}"] if rest else [])]
+        return [*warnings, *([unread_warning(self.plan)] if self.plan.unread else [])]

@@ -70,7 +70,11 @@ def write_messages(path: str | os.PathLike[str], messages: Iterable[Stamped], *,
         raise ConfigError(f"{target} exists; choose another name or remove it")
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    waiting = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}.partial-", dir=target.absolute().parent))
+    try:
+        waiting = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}.partial-", dir=target.absolute().parent))
+    except OSError as error:
+        error.filename = os.fspath(target)  # nobody asked for the folder that waits
+        raise
     try:
         with _errors_of_ours(target), Writer(waiting / "bag", version=_FORMAT, storage_plugin=plugin) as writer:
             connections: dict[str, Any] = {}

@@ -98,6 +98,8 @@ class TextSource:
                 raise FormatError(problem, self.path)
             if first and b"\0" in data[:4096]:
                 raise FormatError("this is binary data, not a text file", self.path)
+            if first and b"\r" in data and b"\n" not in data:
+                raise FormatError("its lines end in CR alone; tr '\\r' '\\n' makes lines of them", self.path)
             data, first = data.removeprefix(b"\xef\xbb\xbf") if first else data, False
             if overlong:
                 cut = data.find(b"\n")
@@ -147,7 +149,7 @@ def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = N
     except EOFError:
         raise FormatError("the gzip data is cut off; copy the file again, or save what zcat can read", name) from None
     except (gzip.BadGzipFile, zlib.error) as error:
-        raise FormatError(f"the gzip data is damaged ({error})", name) from None
+        raise FormatError(f"the gzip data is damaged ({error}); copy it again, or save what zcat can read", name) from None
     except OSError as error:
         raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
     finally:

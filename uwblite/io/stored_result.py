@@ -94,8 +94,8 @@ class StoredResult:
         """Offset of the lidar's clock, s: a scan stamped t was taken at t + laser_delay by the trajectory's clock; 0 where
         the report does not contain it."""
         entries = self.report.get("calibration") or []
-        found = [e.get("value") for e in entries if isinstance(e, dict) and e.get("name") == "laser_delay"]
-        return float(found[0]) if found and isinstance(found[0], int | float) else 0.0
+        delays = [e.get("value") for e in entries if isinstance(e, dict) and e.get("name") == "laser_delay"]
+        return float(delays[0]) if delays and isinstance(delays[0], int | float) else 0.0
 
     def pose_at(self, recording: int, stamps: Floats) -> Floats:
         """Return the poses (..., 3) of a recording, counted from 1, at times of its clock, s."""
@@ -168,12 +168,12 @@ def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
     if (rows := len(table.texts("id"))) > MOST_ANCHORS:
         raise FormatError(f"has {rows} anchors, more than {MOST_ANCHORS}: it must be the anchors.csv of one map", table.path)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", "bias", "residual_rms", default=np.nan)
-    found = []
+    anchors = []
     texts = table.texts("id"), table.texts("status", default="ok")
     for name, status, (x, y, sx, sy, xy, bias, rms) in zip(*texts, values, strict=True):
         off = 0.0 if np.isnan(xy) else xy
-        found.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status, bias, rms))
-    return tuple(found)
+        anchors.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status, bias, rms))
+    return tuple(anchors)
 
 
 def _pose(values: Any) -> Floats | None:

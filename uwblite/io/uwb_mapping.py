@@ -79,7 +79,7 @@ class UwbMapping:
         MissingField : the message has no such field.
         """
         readings = _field(message, self.readings, self) if self.readings else [message]
-        found = []
+        extracted = []
         for reading in readings:
             value = _field(reading, self.range, self)
             quality = float(_field(reading, self.quality, self)) if self.quality else 100.0
@@ -89,10 +89,10 @@ class UwbMapping:
                 pairs = zip(range(len(value)), ids, value, strict=False)
                 measured = [(name, float(v)) for k, name, v in pairs if self._wanted(reading, k)]
                 usable = [(self._name(name), v) for name, v in measured if math.isfinite(v) and v != 0.0]
-                found += [Reading(name, v * self.unit, quality, tag) for name, v in usable]
+                extracted += [Reading(name, v * self.unit, quality, tag) for name, v in usable]
             elif self._wanted(reading):
-                found.append(Reading(self._anchor(reading, topic), float(value) * self.unit, quality, tag))
-        return found
+                extracted.append(Reading(self._anchor(reading, topic), float(value) * self.unit, quality, tag))
+        return extracted
 
     def _tag(self, reading: Any, message: Any, topic: str) -> str:
         """Return the id of the tag that measured, '' where the message does not tell."""
@@ -160,8 +160,8 @@ def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> lis
     understood = False
     for mapping in mappings:
         try:
-            if found := mapping.extract(message, topic):
-                return found
+            if readings := mapping.extract(message, topic):
+                return readings
             understood = True
         except MissingField as error:
             missing = missing or error

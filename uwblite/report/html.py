@@ -138,8 +138,8 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
 def _calibration_table(result: MapResult) -> str:
     """Return what was calibrated, and, folded away, what the recording does not show."""
     head = ("meaning", "value", "name")
-    found = [_calibration_row(c) for c in result.calibration if c.state == "estimated"]
-    text = _table(head, found, "Nothing was calibrated.")
+    estimated = [_calibration_row(c) for c in result.calibration if c.state == "estimated"]
+    text = _table(head, estimated, "Nothing was calibrated.")
     if silent := [(*_calibration_row(c), c.reason) for c in result.calibration if c.state != "estimated"]:
         rest = _table((*head, "why it stays at what was assumed"), silent, "")
         text += f"<details><summary>{len(silent)} more that the recording does not show</summary>{rest}</details>"
@@ -229,10 +229,10 @@ def _residuals(result: MapResult) -> str:
         " What lies beyond the scale is drawn at its edge.</p>"
     ]
     for index, anchor in enumerate(result.anchors):
-        mine = np.flatnonzero(table["anchor"] == index)
-        mine = mine[np.isfinite(table["residual"][mine])]
-        if len(mine):
-            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], time / span, ends))
+        rows = np.flatnonzero(table["anchor"] == index)
+        rows = rows[np.isfinite(table["residual"][rows])]
+        if len(rows):
+            parts.append(_residual_plot(anchor.id, table, rows[thin(len(rows), MOST_RESIDUALS)], time / span, ends))
     return "".join(parts)
 
 

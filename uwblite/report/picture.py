@@ -54,29 +54,29 @@ def draw_axes(image: NDArray[np.uint8], low: Floats, scale: float) -> None:
     step = round_length(_TICK_EVERY / scale)
     for axis, length in enumerate((width, height)):
         for value in np.arange(math.ceil(low[axis] / step), math.floor((low[axis] + length / scale) / step) + 1) * step:
-            at, label = (value - low[axis]) * scale, f"{value + 0.0:g}"
+            offset, label = (value - low[axis]) * scale, f"{value + 0.0:g}"
             if axis == 0:
-                canvas.lines(np.array([[at, height - 7.0, at, height]]), 1.5, INK)
-                place, shown = (at - 3 * len(label), height - 18.0), 20 < at < width - 30
+                canvas.lines(np.array([[offset, height - 7.0, offset, height]]), 1.5, INK)
+                place, shown = (offset - 3 * len(label), height - 18.0), 20 < offset < width - 30
             else:
-                canvas.lines(np.array([[0.0, height - at, 7.0, height - at]]), 1.5, INK)
-                place, shown = (11.0, height - at - 4), 10 < height - at < height - 30
+                canvas.lines(np.array([[0.0, height - offset, 7.0, height - offset]]), 1.5, INK)
+                place, shown = (11.0, height - offset - 4), 10 < height - offset < height - 30
             if shown:
                 canvas.text(*place, label, INK, 1, PAPER)
     _draw_origin(canvas, np.array([-low[0] * scale, height + low[1] * scale]))
 
 
-def _draw_origin(canvas: Canvas, at: Floats) -> None:
+def _draw_origin(canvas: Canvas, origin: Floats) -> None:
     height, width = canvas.image.shape[:2]
-    if not (0 <= at[0] < width and 0 <= at[1] < height):
+    if not (0 <= origin[0] < width and 0 <= origin[1] < height):
         return
     for name, step in (("x", np.array([34.0, 0.0])), ("y", np.array([0.0, -34.0]))):
-        canvas.lines(np.concatenate([at, at + step])[None], 2.0, INK)
+        canvas.lines(np.concatenate([origin, origin + step])[None], 2.0, INK)
         side = np.array([-step[1], step[0]]) / 34.0
-        canvas.polygon(np.array([at + step + step * 8 / 34, at + step + 4 * side, at + step - 4 * side]), INK)
-        x, y = (at + step * 1.25 + np.array([3.0, -10.0])).tolist()
+        canvas.polygon(np.array([origin + step + step * 8 / 34, origin + step + 4 * side, origin + step - 4 * side]), INK)
+        x, y = (origin + step * 1.25 + np.array([3.0, -10.0])).tolist()
         canvas.text(x, y, name, INK, 1, FLOOR)
-    canvas.discs(at[None], 3.5, INK)
+    canvas.discs(origin[None], 3.5, INK)
 
 
 def draw_foot(image: NDArray[np.uint8], top: int, scale: float, caption: str, keys: Sequence[Key]) -> None:
@@ -235,8 +235,8 @@ def _legend(recordings: int, anchors: Sequence[PictureAnchor], closures: Floats 
     names = ["path"] if recordings == 1 else [f"recording {k}" for k in range(1, min(recordings, len(PATHS)) + 1)]
     keys = [Key(name, colour, "line") for name, colour in zip(names, PATHS, strict=False)] if recordings else []
     keys += [Key("start", START, "disc"), Key("end", PATHS[0], "ring")] if recordings else []
-    if there := [a for a in anchors if not a.proposed]:
-        ellipses = any(a.covariance is not None for a in there)
+    if standing := [a for a in anchors if not a.proposed]:
+        ellipses = any(a.covariance is not None for a in standing)
         keys.append(Key("anchor, 2 sigma" if ellipses else "anchor", ANCHOR, "triangle"))
     keys += [Key("proposed", PROPOSED, "triangle")] if any(a.proposed for a in anchors) else []
     keys += [Key("loop closure", ACCEPTED, "line")] if closures is not None and len(closures) else []

@@ -14,7 +14,7 @@ def printable(text: str) -> str:
 
 def encodable(text: str) -> str:
     """Return text that UTF-8 can hold: bytes of file names that are not UTF-8 written as escapes."""
-    return text if text.isascii() else re.sub("[\ud800-\udfff]", lambda found: _escape(found[0]), text)
+    return text if text.isascii() else re.sub("[\ud800-\udfff]", lambda match: _escape(match[0]), text)
 
 
 def csv_field(text: str) -> str:

@@ -199,10 +199,10 @@ def _parts(name: str, names: Collection[str]) -> tuple[str, int, int]:
 
     A radio may be called ``ID@2`` itself: that is another place of ``ID`` only where there is an ``ID``.
     """
-    found = _PLACE.fullmatch(name)
-    if found is None or found[1] not in names:
+    match = _PLACE.fullmatch(name)
+    if match is None or match[1] not in names:
         return name, 1, 1
-    return found[1], int(found[3] or 1), int(found[2] or 1)
+    return match[1], int(match[3] or 1), int(match[2] or 1)
 
 
 def name_and_number(name: str) -> tuple[str, int]:

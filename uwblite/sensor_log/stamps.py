@@ -70,10 +70,9 @@ def stand_still(stamps: Floats, travelled: Floats) -> bool:
     way = np.diff(travelled)
     group = np.concatenate([[0], np.cumsum(np.diff(stamps) != 0.0)])
     within = np.where(group[1:] == group[:-1], way, 0.0)
-    far = np.bincount(group[1:], within) > min(_BUFFERED, _HALF * float(way.sum()))
-    return float(within[far[group[1:]]].sum()) > _HALF * float(way.sum())
+    far = np.bincount(group[1:], within) > min(_BUFFERED, 0.5 * float(way.sum()))
+    return float(within[far[group[1:]]].sum()) > 0.5 * float(way.sum())
 
 
 _BUFFERED = 10.0
 """m; more than a robot drives while readings wait in a buffer: a few seconds at 3 m/s at most."""
-_HALF = 0.5
