@@ -18,7 +18,7 @@ class Written:
 
 def text_at(*moments):
     """Return a text whose clock shows these moments, s, one after the other; it began at 50 s, 1000 s before wall time."""
-    clock, log = iter(moments), Written()
+    clock, log = iter((50.0, *moments)), Written()
     return LogText(log, Mounting(params=(("anchor_height", "2.0"),)), Host("robot", lambda: next(clock), 1000.0)), log
 
 

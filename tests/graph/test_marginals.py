@@ -4,21 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import calibrated_loop, dense_system, loop, relative_edges
+from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
+from uwblite.graph.joint_covariance import JointCovariance
 from uwblite.graph.marginals import CommonErrors, about_best_fit, added_unknown, added_unknown_and_moves, marginals, shape_error
 from uwblite.graph.solver import optimize
 from uwblite.graph.variance_components import variances_of_kinds
-
-
-def dense_covariance(graph):
-    """Return the covariance of every block of unknowns with every other, zero where fixed, by a dense inverse."""
-    H, _, number = dense_system(graph)
-    padded = np.zeros((len(H) + 1, len(H) + 1))
-    padded[:-1, :-1] = np.linalg.inv(H)
-    return lambda a, i, b, j: padded[np.ix_(number[a][i], number[b][j])]
 
 
 @pytest.mark.parametrize("n", [8, 60, 300])
@@ -43,31 +36,6 @@ def test_fixed_unknowns_have_no_covariance():
     np.testing.assert_allclose(found.covariances.anchors[2], covariance("anchors", 2, "anchors", 2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("few", [True, False])
-def test_relative_covariances_follow_from_the_joint_one(few):
-    graph, _ = calibrated_loop()
-    rng = np.random.default_rng(0)
-    i, j = rng.integers(0, 3 if few else 60, 200), rng.integers(0, 60, 200)
-    i[:2], j[:2] = [0, 5], [5, 0]  # from and to the fixed pose
-    covariance, found = dense_covariance(graph), marginals(graph)
-    for a, b, relative in zip(i, j, found.relative(i, j), strict=True):
-        J = np.hstack(se2.between_jacobians(graph.poses[a], graph.poses[b]))
-        joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
-        np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(found.relative(j, i)[2], found.relative(j[2], i[2])[0], rtol=1e-9)
-
-
-def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
-    truth = np.cumsum(np.full((5, 3), 0.2), axis=0)
-    sigma = np.array([0.1, 0.05, 0.02])
-    graph = Graph(truth, edges=(relative_edges(truth, range(4), range(1, 5), sigma),))
-    relative = marginals(graph).relative([1, 2, 3], [2, 3, 4])
-    # The edge's error Z^-1 (Xi^-1 Xj) stands in the frame of pose j, which is turned by 0.2 against that of pose i.
-    c, s = np.cos(0.2), np.sin(0.2)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(relative, np.tile(turn @ np.diag(sigma**2) @ turn.T, (3, 1, 1)), atol=1e-12)
-
-
 @pytest.mark.slow
 def test_covariances_are_those_of_repeated_experiments():
     """300 graphs that differ by their noise: errors over predicted sigmas have mean square 1 to sqrt(2 / 300) each."""
@@ -88,7 +56,7 @@ def test_covariances_are_those_of_repeated_experiments():
         away = graph.anchors[0] - anchors[0]
         sums += [
             error @ np.linalg.solve(found.covariances.poses[8], error) / 3,
-            across @ np.linalg.solve(found.relative([3], [12])[0], across) / 3,
+            across @ np.linalg.solve(JointCovariance(graph, np.array([3, 12])).relative([3], [12])[0], across) / 3,
             away @ np.linalg.solve(found.covariances.anchors[0], away) / 2,
         ]
     np.testing.assert_allclose(sums / repeats, 1.0, atol=4.0 * np.sqrt(2.0 / 2 / repeats))

@@ -17,7 +17,7 @@ from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
 from uwblite.report import svg_map
-from uwblite.report.html import render
+from uwblite.report.html import Heading, render
 
 FRAME = np.array([[-10.0, -10.0], [10.0, 10.0]])
 """Corners of a map, m."""
@@ -63,7 +63,7 @@ def png():
 
 
 def page(**options):
-    return render(small_result(**options), title="run.log", command="uwblite map run.log --out map/", grid_png=png())
+    return render(small_result(**options), Heading("run.log", "uwblite map run.log --out map/"), png())
 
 
 def test_everything_that_belongs_in_it_is_there():
@@ -81,7 +81,7 @@ def test_everything_that_belongs_in_it_is_there():
 
 
 def test_verdict_and_map_come_first_and_how_it_was_made_last():
-    text = render(small_result(), title="run.log", command="uwblite map", lead="4 min 00 s", facts=(("sha256", "ab" * 32),))
+    text = render(small_result(), Heading("run.log", "uwblite map", "4 min 00 s", (("sha256", "ab" * 32),)))
     parts = ("<h1>", 'id="warnings"', "4 min 00 s", "<svg", 'id="anchors"', "abababab", "uwblite map<")
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
@@ -99,14 +99,14 @@ def test_every_cell_of_a_wide_table_names_its_column():
 
 def test_a_squared_height_is_shown_as_a_height():
     squared = CalibrationEstimate(UnknownKey("height2", "5C0B"), 0.09, 0.08, "m2", "squared height", "estimated")
-    text = render(replace(small_result(), calibration=(squared,)), title="a", command="b")
+    text = render(replace(small_result(), calibration=(squared,)), Heading("a", "b"))
     assert "height of anchor 5C0B above or below the tag</td>" in text
     assert ">0.30 m, below 0.50 m</td>" in text
 
 
 def test_figures_of_stages_have_words():
     figures = {"keyframes": 186, "searched": 0, "used": 0, "alike": [1.0, 1.5], "shift": [1, 2], "converged": True}
-    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), title="a", command="b")
+    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), Heading("a", "b"))
     assert ">186 keyframes</td>" in text
 
 
@@ -128,7 +128,7 @@ def test_marked_ranges_are_those_that_disagree():
 def test_rejected_closures_are_counted_by_outcome():
     result = small_result()
     more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
-    text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
+    text = render(replace(result, closures=(*result.closures, *more)), Heading("a", "b"))
     assert re.search(f">{OUTCOMES['few-matches']}</td><td[^>]*>5</td>", text)
     assert "only 12% of its points" in text
 
@@ -143,20 +143,20 @@ def test_text_of_a_log_stays_text():
     evil = page(evil=EVIL)
     assert EVIL not in evil
     assert Page(evil).tags.count("script") == Page(page()).tags.count("script") == 1
-    titled = render(small_result(), title=EVIL, command=EVIL, facts=((EVIL, EVIL),))
+    titled = render(small_result(), Heading(EVIL, EVIL, facts=((EVIL, EVIL),)))
     assert Page(titled).tags.count("script") == 1
 
 
 def test_same_result_same_bytes_unless_timings_are_asked_for():
     assert page(seconds=1.0) == page(seconds=2.0)
-    one, two = (render(small_result(seconds=s), title="a", command="b", timings=True) for s in (1.0, 2.0))
+    one, two = (render(small_result(seconds=s), Heading("a", "b"), timings=True) for s in (1.0, 2.0))
     assert one != two
     assert "seconds" in one
 
 
 def test_works_without_lidar_and_without_radio():
     bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), findings=())
-    text = render(bare, title="a", command="b")
+    text = render(bare, Heading("a", "b"))
     assert "No warnings." in text
     assert "<image" not in text
 
@@ -187,7 +187,7 @@ def test_an_unplaced_anchor_is_listed_and_not_drawn():
     lost = replace(
         result.anchors[0], id="lost", position=np.full(2, np.nan), covariance=np.full((2, 2), np.nan), status="unplaced"
     )
-    text = render(replace(result, anchors=(*result.anchors, lost)), title="a", command="b")
+    text = render(replace(result, anchors=(*result.anchors, lost)), Heading("a", "b"))
     assert "unplaced" in text
     assert "nan" not in text
     assert text.count("<ellipse") == 2
@@ -264,6 +264,6 @@ def test_kept_and_rejected_closures_are_distinguished():
 def test_the_name_of_an_anchor_at_the_edge_has_room():
     result = small_result()
     far = replace(result.anchors[0], position=np.array([500.0, 0.0]))
-    text = render(replace(result, anchors=(far,)), title="run.log", command="uwblite", grid_png=None)
+    text = render(replace(result, anchors=(far,)), Heading("run.log", "uwblite"))
     x, _, width, _ = map(float, re.search(r'id="map-view" viewBox="([^"]*)"', text)[1].split())
     assert x + width > 500.0 + 0.1 * width

@@ -42,6 +42,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "refused": _of("odometry-alone"),
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
+        "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
         "made-up-stamps": _TIMES,
         "stamps-of-receipt": _TIMES,
@@ -75,7 +76,12 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
 """By the kind of a cause, the kinds that it explains; a cause stands before those causes that it explains."""
 _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
     {
-        "radio": _of(_TIMES, _BY_RANGES, "carried spikes few-in-reach few-ranges no-ranges untied-parts odometry-alone"),
+        "radio": _of(
+            _TIMES,
+            _BY_RANGES,
+            "ranges-outside-odometry worse-than-parts range-scatter carried spikes few-in-reach few-ranges no-ranges",
+            "untied-parts odometry-alone",
+        ),
         "lidar": _of(_TIMES, _BY_SCANS, _PLACES, "wheels-against-lidar carried no-lidar range-scatter path-displaced"),
     }
 )

@@ -97,9 +97,8 @@ def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Boo
 def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find steps of the odometry that the map contradicts far beyond their noise, whatever that was estimated to be.
 
-    With a lidar the wheels slipped and the map followed, which is good to know, unless neither scans nor ranges tie both sides
-    of such steps. Without one, a robust kernel lets one step absorb the errors of many, and the map looks as if the robot had
-    been carried.
+    Where scans tie both sides of such steps, the wheels slipped and the map followed: good to know. Where ranges alone do, a
+    robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
     wheels, recordings = estimate.odometry, task.recordings
     if not len(wheels):
@@ -107,7 +106,7 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     whitened = wheels.residuals(estimate.graph)
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
     off = np.where(measured, np.abs(whitened).max(axis=1), 0.0)
-    far, stretch = off > _JUMP, _stretch(off > _SUDDEN)
+    far, stretch = np.flatnonzero(off > _JUMP), _stretch(off > _SUDDEN)
     if stretch is not None:
         lidar = recordings.have_scans
         why = "the wheels slipped, and the map does not follow them" if lidar else "they slipped, or ranges or clocks are wrong"
@@ -116,15 +115,18 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         text = f"between t = {start:.0f} and {end:.0f} s most steps of the wheels contradict the map beyond their noise: {why}"
         found = (warning if lidar else doubt)("odometry-steps", text, start=start, end=end)
         yield between_keyframes(found, recordings, span)
-        far[stretch[0] : stretch[1] + 1] |= off[stretch[0] : stretch[1] + 1] > _SUDDEN
+        measured[stretch[0] : stretch[1] + 1] &= off[stretch[0] : stretch[1] + 1] < _SUDDEN
     if recordings.have_scans:
-        yield from _loose_links(measured & ~far, estimate, recordings)
-    elif estimate.placed.any() and (off > _JUMP).any():
-        yield _slips(np.flatnonzero(off > _JUMP), whitened, wheels, recordings)
+        measured[far] = False
+        loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
+        far = np.intersect1d(far, loose)
+        yield from _loose_links(np.setdiff1d(loose, far) if estimate.placed.any() else loose, estimate, recordings)
+    if estimate.placed.any() and len(far):
+        yield _slips(far, whitened, wheels, recordings)
 
 
 def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Recordings) -> Finding:
-    """Return the finding on single steps (s,) that are far off by the ranges, where no lidar measures them instead."""
+    """Return the finding on single steps (s,) that are far off by the ranges, where no scans tie their sides."""
     off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at]))
     when = listed([seconds(recordings, k) for k in wheels.i[at].tolist()])
     way, turn = float(np.hypot(off[:, 0], off[:, 1]).max()), float(off[:, 2].max())
@@ -146,13 +148,13 @@ def _stretch(off: Bools) -> tuple[int, int] | None:
     return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
 
 
-def _loose_links(sound: Bools, estimate: Estimate, recordings: Recordings) -> Iterator[Finding]:
-    """Doubt a map with a break of the odometry (e,) across which scans leave a direction free, as along a bare wall.
+def _loose_links(loose: Ints, estimate: Estimate, recordings: Recordings) -> Iterator[Finding]:
+    """Doubt a map with steps (l,) that no odometry measured and scans leave free in a direction, as along a bare wall.
 
     Ranges connect the parts before and after, unless those of half of the anchors contradict the map in one of them.
     """
     wheels, stamps = estimate.odometry, recordings.stamps
-    links = wheels.j[untied_breaks(wheels, estimate.graph, sound, recordings.path)]
+    links = wheels.j[loose]
     if estimate.placed.any() and estimate.ranges is not None:
         links = _contradicted_by_ranges(links, estimate.graph, estimate.ranges)
     at = (stamps[links - 1] - stamps[0]).tolist()

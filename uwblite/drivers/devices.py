@@ -135,7 +135,7 @@ def _scip(options: Values, setup: Setup) -> Driver:
     steps = options["steps"]
     first, _, last = steps.partition(":")
     if steps and not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= 9999):
-        raise ConfigError(f"--lidar scip: steps={steps} is not two steps such as 128:640")
+        raise ConfigError(f"scip: steps={steps} is not two steps such as 128:640")
     start, end = (int(first), int(last)) if steps else (None, None)
     request = ScanRequest(start, end, options["cluster"], options["skip"], wide=not options["narrow"])
     return ScipDriver(request, options["baud"], stream=setup.stream)

@@ -7,6 +7,7 @@ request and reply.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -54,11 +55,11 @@ class ScipDriver(ScipUnit):
         self._scans, self._stream = request or ScanRequest(), stream
         self._rates_tried: set[int] = set()
         self._rounds = 0
-        self._series = Continuity(_follows, summed=True)
+        self._series = Continuity(_follows, "scan whose time", summed=True)
 
     def stop(self) -> list[Action]:
         """Return what switches the laser off and ends the stream."""
-        return [*[Corrupt(b"", "scan whose time nothing confirmed")] * len(self._series.waiting), Send(b"QT\n")]
+        return [*self._series.unconfirmed(), Send(b"QT\n")]
 
     def script(self) -> Script[None]:
         """Find the unit, learn who it is, and read scans; begin again when none come."""
@@ -102,7 +103,7 @@ class ScipDriver(ScipUnit):
                 good, why, self._rounds = self.now, "", 0
                 durations.append(self.now - event.stamp)
                 until = self.now + max(SCAN_PATIENCE, 10 * self.period, 3 * durations[-1])
-                yield from self._scan(event)
+                yield from self._series.confirmed(event, 1, self._timed)
                 if len(durations) == 2 and (yield from self._fit_line(min(durations))):
                     return ""
             elif isinstance(event, Reply) and event.command[0] == "M":
@@ -172,15 +173,8 @@ class ScipDriver(ScipUnit):
             return True
         return False
 
-    def _scan(self, scan: Distances) -> Script[None]:
-        """Log scans. One whose time leaps, and the first, count only if the next one goes on from it."""
-        passed, dropped = self._series.take(scan, 1)
-        for _ in dropped:
-            yield Corrupt(b"", "scan whose time leaps away and back")
-        for taken in passed:
-            yield from self._timed(taken)
-
-    def _timed(self, scan: Distances) -> Script[None]:
+    def _timed(self, scan: Distances) -> Iterator[Action]:
+        """Log a scan. One whose time leaps, and the first, count only if the next one goes on from it."""
         reading = self._clock.read(scan.time + TRUNCATION, scan.stamp)
         if reading.reset:
             yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts again")

@@ -139,7 +139,7 @@ class LineDriver(Driver, ABC):
         super().__init__(protocol, title)
         self.baud, self.clock, self.health = baud, clock, LinkHealth()
         self._unit = unit
-        self._series = Continuity(self.follows)
+        self._series = Continuity(self.follows, "line that")
 
     def spacing(self, event: Line | Corrupt) -> float | None:
         """Return that the time between two lines without a time of their own is learnt."""
@@ -158,9 +158,7 @@ class LineDriver(Driver, ABC):
 
     def take(self, event: Line) -> list[Action]:
         """Turn a line into what was measured. One that leaps counts only if the next one goes on from it."""
-        passed, dropped = self._series.take(event, WITNESSES[self.health.is_damaged(event.stamp)])
-        given_up: list[Action] = [Corrupt(b"", "line that leaps away and back")] * len(dropped)
-        return [*given_up, *(action for line in passed for action in self.measured(line))]
+        return self._series.confirmed(event, WITNESSES[self.health.is_damaged(event.stamp)], self.measured)
 
     @abstractmethod
     def measured(self, line: Line) -> list[Action]:
@@ -189,4 +187,4 @@ class LineDriver(Driver, ABC):
 
     def stop(self) -> list[Action]:
         """Return Corrupt for lines that nothing confirmed."""
-        return [Corrupt(b"", "line that nothing confirmed")] * len(self._series.waiting)
+        return self._series.unconfirmed()

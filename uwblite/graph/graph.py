@@ -244,9 +244,9 @@ def edge_cost(edges: Edges, residuals: Floats) -> float:
     return float(np.sum(rho * edges.own_weights))
 
 
-def edge_costs(graph: Graph, linearized: Sequence[Linearization]) -> list[float]:
-    """Return the same of each kind of a graph's edges, linearised at its estimates."""
-    return [edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True)]
+def linearized_cost(graph: Graph, linearized: Sequence[Linearization]) -> float:
+    """Return the same of all edges of a graph, linearised at its estimates."""
+    return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
 
 
 def kernel_weights(edges: Edges, residuals: Floats) -> Floats:

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
-from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import SolverError
 from .eliminated import Blocks, WithBlocks
@@ -83,8 +82,6 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
 
 _MET_AT_ONCE = 1 << 14
 """Rows of a table of common errors in memory at once."""
-_AT_ONCE = 300
-"""Right-hand sides solved together; bounds the memory."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
 
@@ -198,26 +195,6 @@ class Marginals:
         # In undetermined directions the covariance is rounding error.
         return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
 
-    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
-        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
-        return relative_covariances(self._graph, i, j, self.covariances.poses[i], self.covariances.poses[j], self._cross(i, j))
-
-    def _cross(self, i: Ints, j: Ints) -> Floats:
-        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the smaller set."""
-        if len(np.unique(i)) < len(np.unique(j)):
-            return self._cross(j, i).transpose(0, 2, 1)
-        number = self.unknowns.number["poses"]
-        cross = np.zeros((len(i), 3, 3))
-        sources = np.unique(j)
-        for first in range(0, len(sources), _AT_ONCE // 3):
-            part = sources[first : first + _AT_ONCE // 3]
-            here = np.nonzero((j >= part[0]) & (j <= part[-1]))[0]
-            columns = self.columns(number[part].ravel())
-            at = 3 * np.searchsorted(part, j[here])[:, None, None] + np.arange(3)
-            cross[here] = columns[number[i[here]][:, :, None], at]
-        return cross
-
     def solve(self, right: Floats) -> Floats:
         """Return H^-1 times right (size, m)."""
         return np.asarray(self._factor.solve(right))
@@ -229,14 +206,6 @@ class Marginals:
         right[-1] = 0.0
         right[:-1] = self._factor.solve(right[:-1])
         return right
-
-
-def relative_covariances(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
-    """Return the covariances (m, 3, 3) of between(X_i, X_j) by the poses' own and mutual ones."""
-    by_i, by_j = se2.between_jacobians(graph.poses[i], graph.poses[j])
-    mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
-    own = by_i @ of_i @ by_i.transpose(0, 2, 1) + by_j @ of_j @ by_j.transpose(0, 2, 1)
-    return own + mixed + mixed.transpose(0, 2, 1)
 
 
 def factor_of(normal: NormalEquations, further: Blocks | None = None) -> SuperLU | WithBlocks:

@@ -103,7 +103,7 @@ class LogReader:
     def feed(self, block: bytes) -> None:
         """Take a block of whole lines."""
         found = Block.of(block)
-        gaps = found.gaps
+        block, gaps = found.text, found.gaps
         ends = gaps[found.array[gaps] == 10]
         starts = np.concatenate([[0], ends[:-1] + 1])
         line_numbers, count = self.lines + 1 + np.arange(len(starts)), len(starts)

@@ -1,6 +1,7 @@
 """The laser messages of a CARMEN log: found line by line, their readings decoded for a whole block of lines at a time."""
 
 import math
+import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -35,8 +36,6 @@ class Pending:
     number: int
     first: int
     """Index into the gaps of the gap behind the first reading."""
-    readings: Floats | None
-    """Readings, where they were read the general way."""
     stamp: float
 
 
@@ -53,7 +52,9 @@ class Block:
 
     @staticmethod
     def of(text: bytes) -> "Block":
-        """Return the block of a text."""
+        """Return the block of a text, its words parted by single blanks."""
+        if b"  " in text or b"\t" in text:
+            text = re.sub(rb"(?<=[^\n])[ \t]+", b" ", text)
         array = np.frombuffer(text, dtype=np.uint8)
         return Block(text, array, np.flatnonzero(array <= 32))
 
@@ -63,21 +64,16 @@ class Block:
         first = np.array([p.first for p in pending], dtype=np.intp)
         begins, ends = self.gaps[np.maximum(first - 1, 0)] + 1, self.gaps[first + beams - 1]
         values = np.empty((len(pending), beams), dtype=np.float32)
-        quick = np.array([p.readings is None for p in pending])
+        word = self.text[begins[0] : self.gaps[first[0]]]
+        width, decimals = len(word), len(word) - 1 - word.find(b".")
+        quick = (ends - begins == beams * (width + 1) - 1) & (1 <= decimals <= 6) & (decimals + 2 <= width <= 9)
         if quick.any():
-            one = int(np.argmax(quick))
-            word = self.text[begins[one] : self.gaps[first[one]]]
-            width, decimals = len(word), len(word) - 1 - word.find(b".")
-            quick &= (ends - begins == beams * (width + 1) - 1) & (1 <= decimals <= 6) & (decimals + 2 <= width <= 9)
-            if quick.any():
-                values[quick], quick[quick] = decode_equal_widths(self.array, begins[quick], beams, width, decimals)
+            values[quick], quick[quick] = decode_equal_widths(self.array, begins[quick], beams, width, decimals)
         for row in np.flatnonzero(~quick):
-            readings = pending[row].readings
             try:
-                if readings is None:
-                    readings = np.array(self.text[begins[row] : ends[row]].split(), dtype=np.float64)
-                    if len(readings) != beams:
-                        raise BrokenLine("readings are parted unevenly")
+                readings = np.array(self.text[begins[row] : ends[row]].split(), dtype=np.float64)
+                if len(readings) != beams:
+                    raise BrokenLine("readings are parted unevenly")
                 values[row] = np.clip(readings, -1.0, 1e30)
             except ValueError as error:
                 errors[row] = error
@@ -162,34 +158,15 @@ class LaserMessages:
                 return
             self._kind = name
             self._scans, self._poses, self._pose_lines, self._layouts = {}, array("d"), array("q"), {}
-        try:
-            self._take_evenly_spaced(name, number, start, end, gap)
-        except ValueError:
-            self._take_any(name, number, self._block.text[start:end].split())
-
-    def _take_evenly_spaced(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
-        """Take a line whose words are parted by single blanks, leaving the readings undecoded."""
-        gaps, head = self._block.gaps, gap + HEAD[name] - 1
-        if head >= len(gaps) or gaps[head] >= end:
-            raise BrokenLine("too short")
-        layout = self._layout(name, self._block.text[start : gaps[head]])
+        text, gaps, what, head = self._block.text, self._block.gaps, name.decode(), gap + HEAD[name] - 1
+        if head >= len(gaps) or gaps[head] > end:
+            raise BrokenLine(f"{what} has {len(text[start:end].split())} fields, far too few")
+        layout = self._layout(name, text[start : gaps[head]])
         last = head + layout.beams
         if last >= len(gaps) or gaps[last] >= end:
-            raise BrokenLine("too short")
-        stamp = self._tail(name, number, self._block.text[gaps[last] + 1 : end].split())
-        self._queue(layout, Pending(number, head + 1, None, stamp))
-
-    def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
-        """Take a line the general way."""
-        what, head = name.decode(), HEAD[name]
-        if len(tokens) < head:
-            raise BrokenLine(f"{what} has {len(tokens)} fields, far too few")
-        layout = self._layout(name, b" ".join(tokens[:head]))
-        if len(tokens) <= head + layout.beams:
             raise BrokenLine(f"{what} announces {layout.beams} readings but the line is too short for them")
-        readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
-        stamp = self._tail(name, number, tokens[head + layout.beams :])
-        self._queue(layout, Pending(number, 0, readings, stamp))
+        stamp = self._tail(name, number, text[gaps[last] + 1 : end].split())
+        self._queue(layout, Pending(number, head + 1, stamp))
 
     def _queue(self, layout: Layout, pending: Pending) -> None:
         scans = self._scans.get(layout) or self._scans.setdefault(layout, _Scans())

@@ -147,7 +147,7 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     kind = format_of(path)
     scan_message = bag[0].scan if bag is not None and kind not in ("bag", "csv") else ""
     if bag is not None and kind != "bag" and (bag[1] or bag[0] != type(bag[0])(scan=scan_message)):
-        raise ConfigError(f"{path} is no ROS bag: --uwb-mapping and the topics are for bags")
+        raise ConfigError(f"{path} is no ROS bag: `mappings` and the topics are for bags")
     if kind == "csv":
         from .csv_folder import read_csv_folder
 
@@ -182,7 +182,7 @@ _TABLES = (
 )
 _NO_RECORDING = {
     "isam": "is a pose graph of iSAM, no recording: uwblite optimize says how to write it",
-    "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ --to csv), to which"
+    "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ `to=csv`), to which"
     " ranges.csv (stamp,anchor,range,quality) and scans.csv may be added; uwblite evaluate compares with it",
     "kitti": "is a trajectory without times, no recording",
     "rawlog": f"is a binary rawlog of MRPT, which is not read: rawlog-edit exports odometry and scans as text; {_TABLES}",
@@ -242,4 +242,4 @@ def refuse_existing(force: bool, *paths: str | None) -> None:
     """Refuse to replace what is there, unless forced."""
     for path in paths:
         if path and os.path.exists(path) and not force and os.path.isfile(path):
-            raise ConfigError(f"{path} exists; use --force to replace it, or another name")
+            raise ConfigError(f"{path} exists; use `force` to replace it, or another name")

@@ -59,9 +59,13 @@ _LAYOUTS = {
     "EDGE2": Layout(2, 9, places=3),
 }
 _TAGS = {
-    "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY", "pose_prior": "EDGE_PRIOR_SE2", "landmark_prior": "EDGE_PRIOR_XY",
-    "range": "EDGE_RANGE_SE2_XY", "pose_range": "EDGE_RANGE_SE2",
-}  # fmt: skip
+    "relative": "EDGE_SE2",
+    "observation": "EDGE_SE2_XY",
+    "pose_prior": "EDGE_PRIOR_SE2",
+    "landmark_prior": "EDGE_PRIOR_XY",
+    "range": "EDGE_RANGE_SE2_XY",
+    "pose_range": "EDGE_RANGE_SE2",
+}
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
 

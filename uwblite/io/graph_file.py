@@ -28,10 +28,14 @@ _NONE = np.zeros(0, dtype=np.intp)
 
 
 ENDS = {
-    "relative": ("pose", "pose"), "observation": ("pose", "landmark"), "range": ("pose", "landmark"),
-    "pose_range": ("pose", "pose"), "landmark_range": ("landmark", "landmark"), "pose_prior": ("pose",),
+    "relative": ("pose", "pose"),
+    "observation": ("pose", "landmark"),
+    "range": ("pose", "landmark"),
+    "pose_range": ("pose", "pose"),
+    "landmark_range": ("landmark", "landmark"),
+    "pose_prior": ("pose",),
     "landmark_prior": ("landmark",),
-}  # fmt: skip
+}
 """What the text formats can say, and between what: the pose of one in the other, a landmark's position in a pose, distances,
 and where a pose or a landmark is."""
 WIDTHS = {"relative": 3, "pose_prior": 3, "observation": 2, "landmark_prior": 2}

@@ -50,9 +50,14 @@ _LAYOUTS = {
     "EDGE_RANGE": Layout(2, 2, stamped=True, places=1),
 }
 _TAGS = {
-    "pose_prior": "VERTEX_SE2:PRIOR", "landmark_prior": "VERTEX_XY:PRIOR", "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY",
-    "range": "EDGE_RANGE", "pose_range": "EDGE_RANGE", "landmark_range": "EDGE_RANGE",
-}  # fmt: skip
+    "pose_prior": "VERTEX_SE2:PRIOR",
+    "landmark_prior": "VERTEX_XY:PRIOR",
+    "relative": "EDGE_SE2",
+    "observation": "EDGE_SE2_XY",
+    "range": "EDGE_RANGE",
+    "pose_range": "EDGE_RANGE",
+    "landmark_range": "EDGE_RANGE",
+}
 """In the order of the file."""
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 

@@ -166,36 +166,39 @@ class PictureAnchor:
     """It does not stand there yet."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """What is drawn on a map besides the path."""
+
+    anchors: Sequence[PictureAnchor] = ()
+    """Positions that are not finite are left out."""
+    closures: Floats | None = None
+    """(c, 4) x, y, x, y of the two poses of each accepted loop closure, m."""
+    doubted: Sequence[Floats] = ()
+    """(n, 2) x, y along each stretch of the path that is not to be trusted, m."""
+
+
 def draw_map(
     grid: OccupancyGrid | None,
     trajectory: Floats,
+    overlay: Overlay = Overlay(),
     *,
-    anchors: Sequence[PictureAnchor] = (),
-    closures: Floats | None = None,
-    doubted: Sequence[Floats] = (),
     caption: str = "",
     size: int = 1400,
     colours: Image | None = None,
 ) -> Image:
-    """Draw a map.
+    """Draw a map; return it as (height, width, 3) red, green, blue, row 0 and largest y on top.
 
     Parameters
     ----------
     grid : cells; None = none were mapped.
     trajectory : (n, 2 or more) x, y of the base, m, map frame; a row of nan parts recordings,
         which have colours of their own.
-    anchors : those to draw; positions that are not finite are left out.
-    closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
-    doubted : (n, 2) x, y along each stretch of the path that is not to be trusted, m.
     size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
     colours : (rows, cols, 3) of the cells; None = `shaded`.
-
-    Returns
-    -------
-    (height, width, 3) red, green, blue; row 0 on top, largest y on top.
     """
     path, size = trajectory[:, :2], max(size, _SMALLEST)
-    placed = [a for a in anchors if np.isfinite(a.position).all()]
+    placed, closures = [a for a in overlay.anchors if np.isfinite(a.position).all()], overlay.closures
     low, high = _extent(grid, path, placed)
     resolution = grid.geometry.resolution if grid is not None else max(float((high - low).max()) / size, 1e-3)
     scale = _pixels_per_metre(float((high - low).max()), resolution, size)
@@ -203,7 +206,7 @@ def draw_map(
     width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
     tracks = _recordings(path)
     keys = _legend(len(tracks), placed, closures)
-    keys += [Key("not to be trusted", DOUBTED, "line")] if doubted else []
+    keys += [Key("not to be trusted", DOUBTED, "line")] if overlay.doubted else []
     image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
@@ -219,7 +222,7 @@ def draw_map(
         canvas.lines(ends, 1.3, ACCEPTED, 0.75)
     for number, track in enumerate(map(pixel, tracks)):
         _draw_track(canvas, track, PATHS[number % len(PATHS)])
-    for stretch in doubted:
+    for stretch in overlay.doubted:
         canvas.polyline(pixel(stretch), 6.0, DOUBTED, 0.6)
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)
