@@ -227,7 +227,7 @@ def require_type(value: Any, name: str, kind: type, what: str = "") -> None:
     """Raise DataError where an argument is of another type; what: the type in words, where its own name is none."""
     if not isinstance(value, kind):
         wanted = what or kind.__name__
-        raise DataError(f"{name} must be {'an' if wanted[0] in 'AEIOU' else 'a'} {wanted}, not {_described(value)}")
+        raise DataError(f"{name} must be {'an' if wanted[0] in 'AEIO' else 'a'} {wanted}, not {_described(value)}")
 
 
 def _described(value: Any) -> str:
