@@ -23,14 +23,14 @@ class Frame:
     number: int
 
 
-def passed(arrivals, spacing, others=()):
+def passed(arrivals, spacing, others=(), members=lambda number: ()):
     """Return the frames, in the order in which they pass, of these arrivals, s; and when each passed."""
     backlog, out, times = Backlog(), [], []
     for number, now in enumerate(arrivals):
         while (due := backlog.deadline()) is not None and due < now:
             out += (ready := backlog.due(due))
             times += [due] * len(ready)
-        ready = backlog.take(Frame(now, number), now, spacing)
+        ready = backlog.take(Frame(now, number), now, spacing, members(number))
         if number in others:
             ready += backlog.take("other", now, None)
         out, times = out + ready, times + [now] * len(ready)
@@ -87,6 +87,11 @@ def test_rounds_that_come_as_several_lines_are_no_pause_and_fill_one():
     assert [frame.stamp for frame in out] == pytest.approx(sent)
     out, _ = passed(held(sent, 20.05, 22.05), 0.0)
     assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.11
+    # With the anchors of the lines each stands in its round; that one of them is missing now and then changes nothing.
+    for lines in (range(1200), [k for k in range(1200) if k % 4 or k % 12]):
+        times = [sent[k] + 0.01 * (k % 4) for k in lines]
+        out, _ = passed(held(times, 20.05, 26.05), 0.0, members=lambda number, lines=lines: (f"A{lines[number] % 4}",))
+        assert max(abs(frame.stamp - time) for frame, time in zip(out, times, strict=True)) < 0.015
 
 
 def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
@@ -121,13 +126,14 @@ def test_a_base_loses_nothing_in_a_pause_and_did_not_restart(kind, seconds, what
         assert abs(pose.x - true[1]) + abs(pose.y - true[2]) < 0.03
 
 
-@pytest.mark.parametrize("board", ["makerfabs-at", "bu03"])
+@pytest.mark.parametrize("board", ["makerfabs", "bu01", "makerfabs-at", "bu03"])
 def test_rounds_of_a_board_without_a_clock_stand_at_their_times(board):
     clock, sent = WorldClock(), []
     clock.start(1000.0)
     device = UwbBoard(RoomWorld().epochs(), clock, BOARDS[board], lambda t, rows: sent.append(t))
     actions, _ = simulate(open_device("uwb", f"{board}:port")[0].driver, device, 30.0, stop=(15.0, 6.0))
     stamps = [epoch.stamp for epoch in of_kind(actions, RangeEpoch)]
-    assert len(stamps) >= len(sent) - 2
+    assert len(set(stamps)) >= len(sent) - 2
     assert max(min(abs(stamp - time) for time in sent) for stamp in stamps) < 0.02
-    assert min(b - a for a, b in itertools.pairwise(stamps)) > 0.05
+    if board in ("makerfabs-at", "bu03"):  # one line a round
+        assert min(b - a for a, b in itertools.pairwise(stamps)) > 0.05

@@ -12,7 +12,7 @@ from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
 from uwblite.lidar.scan_to_scan import TrackingConfig, descend, follow, reattached
-from uwblite.odometry.slips import EVERY, LASTS, SoundWheels
+from uwblite.odometry.slips import EVERY, LASTS
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -26,14 +26,13 @@ def odometry_steps(truth, clouds, stated):
 
 def tracked(truth, clouds, stated, by_ranges=None):
     """Return the scan odometry of a chain whose odometry reports the steps said (k - 1, 3)."""
-    wheels = replace(chained(truth, NOISE), motion=stated)
+    wheels = replace(chained(truth, NOISE), motion=stated, slips=by_ranges)
     poses = [truth[0]]
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    sound = SoundWheels(wheels, by_ranges)
-    return follow(clouds, raster, sound, Graph(np.array(poses)), steps, GATE, TrackingConfig())
+    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, TrackingConfig())
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,22 @@ from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
+from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.slips import with_slips
 from uwblite.odometry.wheels import (
     OdometryNoiseConfig,
     _independent,
     _neighbours,
     _scale,
     drift_time,
+    redundancy,
     reestimate_wheel_noise,
     sideways_priors,
     turn_scales,
+    variance_factors,
     wheel_edges,
 )
 from uwblite.sensor_log import Odometry
@@ -94,6 +98,58 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
     few = RelativePoseEdges(some[:5], some[:5] + 1, steps_measured[:5], steps.sqrt_information[:5])
     assert reestimate_wheel_noise(wheels, few, graph) is wheels
+
+
+def ranged(seed, times, steps=300):
+    """Return the optimum of wheels whose noise is so many times (3,) the assumed one, and of ranges to four known anchors."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 2.0 * steps)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    exact = wheel_edges(frames, replace(NOISE, kernel=SQUARED), Calibration())
+    noise = rng.standard_normal((len(exact), 3)) * times / np.einsum("eii->ei", exact.sqrt_information)
+    wheels = replace(exact, motion=exact.motion + noise)
+    poses, anchors = frames.odometry, np.array([[-20.0, -20.0], [20.0, -20.0], [20.0, 20.0], [-20.0, 25.0]])
+    pose, anchor = (each.ravel() for each in np.meshgrid(np.arange(len(poses)), np.arange(4), indexing="ij"))
+    none, sigma = np.zeros((len(pose), 2)), np.full(len(pose), 0.02)
+    measured = np.hypot(*(poses[pose, :2] - anchors[anchor]).T) + rng.normal(0.0, sigma)
+    ranges = RangeEdges(pose, anchor, measured, sigma, none, 0.0 * sigma, none, np.zeros(2), 0.0 * sigma,
+                        np.full((len(pose), 6), -1))  # fmt: skip
+    graph = Graph(poses, anchors, (wheels, ranges), fixed_anchors=np.ones(4, dtype=bool))
+    return optimize(graph)[0], exact
+
+
+def test_redundancy_of_wheels_is_the_trace_of_what_ranges_show_of_them():
+    graph, _ = ranged(1, np.ones(3), steps=60)
+    wheels, lin = graph.edges[0], [edges.linearize(graph) for edges in graph.edges]
+    jacobian = np.zeros((sum(each.residuals.size for each in lin), 3 * len(graph.poses)))
+    row = 0
+    for each in lin:
+        for name, index, columns in each.blocks:
+            for e, (pose, part) in enumerate(zip(index, columns, strict=True)):
+                if name == "poses":
+                    first = row + e * part.shape[0]
+                    jacobian[first : first + part.shape[0], 3 * pose : 3 * pose + 3] += part
+        row += each.residuals.size
+    own = jacobian[: 3 * len(wheels)]
+    left = 1.0 - np.einsum("ri,ij,rj->r", own, np.linalg.inv(jacobian.T @ jacobian), own)
+    expected = left.reshape(-1, 3).sum(axis=0)
+    assert redundancy(graph, wheels, np.ones(len(wheels))) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("times", [(1.0, 1.0, 1.0), (3.0, 1.0, 1.0), (1.0, 2.0, 4.0), (0.6, 1.0, 0.6)])
+def test_ranges_show_the_noise_of_wheels(times):
+    """From any assumption, round by round; wheels that slip a few times, and are known to, are not noisy for that."""
+    graph, exact = ranged(2, np.array(times))
+    wheels, ranges = graph.edges
+    slips = np.zeros(len(wheels))
+    slips[::25] = 1.0
+    slipping = replace(wheels, motion=wheels.motion + slips[:, None] * [0.3, 0.0, 0.5])
+    factors = np.ones(3)
+    for _ in range(10):
+        own = replace(slipping, sqrt_information=exact.sqrt_information / np.sqrt(factors))
+        graph = optimize(replace(graph, edges=(with_slips(own, slips), ranges)))[0]
+        factors = variance_factors(graph, graph.edges[0], 1.0 - slips, factors)
+    assert np.sqrt(factors) == pytest.approx(times, rel=0.2)
 
 
 def test_errors_that_telescope_are_not_the_wheels():

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from helpers.planted import odometry, ranges, wander
 from helpers.planted_graphs import plain_ranges, random_poses
 
@@ -19,7 +20,18 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.joining import Places, _laid_on, _one_bootstrap, _one_graph, agreement, fitted, join, places_of, together
+from uwblite.pipeline.joining import (
+    Places,
+    _laid_on,
+    _one_bootstrap,
+    _one_graph,
+    _one_odometry,
+    agreement,
+    fitted,
+    join,
+    places_of,
+    together,
+)
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
@@ -55,6 +67,16 @@ def test_anchors_of_one_recording_alone_keep_what_it_says_and_none_is_no_bootstr
     assert joined.hypotheses == (("two",), (), ("one",))
     assert (joined.placed.tolist(), joined.ambiguous.tolist()) == ([True, False, True], [False, False, True])
     assert _one_bootstrap(estimates[1:2], [np.zeros(3)], [np.zeros(0, int)], 0) is None
+
+
+def test_slips_of_one_recording_are_kept_beside_another_without():
+    """Those of steps of recordings that show none are 0."""
+    wheels = chained(np.zeros((4, 3)), (0.01, 0.01, 0.01))
+    slips, recordings = np.array([0.0, 0.7, 0.2]), SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=4)])
+    one = _one_odometry([wheels, replace(wheels, slips=slips)], [np.zeros(0, dtype=np.intp)] * 2, recordings)
+    assert one.slips.tolist() == [0.0, 0.0, 0.0, *slips]
+    assert one.i.tolist() == [0, 1, 2, 4, 5, 6]
+    assert _one_odometry([wheels] * 2, [np.zeros(0, dtype=np.intp)] * 2, recordings).slips is None
 
 
 def test_a_recording_that_nothing_lays_on_the_others_is_refused():

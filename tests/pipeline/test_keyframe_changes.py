@@ -10,7 +10,6 @@ from helpers.planted import box, ranges, recording, scans, wander
 from uwblite import se2
 from uwblite.graph.graph import PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.odometry.slips import SoundWheels, with_slips
 from uwblite.pipeline.keyframe_changes import with_keyframes
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.radio_stages import dead_reckoning
@@ -119,15 +118,11 @@ def test_pieces_of_a_step_have_its_variance_together(exact):
         np.testing.assert_allclose(pieces[first:last].sum(axis=0), whole[k], rtol=1e-4)
 
 
-def test_sound_wheels_and_their_slips_are_cut_with_the_steps(exact):
+def test_pieces_of_a_step_slip_as_it_does(exact):
     recordings, estimate = exact
     slips = np.linspace(0.0, 1.0, len(estimate.odometry))
-    sound, loose = SoundWheels(estimate.odometry, slips), with_slips(estimate.odometry, slips)
-    dense = with_keyframes(replace(estimate, odometry=loose, sound=sound), recordings, denser(recordings, CUT, 2))
+    slipping = replace(estimate, odometry=replace(estimate.odometry, slips=slips))
+    dense = with_keyframes(slipping, recordings, denser(recordings, CUT, 2))
     number = np.searchsorted(dense.recordings.stamps, recordings.stamps)
-    whole, pieces = covariances(estimate.odometry), covariances(dense.sound.edges)
     for k, (first, last) in enumerate(pairwise(number)):
-        np.testing.assert_allclose(pieces[first:last].sum(axis=0), whole[k], rtol=1e-4)
-        np.testing.assert_array_equal(dense.sound.slips[first:last], slips[k])
-    np.testing.assert_array_equal(dense.sound.edges.motion, dense.odometry.motion)
-    np.testing.assert_array_equal(dense.sound.edges.i, dense.odometry.i)
+        np.testing.assert_array_equal(dense.odometry.slips[first:last], slips[k])

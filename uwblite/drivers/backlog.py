@@ -2,12 +2,13 @@
 
 All frames of a pause arrive at its end. One that comes after a pause waits, with those behind it, until they come no faster
 than usual: the last one came at its own time, those before it at their usual distances. Where they do not fill the pause, the
-rest of it was silence.
+rest of it was silence. A round of several frames, one for each anchor, begins where one of its members comes again: rounds
+have the usual distance, and each frame its usual place in the round.
 """
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 PAUSE, LEAST_PAUSE = 3.0, 0.1
@@ -15,9 +16,22 @@ PAUSE, LEAST_PAUSE = 3.0, 0.1
 LOOK, MOST_LOOK, FAST = 4.0, 0.5, 8
 """Usual distances, at most so many s, in which fewer frames than FAST show that they come no faster than usual."""
 MEMORY, USUAL = 256, 0.9
-"""Distances that are remembered, and the share of them that is usual: a board may send the ranges of a round together."""
+"""Distances that are remembered, and the share of them that is usual."""
 MOST = 1 << 16
 """Events that wait at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """An event that waits."""
+
+    event: Any
+    spacing: float | None
+    """s, usual distance of a frame from the one before; None = it is no frame."""
+    period: float = 0.0
+    """s, usual distance of a frame's round from the one before."""
+    members: tuple[str, ...] = ()
+    """Of a round, in the frame; none = it is a round."""
 
 
 class Backlog:
@@ -27,32 +41,39 @@ class Backlog:
         self._last: float | None = None
         """s, arrival of the last frame that does not wait."""
         self._steps: deque[float] = deque(maxlen=MEMORY)
-        self._waiting: list[tuple[Any, float | None]] = []
-        """Events, and for frames their usual distances from the one before, s."""
+        self._begun, self._periods = -math.inf, deque[float](maxlen=MEMORY)
+        """s, first frame of its round, and from each round to the next."""
+        self._came: set[str] = set()
+        """Members of the round that came."""
+        self._places: dict[str, float] = {}
+        """s by which each member's frame comes after the first of its round."""
+        self._waiting: list[_Held] = []
 
-    def take(self, event: Any, now: float, spacing: float | None) -> list[Any]:
+    def take(self, event: Any, now: float, spacing: float | None, members: tuple[str, ...] = ()) -> list[Any]:
         """Return the events that need not wait at time `now`, s.
 
         Parameters
         ----------
         event : a frame has a `stamp`, the arrival of its first byte, s.
         spacing : s, usual distance from the frame before, 0 = it is to be learnt; None = the event is no frame of a stream.
+        members : of a round, which has each once, those in the frame; none = each frame is a round.
         """
         if not self._waiting and spacing is None:
             return [event]
+        held = _Held(event, None)
         if spacing is not None:
-            longest, mean = self._learnt() if spacing == 0.0 else (spacing, spacing)
+            longest, mean = _usual(self._steps) if spacing == 0.0 else (spacing, spacing)
             step = 0.0 if self._last is None else event.stamp - self._last
             if not self._waiting and (longest == 0.0 or step <= max(PAUSE * longest, LEAST_PAUSE)):
-                self._remember(event.stamp)
+                self._remember(event.stamp, members)
                 return [event]
-            spacing = mean
-        self._waiting.append((event, spacing))
+            held = _Held(event, mean, _usual(self._periods)[1] if spacing == 0.0 else spacing, members)
+        self._waiting.append(held)
         return self.due(now)
 
     def deadline(self) -> float | None:
         """Return the time at which events that wait need not do so any longer, s."""
-        frames = [(event.stamp, spacing) for event, spacing in self._waiting[-MEMORY:] if spacing is not None]
+        frames = [(held.event.stamp, held.spacing) for held in self._waiting[-MEMORY:] if held.spacing is not None]
         if not frames:
             return None
         return float(frames[-FAST:][0][0] + min(LOOK * frames[-1][1], MOST_LOOK))
@@ -65,27 +86,46 @@ class Backlog:
     def release(self) -> list[Any]:
         """Return all events that wait."""
         waiting, self._waiting = self._waiting, []
-        frames = [(event.stamp, spacing) for event, spacing in waiting if spacing is not None]
+        frames = [held for held in waiting if held.spacing is not None]
         if not frames or self._last is None:
-            return [event for event, _ in waiting]
-        length, last = sum(spacing for _, spacing in frames), frames[-1][0]
-        shrink = min(1.0, (last - self._last) / length)
-        time, events = last - shrink * length, []
-        for event, spacing in waiting:
-            if spacing is not None:
-                time += shrink * spacing
-                event = replace(event, stamp=min(event.stamp, time))
-                self._remember(event.stamp)
+            return [held.event for held in waiting]
+        # Time from the beginning of the present round, as they are sent.
+        sent, came, time = [], set(self._came), 0.0
+        for held in frames:
+            if self._begins(came, held.members):
+                time, came = time + held.period, set()
+            came.update(held.members)
+            sent.append(time + max((self._places.get(name, 0.0) for name in held.members), default=0.0))
+        last = frames[-1].event.stamp
+        shrink = min(1.0, (last - self._begun) / max(sent[-1], 1e-9))
+        times = iter(last - shrink * (sent[-1] - each) for each in sent)
+        events = []
+        for held in waiting:
+            event = held.event
+            if held.spacing is not None:
+                event = replace(event, stamp=min(event.stamp, max(next(times), self._last)))
+                self._remember(event.stamp, held.members)
             events.append(event)
         return events
 
-    def _remember(self, stamp: float) -> None:
+    def _begins(self, came: set[str], members: tuple[str, ...]) -> bool:
+        """Return whether a frame begins a round after what came of the one before."""
+        return not members or not came.isdisjoint(members)
+
+    def _remember(self, stamp: float, members: tuple[str, ...]) -> None:
         if self._last is not None:
             self._steps.append(stamp - self._last)
+        if self._last is None or self._begins(self._came, members):
+            if self._last is not None:
+                self._periods.append(stamp - self._begun)
+            self._begun, self._came = stamp, set()
+        self._came.update(members)
+        self._places.update(dict.fromkeys(members, stamp - self._begun))
         self._last = stamp
 
-    def _learnt(self) -> tuple[float, float]:
-        """Return the longest usual distance, and the mean of all that are no pause, s."""
-        longest = sorted(self._steps)[math.ceil(USUAL * len(self._steps)) - 1] if self._steps else 0.0
-        steps = [step for step in self._steps if step <= PAUSE * longest]
-        return longest, sum(steps) / max(len(steps), 1)
+
+def _usual(steps: deque[float]) -> tuple[float, float]:
+    """Return the longest usual distance, and the mean of all that are no pause, s."""
+    longest = sorted(steps)[math.ceil(USUAL * len(steps)) - 1] if steps else 0.0
+    usual = [step for step in steps if step <= PAUSE * longest]
+    return longest, sum(usual) / max(len(usual), 1)

@@ -93,6 +93,10 @@ class Driver:
         """Return how long after the one before the device sends a frame, s; None = the event is none, or has its own time."""
         return self.rhythm if self.frame is not None and isinstance(event, self.frame) else None
 
+    def members(self, event: Any) -> tuple[str, ...]:
+        """Return what a frame contains of a round that has each once, such as anchors; none = each frame is a round."""
+        return ()
+
     def script(self) -> Script[None]:
         """Hold the conversation; by default, listen."""
         while True:
@@ -174,7 +178,8 @@ class Session:
         for event in self.driver.parse(data, now):
             if not isinstance(event, Corrupt):
                 self.last_event = now
-            actions += self._handle(self._backlog.take(event, now, self.driver.spacing(event)))
+            held = self._backlog.take(event, now, self.driver.spacing(event), self.driver.members(event))
+            actions += self._handle(held)
         return actions
 
     def tick(self, now: float) -> list[Action]:

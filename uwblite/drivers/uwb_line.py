@@ -242,6 +242,11 @@ class UwbDriver(LineDriver):
         """Return the board's time, its own unit; None = there is none."""
         return content.time if isinstance(content, Ranges) else None
 
+    def members(self, event: Line | Corrupt) -> tuple[str, ...]:
+        """Return the anchors of a line: some boards print one line for each."""
+        content = event.content if isinstance(event, Line) else None
+        return tuple(f"{content.tag}/{r.anchor_id}" for r in content.readings) if isinstance(content, Ranges) else ()
+
     def measured(self, line: Line) -> list[Action]:
         """Turn a line into ranges."""
         if isinstance(line.content, Refused):

@@ -117,6 +117,8 @@ class OdometryEdges(EdgeTable):
     unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+    slips: Floats | None = None
+    """(e,) probability that the wheels slip over each step, by what is no scan; not yet in the information. None = none."""
 
     def corrected(self, graph: Graph) -> Floats:
         """Return the motion (e, 3) with the present calibration applied."""

@@ -14,6 +14,7 @@ from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
 from .carmen_stamps import LineClock, time_order
 from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
+from .interlacing import beams_lie_between
 from .readings import DEFAULT_REACH, ScanGeometry, clean, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
@@ -140,8 +141,8 @@ class LaserMessages:
         self._counts = dict.fromkeys(RANK, 0)
         self._layouts: dict[bytes, Layout] = {}
         self._scans: dict[Layout, _Scans] = {}
-        self._counted = set[Layout]()
-        """All layouts of the scans."""
+        self._between = set[Layout]()
+        """Layouts whose beams lie between those of another one."""
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
         self._pose_lines = array("q")
@@ -217,10 +218,10 @@ class LaserMessages:
         for name, count in self._counts.items():
             if count and name != self._kind:
                 skipped[name.decode()] = count
-        self._counted = set(self._scans)
         kept = max(self._scans, key=lambda layout: self._scans[layout].seen, default=None)
         if kept is None or not len(self._scans[kept].stamps):
             return None, None
+        self._between = {layout for layout in self._scans if self._lies_between(layout, params)}
         what, geometry = self._kind.decode(), self._geometry(kept, params)
         range_min = params.get("laser_range_min")
         range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
@@ -240,15 +241,25 @@ class LaserMessages:
         return laser, self._mounting(what, warnings)
 
     def _geometry(self, layout: Layout, params: Params) -> ScanGeometry:
-        """Return where the beams of messages of a layout point.
-
-        A SICK that interlaces sends scans of one beam fewer, too, and their beams lie between those of the others.
-        """
+        """Return where the beams of messages of a layout point."""
         if self._kind != b"FLASER":
             return ScanGeometry(layout.angle_min, layout.angle_increment, layout.beams)
         first, step = params.guess_scanner(layout.beams)
-        interlaced = Layout(layout.beams + 1) in self._counted
-        return ScanGeometry(first + (0.5 * step if interlaced else 0.0), step, layout.beams)
+        return ScanGeometry(first + (0.5 * step if layout in self._between else 0.0), step, layout.beams)
+
+    def _lies_between(self, layout: Layout, params: Params) -> bool:
+        """Return whether the beams of a layout lie between those of another one, as of a SICK that interlaces."""
+        longer = Layout(layout.beams + 1)
+        if self._kind != b"FLASER" or longer not in self._scans:
+            return False
+        reach = self._reach(layout, params)
+        seen, lines = [], []
+        for each in (longer, layout):
+            readings = np.array(self._scans[each].ranges).reshape(-1, each.beams)
+            with np.errstate(invalid="ignore"):
+                seen.append(np.where((readings > 0.0) & (readings < reach), readings, np.nan))
+            lines.append(np.array(self._scans[each].numbers, dtype=np.intp))
+        return beams_lie_between(seen[0], seen[1], (lines[0], lines[1]))
 
     def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""

@@ -6,7 +6,7 @@ with the possibility that the wheels slipped. A slip lasts: the evidence of all 
 wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.slips import SoundWheels, covariance_of, posterior, slip_sigma, with_slips
+from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
@@ -121,22 +121,20 @@ def descended_edges(clouds: Clouds, raster: CloudRasters, steps: Steps, config: 
 
 
 def follow(
-    clouds: Clouds, raster: CloudRasters, sound: SoundWheels, graph: Graph, steps: Steps, gate: float, config: TrackingConfig
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, config: TrackingConfig
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
     Parameters
     ----------
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
-    sound : the odometry between neighbouring keyframes; where it slipped by what is no scan weighs as much as one pair of
-        clouds. graph : holds its calibration.
-    steps : the same steps after descent, see descend. gate : reach of the raster, m.
+    wheels : edges between neighbouring keyframes; what is no scan and shows slips weighs as much as one pair of clouds.
+    graph : holds their calibration. steps : the same steps after descent, see descend.
     """
-    wheels, tight = sound.edges, min(config.gate, gate)
-    i = wheels.i
+    i, tight = wheels.i, config.gate
     good = steps.enough & (steps.share >= config.good_share)
     certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
-    noise = reestimate_wheel_noise(wheels, certain, graph)
+    noise = replace(reestimate_wheel_noise(wheels, certain, graph), slips=None)
     points, mean = pair_points(clouds, i + 1, config.points), noise.corrected(graph)
     chance = matched_by_chance(clouds, raster, i, points, mean)
     registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma, chance)
@@ -145,7 +143,7 @@ def follow(
     prior = Prior(mean, usual, usual + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
     found = registration.register(i, i + 1, points, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
-    prior_odds = 0.0 if sound.slips is None else of_fallible(np.maximum(logit(sound.slips), 0.0), RegistrationConfig.useless)
+    prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
     slips = posterior(found.log_odds + prior_odds, wheels.duration)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)

@@ -5,7 +5,7 @@ tells of its neighbours, too: the posterior of each step follows from that of al
 two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,16 +19,6 @@ EVERY, LASTS = 600.0, 2.0
 SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as
 people walk. They count at most all of their motion too much."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SoundWheels:
-    """The odometry as if its wheels did not slip, and where they did."""
-
-    edges: OdometryEdges
-    """With the noise of wheels that do not slip."""
-    slips: Floats | None = None
-    """(e,) probability of a slip over each step by what is no scan; None = nothing tells."""
 
 
 def slip_sigma(wheels: OdometryEdges) -> Floats:
@@ -107,4 +97,9 @@ def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2
     slips = 1.0 / (slip_sigma(wheels) ** 2 + 1.0 / sound)
     diagonal = np.sqrt((1.0 - probability[:, None]) * sound + probability[:, None] * slips)
-    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3))
+    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3), slips=None)
+
+
+def expected(wheels: OdometryEdges) -> OdometryEdges:
+    """Return the odometry with the slips that it is known to have in its information."""
+    return wheels if wheels.slips is None else with_slips(wheels, wheels.slips)

@@ -13,7 +13,8 @@ from .. import se2
 from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread, spread_about_median, weighted_median
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
-from ..graph.graph import Calibration, Graph
+from ..graph.graph import Calibration, Graph, edge_weights
+from ..graph.marginals import added_unknown
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.robust import Kernel
 from ..sensor_log import Odometry
@@ -100,8 +101,46 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(3)
     for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH_STEPS):
         by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
-        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, 0.1, 10.0)
+        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
+
+
+def variance_factors(graph: Graph, wheels: OdometryEdges, sound: Floats, before: Floats) -> Floats:
+    """Return the factors (3,) on the assumed variances of wheels along, across and in heading that their residuals ask for.
+
+    The squared residuals of right variances add up to the redundancy of the steps (W. Foerstner, Ein Verfahren zur Schaetzung
+    von Varianz- und Kovarianzkomponenten, 1979). The assumed variances count as much as _ASSUMED_COUNTS redundant steps.
+
+    Parameters
+    ----------
+    graph : at its optimum, with all edges. wheels : of them. sound : (e,) probability that the wheels did not slip.
+    before : (3,) factors in use.
+    """
+    squared = (edge_weights(wheels, graph) * sound) @ wheels.residuals(graph) ** 2
+    found = (_ASSUMED_COUNTS + before * squared) / (_ASSUMED_COUNTS + redundancy(graph, wheels, sound))
+    return np.asarray(np.clip(found, _LEAST_FACTOR**2, _LEAST_FACTOR**-2))
+
+
+def redundancy(graph: Graph, wheels: OdometryEdges, sound: Floats) -> Floats:
+    """Return how many (3,) of the steps along, across and in heading all other measurements of a graph show as well.
+
+    It is the trace of a matrix as large as there are steps, estimated by vectors of unrelated signs, those of chirps (M.
+    Hutchinson, A stochastic estimator of the trace, 1989).
+    """
+    phase = np.outer(np.arange(1, _PROBES + 1), np.arange(len(wheels)) ** 2) * _GOLDEN
+    shifts = np.einsum("ke,e,cd->cked", np.where(phase % 1.0 < 0.5, -1.0, 1.0), np.sqrt(sound), np.eye(3))
+    shifts = shifts.reshape(-1, len(wheels), 3)
+    return np.asarray(np.mean(added_unknown(graph, wheels, shifts)[1].reshape(3, -1) ** -2.0, axis=1))
+
+
+_PROBES = 8
+"""Vectors of signs."""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+"""Rate at which the frequency of the first chirp grows: no ratio is farther from all fractions."""
+_ASSUMED_COUNTS = 4.0
+"""Standard deviations that are assumed are right but for a factor of 1.4, as those learnt from four steps are."""
+_LEAST_FACTOR = 0.1
+"""Least factor on a standard deviation of wheels, and the inverse of the largest."""
 
 
 def _growing(off: Floats, step: Ints) -> float:

@@ -271,9 +271,14 @@ def _renamed(indices: Ints, at: Ints) -> Ints:
 
 def _one_odometry(odometry: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
     """Return the odometry edges of all recordings."""
+    slips = [np.zeros(len(own)) if own.slips is None else own.slips for own in odometry]
+    some = any(own.slips is not None for own in odometry)
     moved = [
-        replace(own, i=own.i + recording.first, j=own.j + recording.first, calibration=_renamed(own.calibration, rename))
-        for own, recording, rename in zip(odometry, recordings.each, at, strict=True)
+        replace(
+            own, i=own.i + recording.first, j=own.j + recording.first, calibration=_renamed(own.calibration, rename),
+            slips=p if some else None,
+        )
+        for own, p, recording, rename in zip(odometry, slips, recordings.each, at, strict=True)
     ]
     return moved[0].followed_by(*moved[1:])
 

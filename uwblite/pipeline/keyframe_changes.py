@@ -14,7 +14,6 @@ from ..graph.graph import Edges, PriorEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from ..odometry.attached import attach_ranges
-from ..odometry.slips import SoundWheels
 from ..odometry.wheels import drift_time
 from .estimate import Estimate
 from .recordings import Recordings
@@ -31,44 +30,32 @@ def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) ->
     before, after : the recordings with the estimate's keyframes and with the new ones: as many, or more in between.
     """
     pairs = list(zip(before.each, after.each, strict=True))
-    poses, number, odometry, sound = estimate.graph.poses, np.arange(len(before.stamps)), estimate.odometry, estimate.sound
+    poses, number, odometry = estimate.graph.poses, np.arange(len(before.stamps)), estimate.odometry
     if len(after.stamps) != len(before.stamps):
         poses = np.concatenate([old.dense_trajectory(poses, new.frames.stamps) for old, new in pairs])
         number = np.concatenate([new.first + np.searchsorted(new.frames.stamps, old.frames.stamps) for old, new in pairs])
-        origin = _origin(odometry, number, after)
-        odometry = _cut(odometry, origin, after)
-        if sound is not None:
-            sound = SoundWheels(_cut(sound.edges, origin, after), None if sound.slips is None else sound.slips[origin])
+        odometry = _cut(odometry, number, after)
     frames = [recording.frames for recording in after.each]
     motion, length = (np.concatenate([getattr(f, name) for f in frames]) for name in ("motion", "length"))
     odometry = replace(odometry, motion=motion, length=length, duration=np.concatenate([drift_time(f) for f in frames]))
-    if sound is not None:
-        sound = replace(sound, edges=replace(odometry, sqrt_information=sound.edges.sqrt_information))
     edges = tuple(_renumbered(e, number) for e in estimate.graph.edges)
     ranges = None if estimate.ranges is None else _attached(estimate.ranges, before, after)
     fixed = np.isin(np.arange(len(poses)), number[estimate.graph.fixed_poses])
     graph = replace(estimate.graph, poses=poses, edges=edges, fixed_poses=fixed)
     rejected = None if estimate.rejected is None or len(poses) != len(estimate.rejected) else estimate.rejected
-    return replace(
-        estimate, graph=graph, odometry=odometry, sound=sound, ranges=ranges, rejected=rejected, recordings=after
-    )
+    return replace(estimate, graph=graph, odometry=odometry, ranges=ranges, rejected=rejected, recordings=after)
 
 
-def _origin(odometry: OdometryEdges, number: Ints, after: Recordings) -> Ints:
-    """Return the step (e,) of the odometry of which each step between following keyframes is a piece.
+def _cut(odometry: OdometryEdges, number: Ints, after: Recordings) -> OdometryEdges:
+    """Return a step for every pair of following keyframes; those into which one was cut share its variance.
 
     Parameters
     ----------
     number : (k,) the new number of each keyframe.
     """
     begins = np.concatenate([r.first + np.arange(len(r.frames) - 1) for r in after.each])
-    return np.asarray(np.searchsorted(number[odometry.i], begins, "right") - 1, dtype=np.intp)
-
-
-def _cut(odometry: OdometryEdges, origin: Ints, after: Recordings) -> OdometryEdges:
-    """Return a step for every pair of following keyframes; the pieces of one (e,) share its variance."""
-    begins = np.concatenate([r.first + np.arange(len(r.frames) - 1) for r in after.each])
     way = np.concatenate([r.frames.path + r.frames.turned + _STANDING * r.frames.duration for r in after.each])
+    origin = np.searchsorted(number[odometry.i], begins, "right") - 1
     share = np.maximum(way / np.maximum(np.bincount(origin, way)[origin], 1e-12), 1e-6)
     pieces = odometry.rows(origin)
     root = pieces.sqrt_information / np.sqrt(share)[:, None, None]

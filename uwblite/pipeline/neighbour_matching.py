@@ -16,7 +16,6 @@ from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
-from ..odometry.slips import SoundWheels
 from ..odometry.wheels import reestimate_wheel_noise
 from ..problem.solution import rough
 from . import calibration_checks, scan_clouds
@@ -50,8 +49,14 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    estimate, track = _tracked(estimate, steps, task)
-    return _with_slips(estimate, track, task.following(estimate))
+    track, shown = _followed(estimate, steps, task), estimate.odometry.slips
+    if shown is None:
+        estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
+    else:
+        estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
+    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
+        return estimate
+    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=shown)), track, task.following(estimate))
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
@@ -98,35 +103,17 @@ def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
     Without ranges nothing judges them afterwards, and the steps as measured stay.
+
+    Parameters
+    ----------
+    estimate : its odometry has the noise of sound wheels, and the slips that ranges show.
     """
-    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
-        return replace(estimate, sound=None)
-    if estimate.sound is None:
-        estimate = replace(estimate, sound=SoundWheels(estimate.odometry))
     track = _followed(estimate, _steps(estimate, task), task)
-    cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
+    cut = _with_keyframes_where(estimate, track.slips > _LIKELY, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task), task)
-    return replace(_matched(estimate, track, task), sound=None)
-
-
-def _tracked(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, ScanOdometry]:
-    """Return the estimate with neighbours matched from measured steps, and these as edges."""
-    track = _followed(estimate, steps, task)
-    return _matched(estimate, track, task), track
-
-
-def _matched(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
-    """Return the estimate with neighbours matched; where something shows slips already, as if the wheels slipped there.
-
-    Ranges that are wrong show slips as well; where clouds measure a step, they tell.
-    """
-    if estimate.sound is None:
-        return _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
-    sound = replace(estimate.sound, edges=track.wheels)
-    estimate = replace(estimate, odometry=track.slipped, sound=sound)
-    return _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -173,10 +160,8 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
 
 def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
     """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
-    scans, config = estimate.lidar, task.config
-    sound = estimate.sound or SoundWheels(estimate.odometry)
-    gate = config.refinement.first_gate
-    return scan_to_scan.follow(scans.clouds, scans.raster, sound, estimate.graph, steps, gate, config.scan_to_scan)
+    scans, config = estimate.lidar, task.config.scan_to_scan
+    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
