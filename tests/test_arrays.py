@@ -185,8 +185,8 @@ RANGES = UwbRanges(np.arange(2.0), np.zeros(2, dtype=np.int64), np.ones(2), np.o
 
 
 @pytest.mark.parametrize(("make", "words"), [
-    (lambda: SensorLog("run.log"), "odometry must be a Odometry, not str 'run.log'"),
-    (lambda: SensorLog(None), "odometry must be a Odometry, not NoneType"),
+    (lambda: SensorLog("run.log"), "odometry must be an Odometry, not str 'run.log'"),
+    (lambda: SensorLog(None), "odometry must be an Odometry, not NoneType"),
     (lambda: SensorLog(ODOMETRY, SCANS), "ranges must be a UwbRanges, not LaserScans"),
     (lambda: SensorLog(ODOMETRY, mounting={}), "mounting must be a SensorMounting, not dict"),
     (lambda: Odometry(np.zeros(2), np.zeros((2, 2))), r"odometry\.poses has shape \(2, 2\), expected \(n, 3\) with n = 2"),

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -115,7 +116,7 @@ def test_a_given_pose_fixes_the_heading_itself():
 def test_given_places_and_an_alignment_exclude_each_other(align):
     graph = first_estimate()
     found = BootstrapResult(graph, ALL, (), ~ALL)
-    estimate = Estimate(replace(graph, edges=()), graph.edges[0], graph.edges[1], IDS, found)
+    estimate = Estimate(replace(graph, edges=()), chained(graph.poses, np.full(3, 0.01)), graph.edges[1], IDS, found)
     for places, refused in ((Constraints(anchors=surveyed("A", "B")), align == "walls"), (Constraints(), False)):
         task = Task(SimpleNamespace(clock=CLOCK), MappingConfig(align=align), places, Stages(None, None))
         with pytest.raises(ConfigError, match="leave out align") if refused else nullcontext():

@@ -226,7 +226,8 @@ def require_index(index: NDArray[Any], name: str, count: int, of: str, least: in
 def require_type(value: Any, name: str, kind: type, what: str = "") -> None:
     """Raise DataError where an argument is of another type; what: the type in words, where its own name is none."""
     if not isinstance(value, kind):
-        raise DataError(f"{name} must be a {what or kind.__name__}, not {_described(value)}")
+        wanted = what or kind.__name__
+        raise DataError(f"{name} must be {'an' if wanted[0] in 'AEIO' else 'a'} {wanted}, not {_described(value)}")
 
 
 def _described(value: Any) -> str:

@@ -9,7 +9,7 @@ from helpers.laser_walks import drifted, scanned, walked
 from scipy.spatial import cKDTree
 
 from uwblite import se2
-from uwblite.graph.marginals import marginals
+from uwblite.graph.joint_covariance import JointCovariance
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.lidar.correlative_matching import CorrelativeConfig
@@ -40,7 +40,7 @@ def hall():
     graph = drifted(np.random.default_rng(4), truth, NOISE)
     recording = np.zeros(len(truth), dtype=np.intp)
     pieces = build(clouds, graph.poses, path, recording, SubmapConfig(epsilon=4.0))
-    covariances = marginals(graph)
+    covariances = JointCovariance(graph, pieces.reference)
     proposed = propose(graph, covariances, pieces, recording, set(), set(), True, CONFIG)
     return truth, graph, covariances, pieces, recording, proposed
 
@@ -360,7 +360,8 @@ def test_a_robot_that_never_returns_has_no_candidates():
     graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
     recording = np.zeros(60, dtype=np.intp)
     pieces = build(clouds, graph.poses, truth[:, 0], recording, SubmapConfig(epsilon=8.0))
-    far = propose(graph, marginals(graph), pieces, recording, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
+    covariances, near = JointCovariance(graph, pieces.reference), replace(CONFIG, reach=6.0, search_limit=1.0)
+    far = propose(graph, covariances, pieces, recording, set(), set(), True, near)
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
     assert np.all(apart < 7.0)
     assert optimize(graph, SOLVER)[1].converged

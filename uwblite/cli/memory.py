@@ -68,8 +68,10 @@ def shortage(megabytes: float, maps: int = 1) -> Shortage | None:
 def _needed(megabytes: float, limit: Limit) -> float:
     """Return bytes as this limit counts them."""
     pages = _pages()
-    unused = pages.mapped - pages.resident if limit.of_addresses else pages.private - pages.used if limit.of_data else 0
-    return 1e6 * megabytes + max(unused, 0)
+    mapped, used = (pages.mapped, pages.resident) if limit.of_addresses else (pages.private, pages.used)
+    # Where more is mapped than this process could, the pages are those of an emulator that runs it.
+    known = limit.of_a_process and mapped <= limit.bytes
+    return 1e6 * megabytes + (max(mapped - used, 0) if known else 0)
 
 
 def limits() -> list[Limit]:

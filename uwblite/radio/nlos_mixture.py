@@ -85,7 +85,7 @@ class RangeMixture:
         normal, late = _densities(off, self.sigma, self.detour)
         core = (1.0 - self.tail - self.wild) * normal
         slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
-        return slope / self.density(off + self.centre)
+        return slope / (core + self.tail * late + self.wild / self.width + _NEVER)
 
 
 def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> RangeMixture:
@@ -129,10 +129,11 @@ def shortest_half(values: Floats) -> tuple[float, float]:
 def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats]:
     """Return the densities (m,) of the core and of core plus detour at errors from the core's mean."""
     z = off / sigma
-    normal = np.exp(-0.5 * z**2) / (sigma * np.sqrt(2.0 * np.pi))
+    bell = np.exp(-0.5 * z**2)
+    normal = bell / (sigma * np.sqrt(2.0 * np.pi))
     # exp(a) erfc(b) in the form that neither overflows nor loses digits on its side of b = 0.
     b = (sigma / detour - z) / np.sqrt(2.0)
-    early = np.exp(-0.5 * z**2) * erfcx(np.maximum(b, 0.0))
+    early = bell * erfcx(np.maximum(b, 0.0))
     late = 2.0 * np.exp(np.minimum(0.5 * (sigma / detour) ** 2 - z * sigma / detour, 0.0)) * ndtr(-b * np.sqrt(2.0))
     return normal, np.where(b >= 0.0, early, late) / (2.0 * detour)
 
