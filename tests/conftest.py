@@ -21,7 +21,8 @@ os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / ".hypothesis"))
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
 # A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+unhurried = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("uwblite", unhurried, max_examples=40)
 settings.register_profile("once", settings.get_profile("uwblite"), max_examples=10)
 settings.load_profile("uwblite")
 
@@ -129,23 +130,48 @@ def short_log(room_log, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def minute_map(minute_log, tmp_path_factory):
-    """Folder with the map of that minute, which no test may change; made once for all processes of a run."""
+def once(tmp_path_factory):
+    """A function that makes a folder of this name, which no test may change; once for all processes of a run."""
     import fcntl
+
+    shared = tmp_path_factory.getbasetemp()
+    shared = shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared
+
+    def made(name, make):
+        with open(shared / f"{name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            folder = shared / name
+            if not folder.exists():
+                folder.mkdir()
+                make(folder)
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def minute_map(minute_log, once):
+    """Folder with the map of that minute."""
     import shutil
 
     from uwblite.cli import main
 
-    shared = tmp_path_factory.getbasetemp()
-    shared = shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared
-    with open(shared / "minute_map.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        folder = shared / "minute_map"
-        if not folder.exists():
-            folder.mkdir()
-            shutil.copy(minute_log, folder / "run.log.gz")
-            assert main(["map", str(folder / "run.log.gz"), "--out", str(folder / "map"), "-q"]) in (0, 3)
-    return folder / "map"
+    def mapped(folder):
+        shutil.copy(minute_log, folder / "run.log.gz")
+        assert main(["map", str(folder / "run.log.gz"), "--out", str(folder / "map"), "-q"]) in (0, 3)
+
+    return once("minute_map", mapped) / "map"
+
+
+@pytest.fixture(scope="session")
+def room_result(log, once):
+    """The map of the whole recording of the room, with the default settings."""
+    import pickle
+
+    from uwblite.mapping import build_map
+
+    folder = once("room_result", lambda folder: (folder / "result").write_bytes(pickle.dumps(build_map(log))))
+    return pickle.loads((folder / "result").read_bytes())
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "findings", "work"),
+    ("errors", "findings"),
     ("arrays",),
     ("se2", "config", "clocks"),
     ("sensor_log", "graph", "drivers"),

@@ -92,7 +92,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "nothing (the defaults)": LeftOut(),
     "surfaces": LeftOut(patches=(("pipeline.surface_adjustment.adjust_surfaces", _pairs_alone),)),
     "columns": LeftOut(patches=(
-        ("pipeline.surface_search.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
+        ("pipeline.surface_adjustment.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
     )),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
     "noise of wheels by residuals": LeftOut(patches=(
@@ -111,7 +111,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "corners": LeftOut(("clouds.linearity=0.85",)),
     "deskewing": LeftOut(log=flat),
     "broken stretches": _stage("broken_stretches.replace_broken_stretches"),
-    "slips in turns": _stage("turn_checks.with_slip_in_turns"),
+    "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_presence.name_new_and_absent_anchors"),
     "mirror images": _stage("mirror_images.find_mirror_images"),

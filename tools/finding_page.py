@@ -11,6 +11,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -21,6 +22,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "uwblite"
 FACTORIES = {"doubt": "doubt", "warning": "warning", "Finding": "", "say": "", "add": ""}
 """Functions that make a finding of the kind that is their first argument, and its severity where they say it."""
+MAKES = re.compile(r"\b(?:doubt|warning|Finding)\b|\b(?:say|add)\(\s*f?\"")
+"""What stands in a file that makes findings."""
 KIND = re.compile(r"[a-z]+(-[a-z]+)+|gyro|drift|scales|carried|uncertain|mirrored")
 
 HEAD = """\
@@ -55,17 +58,19 @@ class Rule:
     """The finding's text, an ellipsis in place of each value; empty where it is made elsewhere."""
 
 
-def rules() -> list[Rule]:
+@cache
+def rules() -> tuple[Rule, ...]:
     """Return the rules of the package, in the order of kinds."""
     found: dict[tuple[str, str], Rule] = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        for function in _functions(ast.parse(path.read_text(encoding="utf-8"))):
+    sources = ((path, path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py")))
+    for path, text in sources:
+        for function in _functions(ast.parse(text)) if MAKES.search(text) else ():
             for rule in _rules_of(function, path.relative_to(PACKAGE).as_posix()):
                 known = found.get((rule.kind, rule.room + rule.says))
                 if known is not None and known.severity != rule.severity:
                     rule = Rule(rule.kind, "warning or doubt", rule.room, rule.says, known.text or rule.text)
                 found[rule.kind, rule.room + rule.says] = rule
-    return sorted(found.values(), key=lambda rule: (rule.kind, rule.room))
+    return tuple(sorted(found.values(), key=lambda rule: (rule.kind, rule.room)))
 
 
 def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:

@@ -11,8 +11,7 @@ sys.path.insert(0, str(ROOT))
 
 import finding_page
 
-from uwblite.config import field_docs
-from uwblite.io.settings_toml import permitted, shown_fields, toml_value
+from uwblite.config import field_docs, permitted, shown_fields, toml_value
 from uwblite.mapping import MappingConfig
 from uwblite.pipeline.mapping_config import preset
 

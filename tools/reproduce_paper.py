@@ -30,7 +30,7 @@ from uwblite.io.png import write_png
 from uwblite.map_result import MapResult
 from uwblite.mapping import build_map
 from uwblite.pipeline.mapping_config import preset
-from uwblite.report.picture import PictureAnchor, draw_map
+from uwblite.report.picture import Overlay, PictureAnchor, draw_map
 
 PRESETS = ("paper", "default")
 METHODS = {
@@ -122,7 +122,7 @@ def draw(result: MapResult, path: str, caption: str) -> None:
     anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors if a.status != "unplaced"]
     poses = result.graph.poses[:, :2]
     ends = np.array([[*poses[c.i], *poses[c.j]] for c in result.closures if c.accepted]).reshape(-1, 4)
-    write_png(path, draw_map(result.grid, result.trajectory, anchors=anchors, closures=ends, caption=caption, size=560))
+    write_png(path, draw_map(result.grid, result.trajectory, Overlay(anchors, ends), caption=caption, size=560))
 
 
 def planned(args: argparse.Namespace, pictures: Path) -> list[Task]:

@@ -16,7 +16,7 @@ import ast
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -24,7 +24,7 @@ PACKAGE = ROOT / "uwblite"
 
 _SOLVER = ("graph.solver", "graph.pose_edges", "graph.range_edges", "graph.point_edges", "graph.distance_edges")
 PARTS = {
-    "map": ("mapping", "io.carmen", "io.results", "io.settings_toml"),
+    "map": ("mapping", "io.carmen", "io.results", "config"),
     "solve": _SOLVER,
     "covariances": (*_SOLVER, "graph.marginals"),
     "localize": ("localization", "localization.localize", "io.stored_result", "io.carmen"),
@@ -40,17 +40,19 @@ def file_of(module: str) -> Path | None:
     return next((f for f in (base / "__init__.py", base.with_suffix(".py")) if f.is_file()), None)
 
 
-def imported(module: str, file: Path) -> Iterator[str]:
-    """Yield the modules of the package that a module imports, wherever in it, but for those that only type checkers read."""
+@cache
+def imported(module: str, file: Path) -> tuple[str, ...]:
+    """Return the modules of the package that a module imports, wherever in it, but for those that only type checkers read."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     checking = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test)]
     unread = {id(below) for block in checking for statement in block.body for below in ast.walk(statement)}
     here = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.level and id(node) not in unread:
             base = [*here[: len(here) - node.level + 1], *(node.module or "").split(".")]
-            for name in ("", *(alias.name for alias in node.names)):
-                yield ".".join(filter(None, (*base, name)))
+            found += [".".join(filter(None, (*base, name))) for name in ("", *(alias.name for alias in node.names))]
+    return tuple(found)
 
 
 def files_for(modules: tuple[str, ...]) -> list[Path]:

@@ -121,7 +121,7 @@ class StageSummary:
     figures: dict[str, Any] = field(default_factory=dict)
     """Named counts and figures (JSON-ready)."""
     work: dict[str, int] = field(default_factory=dict)
-    """Operations counted by kind, see work.KINDS; the same on every computer."""
+    """Operations counted by kind, see graph/work.KINDS; the same on every computer."""
 
 
 @documented

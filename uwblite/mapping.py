@@ -12,34 +12,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from .arrays import require_type
 from .assessment import summary
 from .constraints import Constraints
-from .errors import DataError
 from .map_result import MapResult
 from .pipeline import (
     anchor_heights,
     anchor_places,
     anchor_presence,
     broken_stretches,
+    calibration_checks,
     closure_rounds,
     constraint_edges,
     final_stages,
-    landmark_ties,
     lidar_stages,
     map_frame,
     mirror_images,
     neighbour_matching,
-    odometry_units,
     radio_stages,
     scan_selection,
     surface_adjustment,
-    turn_checks,
 )
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stage, Stages
-from .pipeline.recordings import check_distinct, gather
+from .pipeline.recordings import check_distinct, gather, require_types
 from .sensor_log import SensorLog
 
 __all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
@@ -71,12 +67,12 @@ def build_map(
     DataError : there is nothing to map, or recordings share too few anchors, or measurements; an argument is of another type.
     Cancelled : the callback asked to stop.
     """
-    _require_types(logs, config, constraints)
+    require_types(logs, config, constraints)
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
     logs = [scan_selection.prepared(log, config) for log in logs]
-    config = odometry_units.with_given_mounting_and_clock(odometry_units.with_units_checked(config, logs), logs)
+    config = calibration_checks.with_given_mounting_and_clock(calibration_checks.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)
@@ -88,22 +84,10 @@ def build_map(
     return summary.summarise(estimate, covariance, grid, task)
 
 
-def _require_types(logs: object, config: object, constraints: object) -> None:
-    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else None
-    for k, log in enumerate([logs] if several is None else several):
-        require_type(log, "logs" if several is None else f"logs[{k}]", SensorLog)
-    if several is not None and not several:
-        raise DataError("there is no recording to map: logs is empty")
-    if config is not None:
-        require_type(config, "config", MappingConfig)
-    if constraints is not None:
-        require_type(constraints, "constraints", Constraints)
-
-
 def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
     """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
     estimate, config = radio_stages.first_optimisation(task), task.config
-    factors = odometry_units.odometry_unit_factors(estimate, task)
+    factors = calibration_checks.odometry_unit_factors(estimate, task)
     if np.all(factors == 1.0):
         return estimate, task
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
@@ -122,7 +106,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield neighbour_matching.match_scan_to_scan if config.scan_to_scan.on else neighbour_matching.make_clouds
         if config.scan_to_scan.on:
             yield radio_stages.reestimate_ranges
-            yield turn_checks.with_slip_in_turns
+            yield calibration_checks.with_slip_in_turns
         if config.use_loops:
             yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
             yield anchor_places.decide_places
@@ -136,7 +120,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places
     if given.landmark_distances:
-        yield landmark_ties.tie_landmarks
+        yield constraint_edges.tie_landmarks
     yield anchor_presence.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images

@@ -10,6 +10,7 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.assessment import drift_tests
 from uwblite.assessment.drift_tests import _bent, _check_scale_beside_lidar
+from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.mapping import build_map
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import Odometry
@@ -28,23 +29,11 @@ def age(stamps):
     return (stamps - stamps[0]) / np.ptp(stamps)
 
 
-def test_a_sound_recording_drifts_in_nothing(sound):
-    assert not build_map(sound).doubts
-
-
 def test_ranges_that_grow(sound):
     ranges = sound.ranges
     (found,) = drifts(replace(sound, ranges=replace(ranges, ranges=ranges.ranges + 0.6 * age(ranges.stamps))))
     assert "all ranges seem to grow by 0." in found.text
     assert found.figures["value"] == pytest.approx(0.6, abs=0.15)
-
-
-def test_ranges_that_are_late(sound):
-    """To first order: ways are bent where the robot turns within the delay, so less than all of it is found."""
-    ranges = sound.ranges
-    (found,) = drifts(replace(sound, ranges=replace(ranges, stamps=ranges.stamps + 0.8)))
-    assert "s or more" in found.text
-    assert -0.9 < found.figures["value"] < -0.5
 
 
 def test_wheels_that_lose_air(sound):
@@ -121,9 +110,16 @@ def mirrored_from_half_way(steps):
     return steps * np.where(np.arange(len(steps))[:, None] < len(steps) // 2, 1.0, [1.0, 1.0, -1.0])
 
 
-@pytest.mark.parametrize("change", [turned_from_half_way, mirrored_from_half_way])
-def test_a_change_of_the_wheels_half_way(sound, change):
-    assert drifts(with_steps(sound, change), "odometry-slips")
+def test_wheels_that_turn_otherwise_from_half_way_on_are_noisy_and_the_ranges_hold_the_path(sound):
+    """By 0.15 rad a metre: twenty times the noise of the heading that is assumed."""
+    result = build_map(with_steps(sound, turned_from_half_way))
+    assert not result.doubts
+    error = evaluate_trajectory(result.stamps, result.trajectory, sound.odometry.stamps, two_rounds()).ate.rmse
+    assert error < 0.05
+
+
+def test_wheels_that_turn_the_other_way_from_half_way_on_are_a_doubt(sound):
+    assert build_map(with_steps(sound, mirrored_from_half_way)).doubts
 
 
 def test_a_heading_that_drifts_throughout_is_calibrated(sound):

@@ -70,10 +70,14 @@ def handedness(graph, lidar):
     return stages.doubts
 
 
-@pytest.mark.parametrize(("error", "doubted"), [(-1.9, True), (-1.1, True), (-0.4, False), (0.0, False), (1.0, False)])
-def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
+@pytest.mark.parametrize(("error", "kind"), [
+    (-1.9, "mirrored"), (-1.25, "mirrored"), (-1.04, "wheels-against-lidar"), (-0.93, "wheels-against-lidar"), (-0.47, None),
+    (0.0, None), (1.0, None),
+])  # fmt: skip
+def test_wheels_that_turn_against_the_laser_or_without_it_are_doubted(error, kind):
+    """-0.93: scans in reversed order; -0.47: skid steering whose effective track is 1.9 times the true one."""
     graph = Graph(np.zeros((1, 3)), calibration=Calibration((UnknownKey("heading_scale"),), np.array([error])))
-    assert len(stated(handedness(graph, lidar=True), "upside down")) == doubted
+    assert [n.kind for n in handedness(graph, lidar=True)] == ([] if kind is None else [kind])
 
 
 @pytest.mark.parametrize(("error", "doubted"), [(0.24, False), (-0.39, False), (0.26, True), (-0.41, True), (-1.9, True)])
@@ -103,16 +107,13 @@ def test_three_given_anchors_decide_the_sign_and_two_do_not(given, doubted, lida
     assert len(handedness(graph, lidar)) == doubted
 
 
-def moved_together(places, lidar=False, agree_until=None, recordings=1):
+def moved_together(places, lidar=False, recordings=1):
     """Return the kinds of doubts that told_of_moves has."""
-    return [notice.kind for notice in told_of_moves(places, lidar, agree_until, recordings)]
+    return [notice.kind for notice in told_of_moves(places, lidar, recordings)]
 
 
-def told_of_moves(places, lidar=False, agree_until=None, recordings=1, moment=100.0):
-    """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s.
-
-    Ranges to those that `agree_until` names agree with the map up to that time, s; `moment` stands for those 100 s.
-    """
+def told_of_moves(places, lidar=False, recordings=1, moment=100.0):
+    """Return the doubts about a map whose anchors A, B, ... have these places one after the other, from a moment, s, on."""
     anchors, stamps, anchor = [], [], []
     for name, own in zip("ABCD", places, strict=False):
         for number, place in enumerate(own):
@@ -124,26 +125,10 @@ def told_of_moves(places, lidar=False, agree_until=None, recordings=1, moment=10
             anchor.append(np.full(len(measured), len(anchors) - 1))
     stages = Stages(None, None)
     table = {"stamp": np.concatenate(stamps), "anchor": np.concatenate(anchor).astype(np.float64)}
-    until = np.array([(agree_until or {}).get(a.id, np.inf) for a in anchors])
-    table["agrees"] = (table["stamp"] < until[np.concatenate(anchor)]).astype(np.float64)
     recorded = SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0]), each=[None] * recordings)
     task = SimpleNamespace(recordings=recorded, stages=stages)
     stages.findings.extend(check_moved_together(anchors, table, task))
     return stages.doubts
-
-
-@pytest.mark.parametrize(
-    ("shares", "doubted"), [((1.0, 0.4), False), ((0.4, 0.4), False), ((0.5, 0.1), True), ((0.0, 0.0), True), ((), False)]
-)
-def test_a_map_that_most_ranges_contradict_is_doubted(shares, doubted):
-    """The second anchor has twice the ranges of the first."""
-    anchors = [
-        AnchorEstimate("AB"[k], np.zeros(2), np.eye(2), 50 * (k + 1), share, 0.0, 0.1, 0.1, "ok")
-        for k, share in enumerate(shares)
-    ]
-    stages = Stages(None, None)
-    stages.findings.extend(check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=False))))
-    assert [d.kind for d in stages.doubts] == ["ranges-disagree"] * doubted
 
 
 A, B, C, ELSEWHERE = (0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 20.0)
@@ -176,13 +161,6 @@ def test_what_looks_like_anchors_moved_together_depends_on_what_holds_the_trajec
     assert doubt.figures == {"at": 100.0, "moved": 2, "measured": 3}
 
 
-@pytest.mark.parametrize(("until", "doubted"), [(105.0, True), (130.0, True), (170.0, False), (20.0, False)])
-def test_an_anchor_whose_ranges_agree_on_one_side_of_a_move_counts_as_moved(until, doubted):
-    """A was moved at 100 s, B and C were not; ranges to B agree up to a time, of those after the move at most a half."""
-    found = moved_together([[A, ELSEWHERE], [B], [C]], agree_until={"B": until})
-    assert found == ["anchors-moved-together"] * doubted
-
-
 def test_anchors_that_changed_places_were_only_renamed():
     assert not moved_together([[A, B], [B, C], [C, A]])
 
@@ -211,13 +189,12 @@ def test_ranges_without_odometry_are_left_out_and_counted():
     np.testing.assert_allclose(build_map(without).trajectory, result.trajectory, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_map_begins_where_the_odometry_did(seed):
     """Wherever the bootstrap began."""
     log = run(seed, metres=40.0)[2]
     moved = replace(log, odometry=replace(log.odometry, poses=se2.compose(np.array([3.0, -2.0, 1.0]), log.odometry.poses)))
-    for some in (log, moved):
-        np.testing.assert_allclose(build_map(some).trajectory[0], some.odometry.poses[0], atol=1e-9)
+    np.testing.assert_allclose(build_map(moved).trajectory[0], moved.odometry.poses[0], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -245,45 +222,17 @@ def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
 
 
 @pytest.mark.parametrize(("statuses", "warnings", "doubts"), [
-    (("ok", "mirror-ambiguous"), ["anchor-mirror-ambiguous"], []),
-    (("mirror-ambiguous", "distrusted"), ["anchor-distrusted"], ["anchor-mirror-ambiguous", "ranges-disagree"]),
     (("unplaced", "unplaced"), ["anchor-unplaced"] * 2, ["no-anchor"]), (("ok", "ok"), [], []),
+    (("mirror-ambiguous", "distrusted"), ["anchor-distrusted"], ["anchor-mirror-ambiguous"]),
+    (("ok", "mirror-ambiguous"), ["anchor-mirror-ambiguous"], []),
     (("ok", "ok", "distrusted", "unplaced"), ["anchor-distrusted", "anchor-unplaced"], []),
-    (("ok", "distrusted", "unplaced"), ["anchor-distrusted", "anchor-unplaced"], ["ranges-disagree"]),
 ])  # fmt: skip
-@pytest.mark.parametrize("lidar", [False, True])
-def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts, lidar):
-    """Mirror images are a doubt where no anchor has one place alone, and half of the anchors distrusted where no lidar is."""
+def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts):
+    """Mirror images are a doubt where no anchor has one place alone."""
     anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, s, "why") for k, s in enumerate(statuses)]
-    stages = Stages(None, None)
-    stages.findings.extend(check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar))))
-    assert [n.kind for n in stages.warnings] == warnings
-    assert [n.kind for n in stages.doubts] == [kind for kind in doubts if not (lidar and kind == "ranges-disagree")]
-
-
-@pytest.mark.parametrize(("bad", "doubted"), [("AB", True), ("A", False)])
-def test_an_anchor_that_was_moved_counts_once_among_those_that_are_distrusted(bad, doubted):
-    """Four anchors, one of which was moved."""
-    names = ("A", "B", "C", "D", "D@2")
-    anchors = [
-        AnchorEstimate(n, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "distrusted" if n in bad else "ok") for n in names
-    ]
-    stages = Stages(None, None)
-    stages.findings.extend(check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=False))))
-    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubted
-
-
-@pytest.mark.parametrize(("used", "left_out", "lidar", "doubted"), [
-    (1, 1, False, True), (1, 1, True, False), (2, 1, False, False), (2, 2, False, True), (1, 0, False, False),
-])  # fmt: skip
-def test_names_left_out_count_as_distrusted_anchors(used, left_out, lidar, doubted):
-    anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for k in range(used)]
-    stages = Stages(None, None)
-    for _ in range(left_out):
-        stages.findings.append(warning("shared-name", "two anchors answer to a name"))
-    stages.findings.extend(check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar))))
-    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubted
-    assert all(f"{left_out} of {used + left_out} anchors" in n.text and "too few" in n.text for n in stages.doubts)
+    found = list(check_anchors(anchors))
+    assert [n.kind for n in found if n.severity == "warning"] == warnings
+    assert [n.kind for n in found if n.severity == "doubt"] == doubts
 
 
 @pytest.mark.parametrize(("accepted", "contradicted", "other", "grid", "kind"), [
@@ -327,17 +276,6 @@ def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doub
     of_scale = [notice.kind == "unusual-calibration" for notice in (*stages.warnings[wheels:], *stages.doubts)]
     assert of_scale == [True]
     assert len(stages.doubts) == doubted
-
-
-@pytest.mark.parametrize(("scale", "doubted"), [(-0.93, True), (-1.04, True), (-0.47, False), (0.9, False)])
-def test_turns_that_count_next_to_nothing_are_a_doubt(scale, doubted):
-    """-0.93: scans in reversed order; -0.47: skid steering whose effective track is 1.9 times the true one."""
-    stages, key = Stages(None, None), UnknownKey("heading_scale", recording=0)
-    value = CalibrationEstimate(key, scale, 0.02, "1", "relative error of turned angle", "estimated")
-    task = SimpleNamespace(stages=stages, config=MappingConfig(), recordings=SimpleNamespace(have_scans=True))
-    stages.findings.extend(check_calibration([value], {key: SimpleNamespace(sigma=0.1)}, task))
-    assert [n.kind for n in (stages.doubts if doubted else stages.warnings)] == ["unusual-calibration"]
-    assert len(stages.doubts) + len(stages.warnings) == 1
 
 
 @pytest.mark.parametrize(("scale", "lidar", "doubted"), [(0.094, False, True), (0.094, True, False), (-0.09, False, False)])

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from uwblite.assessment.range_agreement import (
-    check_sustained_outliers,
+    check_range_agreement,
     check_wheels_against_lidar,
     outlier_stretches,
 )
-from uwblite.findings import Fact
+from uwblite.findings import Fact, warning
+from uwblite.map_result import AnchorEstimate
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import OdometryBreaks, Screening
 
@@ -35,70 +36,71 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
     assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
 
 
-def recordings_from(*starts, scans=True):
-    """Return recordings whose clocks begin at these times, s."""
-    each = [
-        SimpleNamespace(number=n, frames=SimpleNamespace(stamps=np.array([t, 9e3])), has_scans=scans)
-        for n, t in enumerate(starts)
+def told(agrees, statuses=(), lidar=False, left_out=0, starts=(0.0,), where=None):
+    """Return the findings about anchors of which each has a range a second, which agree with the map or not (a, n).
+
+    Parameters
+    ----------
+    statuses : of the anchors; ok. left_out : names that two anchors had. starts : of the recordings' clocks, s.
+    where : (n,) recording of each range; all of the first.
+    """
+    count, seconds = agrees.shape
+    of = np.zeros(seconds) if where is None else where
+    table = {
+        "stamp": np.tile(starts[0] + np.arange(float(seconds)), count), "anchor": np.repeat(np.arange(float(count)), seconds),
+        "agrees": agrees.ravel().astype(float), "weight": np.ones(agrees.size), "recording": np.tile(of, count),
+    }  # fmt: skip
+    names = ("A", "B", "C", "D", "D@2")
+    anchors = [
+        AnchorEstimate(names[k], np.zeros(2), np.eye(2), seconds, float(agrees[k].mean()), 0.0, 0.1, 0.1, status)
+        for k, status in enumerate(statuses or ("ok",) * count)
     ]
-    return type("Recordings", (), {"each": each, "__len__": lambda self: len(each)})()
+    each = [SimpleNamespace(number=n, frames=SimpleNamespace(stamps=np.array([t]))) for n, t in enumerate(starts)]
+    recordings = type("Recordings", (), {"each": each, "__len__": lambda self: len(each), "have_scans": lidar})()
+    stages = SimpleNamespace(findings=[warning("shared-name", "")] * left_out)
+    return list(check_range_agreement(anchors, table, SimpleNamespace(recordings=recordings, stages=stages)))
+
+
+def wrong_from(count, anchors=4, seconds=1000, since=500):
+    """Return ranges (a, n) that agree but for those of so many anchors from some time on."""
+    return (np.arange(anchors)[:, None] >= count) | (np.arange(seconds) < since)
 
 
 def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beginning():
-    """Of three anchors the second disagrees from 200 s on and in four more stretches; ranges without weight do not count."""
-    stamps = np.tile(1000.0 + np.arange(1000.0), 3)
-    anchor = np.repeat([0.0, 1.0, 2.0], 1000)
-    wrong = np.zeros(3000, dtype=bool)
-    for first in (200, 400, 500, 600, 700):
-        wrong |= (anchor == 1) & (stamps >= 1000 + first) & (stamps < 1050 + first)
-    table = {
-        "stamp": stamps, "anchor": anchor, "agrees": np.where(wrong | (anchor == 2), 0.0, 1.0),
-        "weight": np.where(anchor == 2, 0.0, 1.0), "recording": np.zeros(3000),
-    }  # fmt: skip
-    stages = Stages(None, None)
-    stages.findings.extend(
-        check_sustained_outliers(table, "ABC", SimpleNamespace(recordings=recordings_from(1000.0), stages=stages))
-    )
-    (notice,) = stages.warnings
-    assert (notice.kind, notice.figures["anchor"], len(notice.figures["stretches"])) == ("sustained-outliers", "B", 5)
+    agrees = np.ones((3, 1000), dtype=bool)
+    for first in (200, 400, 500, 600):
+        agrees[1, first : first + 50] = False
+    (notice,) = told(agrees, lidar=True, starts=(1000.0,))
+    assert (notice.kind, notice.severity, notice.anchor, len(notice.stretches)) == ("sustained-outliers", "warning", "B", 4)
     assert notice.text.startswith(
-        "anchor B disagrees with the map for long (t = 200 to 249 s, 400 to 449 s, 500 to 549 s, 600 to 649 s ...)"
+        "anchor B disagrees with the map for long (t = 200 to 249 s, t = 400 to 449 s, t = 500 to 549 s, and 1 more stretches)"
     )
+    assert notice.stretches[0] == (1200.0, 1249.0)
 
 
 def test_an_anchor_disagrees_in_one_recording_while_others_whose_clocks_show_the_same_agree():
-    """Half of all readings between 200 and 300 s are of each recording: together six of ten would agree."""
-    stamps, recording = np.tile(np.arange(400.0), 2), np.repeat([0.0, 1.0], 400)
-    wrong = (recording == 1) & (stamps >= 200) & (stamps < 300) & (stamps % 5 > 0)
-    table = {
-        "stamp": stamps, "anchor": np.zeros(800), "agrees": np.where(wrong, 0.0, 1.0), "weight": np.ones(800),
-        "recording": recording,
-    }  # fmt: skip
-    stages = Stages(None, None)
-    stages.findings.extend(
-        check_sustained_outliers(table, "A", SimpleNamespace(recordings=recordings_from(0.0, 0.0), stages=stages))
-    )
-    (notice,) = stages.warnings
-    assert notice.text.startswith("recording 2: anchor A disagrees with the map for long (t = 200 to 299 s)")
+    """Half of all readings between 200 and 400 s are of each recording: together six of ten would agree."""
+    where, time = np.arange(800) % 2, np.arange(800)
+    wrong = (where == 1) & (time >= 200) & (time < 400) & (time % 10 > 1)
+    (notice,) = told(~wrong[None], lidar=True, starts=(0.0, 0.0), where=where)
+    assert (notice.recording, notice.text[:60]) == (2, "recording 2: anchor A disagrees with the map for long (t = 2")
 
 
-@pytest.mark.parametrize(
-    ("wrong", "count", "lidar", "doubts"),
-    [(2, 4, False, 1), (1, 4, False, 0), (2, 5, False, 0), (1, 1, False, 1), (4, 4, True, 0)],
-)
-def test_half_of_the_anchors_that_disagree_for_long_are_a_doubt_without_a_lidar(wrong, count, lidar, doubts):
-    stamps, anchor = np.tile(np.arange(1000.0), count), np.repeat(np.arange(float(count)), 1000)
-    table = {
-        "stamp": stamps, "anchor": anchor, "agrees": ((anchor >= wrong) | (stamps < 500)) * 1.0,
-        "weight": np.ones(len(stamps)), "recording": np.zeros(len(stamps)),
-    }  # fmt: skip
-    stages = Stages(None, None)
-    recordings = recordings_from(0.0, scans=lidar)
-    stages.findings.extend(
-        check_sustained_outliers(table, "ABCDE"[:count], SimpleNamespace(recordings=recordings, stages=stages))
-    )
-    assert [n.kind for n in stages.warnings] == ["sustained-outliers"] * wrong
-    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubts
+@pytest.mark.parametrize(("agrees", "options", "found"), [
+    (wrong_from(2), {}, True), (wrong_from(1), {}, False), (wrong_from(2, 5), {}, True), (wrong_from(1, 1), {}, True),
+    (wrong_from(4), {"lidar": True}, False), (wrong_from(4, since=200), {"lidar": True}, True),
+    (wrong_from(0), {"statuses": ("ok", "ok", "ok", "distrusted")}, False),
+    (wrong_from(1), {"statuses": ("ok", "ok", "ok", "distrusted")}, True),
+    (wrong_from(0), {"statuses": ("ok", "ok", "distrusted", "unplaced")}, False),
+    (wrong_from(0), {"statuses": ("ok", "unplaced", "distrusted", "unplaced")}, True),
+    (wrong_from(0, 2), {"left_out": 1}, False), (wrong_from(0, 1), {"left_out": 1}, True),
+    (wrong_from(0, 1), {"left_out": 1, "lidar": True}, False),
+    (wrong_from(1, 5), {}, True), (wrong_from(0, 5), {}, False),
+    (wrong_from(0, 5), {"statuses": ("ok", "ok", "ok", "distrusted", "distrusted")}, False),
+])  # fmt: skip
+def test_ranges_that_contradict_the_map_are_a_doubt(agrees, options, found):
+    """Most of all, or without a lidar those of half of the anchors; the fifth is the fourth after a move: one anchor."""
+    assert [n.kind for n in told(agrees, **options) if n.severity == "doubt"] == ["ranges-disagree"] * found
 
 
 def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretches=((0.0, 40.0), (60.0, 90.0)), whose=1):

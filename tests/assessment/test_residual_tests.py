@@ -12,10 +12,9 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.assessment.residual_tests import (
     _contradicted_by_ranges,
-    check_odometry_steps,
+    check_odometry,
     check_range_scatter,
     check_scales,
-    check_slips,
     check_support,
 )
 from uwblite.graph.calibration import scan_indices
@@ -53,7 +52,7 @@ def test_ranges_that_are_no_distances(sound, lidar):
 @pytest.mark.slow
 def test_a_radio_whose_clock_is_seconds_late(sound):
     late = replace(sound.ranges, stamps=sound.ranges.stamps + 6.0)
-    assert "range-scatter" in doubts(replace(sound, ranges=late))
+    assert "ranges-disagree" in doubts(replace(sound, ranges=late))
 
 
 @pytest.mark.slow
@@ -67,80 +66,70 @@ def test_odometry_alone_drifts(sound):
     assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone", "uncertain"}
 
 
-def keyframes_at(stamps):
-    return SimpleNamespace(stamps=stamps, of_keyframe=np.zeros(len(stamps), dtype=int))
+def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
+    """Judge a chain of 80 keyframes on its true places, whose wheels slip: {step: m, m, rad} beyond the motion.
 
-
-def steps_that_slip(spans, degenerate=False):
-    """Judge a chain that follows the lidar, its wheels off for 15 steps; spans: keyframes between which scan edges stand."""
+    Parameters
+    ----------
+    scans : keyframes between which scan edges stand, from the 20th to the 60th. root : of their information, 1/m, 1/m, 1/rad.
+    loop : whether the robot stands at the 79th where it began, and a scan edge says so.
+    """
     truth = np.column_stack([np.arange(80) * 0.3, np.zeros(80), np.zeros(80)])
     wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
-    wheels.motion[30:45, 2] += 0.2
-    j = np.concatenate([np.arange(20, 60) for _ in spans])
-    i = j - np.repeat(spans, 40)
+    for step, by in slip.items():
+        wheels.motion[step] += by
+    pairs = [(k - span, k) for span in scans for k in range(20, 60)] + [(0, 79)] * loop
+    i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     none = np.zeros((len(i), 3))
-    root = np.zeros((len(i), 3, 3)) + np.diag([0.0 if degenerate else 100.0, 100.0, 1000.0])
-    ties = ScanEdges(i, j, se2.between(truth[i], truth[j]), root, none, none, scan_indices(Calibration()))
-    stages = Stages(None, None)
-    recordings = SimpleNamespace(
-        stamps=50.0 + np.arange(80.0), path=np.arange(80.0), of_keyframe=np.zeros(80, dtype=int)
+    ties = ScanEdges(
+        i, j, se2.between(truth[i], truth[j]), np.tile(np.diag(root), (len(i), 1, 1)), none, none, scan_indices(Calibration())
     )
-    stages.findings.extend(check_odometry_steps(
-        SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,))),
-        SimpleNamespace(recordings=recordings, stages=stages),
-    ))
-    return stages
+    recordings = SimpleNamespace(
+        stamps=50.0 + np.arange(80.0), path=truth[:, 0], of_keyframe=np.zeros(80, dtype=int), have_scans=lidar
+    )
+    graph = Graph(truth, edges=(ties,) if len(i) else ())
+    estimate = SimpleNamespace(odometry=wheels, graph=graph, placed=np.array([not lidar]), ranges=None)
+    return list(check_odometry(estimate, SimpleNamespace(recordings=recordings)))
 
 
-def test_steps_that_no_scan_fixes_are_a_doubt():
-    stages = steps_that_slip((1, 2), degenerate=True)
-    assert ([n.kind for n in stages.doubts], stages.warnings) == (["odometry-steps"], [])
+LONG = dict.fromkeys(range(30, 45), (0.0, 0.0, 0.15))
 
 
-@pytest.mark.parametrize("spans", [(1,), (1, 2)])
-def test_wheels_that_slip_are_a_warning_where_scans_fix_the_steps(spans):
-    stages = steps_that_slip(spans)
-    assert stages.doubts == []
-    (notice,) = stages.warnings
-    assert notice.kind == "odometry-steps"
+@pytest.mark.parametrize("scans", [(1,), (1, 2)])
+def test_wheels_that_slip_are_a_warning_where_scans_fix_the_steps(scans):
+    (notice,) = judged(LONG, scans)
+    assert (notice.kind, notice.severity, notice.recording) == ("odometry-steps", "warning", 1)
     assert 25 <= notice.figures["start"] <= 30
     assert 44 <= notice.figures["end"] <= 50
-    assert notice.recording == 1
     assert notice.stretches == ((50.0 + notice.figures["start"], 50.0 + notice.figures["end"]),)
     assert f"`end={notice.figures['start']:.0f}`" in notice.cure
 
 
-@pytest.mark.parametrize(("way", "kind"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])
-@pytest.mark.parametrize("lidar", [False, True])
-def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, lidar):
-    truth = np.column_stack([np.arange(40) * 0.3, np.zeros(40), np.zeros(40)])
-    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
-    wheels.motion[20, 0] += way
-    i, none = np.arange(39), np.zeros((39, 3))
-    root = np.tile(np.eye(3), (39, 1, 1))
-    ties = ScanEdges(i, i + 1, se2.between(truth[:-1], truth[1:]), root, none, none, scan_indices(Calibration()))
-    stages = Stages(None, None)
-    stages.findings.extend(check_slips(
-        SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,) if lidar else ()), placed=np.array([True])),
-        SimpleNamespace(recordings=keyframes_at(50.0 + np.arange(40.0)), stages=stages),
-    ))
-    said = [("doubt", n) for n in stages.doubts] + [("warning", n) for n in stages.warnings]
-    assert [rank for rank, _ in said] == ([] if lidar or kind is None else [kind])
-    assert all(n.figures["way"] == pytest.approx(way, abs=0.05) for _, n in said)
-    assert all(abs(n.figures["turn"]) < 1e-9 for _, n in said)
+@pytest.mark.parametrize(("options", "kind"), [
+    ({"scans": (1, 2), "root": (0.0, 100.0, 1000.0)}, "loose-links"), ({"lidar": False}, "odometry-steps"),
+])  # fmt: skip
+def test_many_steps_that_no_scan_fixes_are_a_doubt(options, kind):
+    assert [n.kind for n in judged(LONG, **options) if n.severity == "doubt"] == [kind]
+
+
+@pytest.mark.parametrize(("way", "found"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])
+def test_a_single_step_far_off_is_named_where_ranges_alone_show_it(way, found):
+    notices = judged({20: (way, 0.0, 0.0)}, lidar=False)
+    assert [(n.kind, n.severity) for n in notices] == ([] if found is None else [("odometry-slips", found)])
+    assert all(n.figures["way"] == pytest.approx(way, abs=0.05) and abs(n.figures["turn"]) < 1e-9 for n in notices)
+
+
+@pytest.mark.parametrize(("options", "found"), [
+    ({"scans": (1,)}, []), ({"loop": True}, []), ({}, ["loose-links"]),
+    ({"scans": (1,), "root": (0.0, 100.0, 100.0)}, ["loose-links"]),
+])  # fmt: skip
+def test_a_single_slip_is_a_doubt_beside_a_lidar_where_no_scans_tie_its_sides(options, found):
+    """A scan of the step itself ties them, and so does one that ties the end to the beginning."""
+    assert [n.kind for n in judged({40: (3.0, 0.0, 0.0)}, **options) if n.severity == "doubt"] == found
 
 
 def test_a_slip_is_the_longest_way_and_turn_of_all_steps_that_slipped():
-    truth = np.column_stack([np.arange(40) * 0.3, np.zeros(40), np.zeros(40)])
-    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
-    wheels.motion[10] += [0.0, 0.3, 0.1]
-    wheels.motion[20] += [0.4, 0.3, 0.05]
-    stages = Stages(None, None)
-    stages.findings.extend(check_slips(
-        SimpleNamespace(odometry=wheels, graph=Graph(truth), placed=np.array([True])),
-        SimpleNamespace(recordings=keyframes_at(100.0 + np.arange(40.0)), stages=stages),
-    ))
-    (notice,) = stages.doubts + stages.warnings
+    (notice,) = judged({10: (0.0, 0.3, 0.1), 20: (0.4, 0.3, 0.05)}, lidar=False)
     assert notice.figures["way"] == pytest.approx(0.5, abs=0.01)
     assert notice.figures["turn"] == pytest.approx(0.1, abs=0.001)
     assert "at t = 10, 20 s" in notice.text
@@ -154,10 +143,12 @@ def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_na
     each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=r))) for r in ratios]
     each.append(SimpleNamespace(log=SimpleNamespace(screening=None)))
     stages = Stages(None, None)
-    stages.findings.extend(check_scales(
-        SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.zeros(0, dtype=bool)),
-        SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages),
-    ))
+    stages.findings.extend(
+        check_scales(
+            SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.zeros(0, dtype=bool)),
+            SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages),
+        )
+    )
     assert [n.figures["lidar_by_wheels"] for n in stages.doubts] == ([] if said is None else [said])
 
 

@@ -17,8 +17,6 @@ from uwblite.assessment.summary import (
     _reason_of_short_ranges,
     _reason_to_distrust,
     _with_times,
-    _without_leaps,
-    _without_strange_biases,
 )
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.findings import doubt
@@ -207,24 +205,6 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
 
 
 @pytest.mark.parametrize(
-    ("biases", "sigma", "strange"),
-    [
-        ((1.2, 1.1, 2.4, 1.3), 0.3, [2]),
-        ((1.2, 1.1, 2.1, 1.3), 0.3, []),
-        ((-1.2, 0.0, 0.1), 0.3, [0]),
-        ((-1.2, 0.0, 0.1), 0.45, []),
-        ((0.0, 1.5, np.nan), 0.1, []),
-        ((0.0, 1.5), 0.1, []),
-    ],
-)
-def test_an_anchor_whose_constant_error_is_far_from_that_of_the_others_is_distrusted(biases, sigma, strange):
-    anchors = tuple(AnchorEstimate("A", np.zeros(2), np.eye(2), 9, 1.0, b, sigma, 0.1, "ok") for b in biases)
-    found = _without_strange_biases(anchors)
-    assert [k for k, a in enumerate(found) if a.status == "distrusted"] == strange
-    assert all("from the others'" in found[k].reason for k in strange)
-
-
-@pytest.mark.parametrize(
     ("used", "sigma", "longest", "bias", "scatter", "reason"),
     [
         (0.5, 4.99, 5.0, -1.6, 1.5, ""),
@@ -352,24 +332,6 @@ def test_the_clock_of_a_move_is_that_of_the_recording_that_shows_it():
     one, other = named("B", "B@2")
     moved = _with_times((one, replace(other, position=np.array([40.0, 0.0]))), ranges, three)
     assert [a.since for a in moved] == [800.0, 900.0]
-    assert [a.status for a in _without_leaps(moved, ranges, three)] == ["ok", "ok"]
-    quick = replace(ranges, stamps=np.array([50.0, 890.0, 900.0, 0.0, 5.0]))
-    assert [a.status for a in _without_leaps(moved, quick, three)] == ["distrusted", "distrusted"]
-
-
-@pytest.mark.parametrize(("way", "silent", "other", "leaps"), [
-    (10.5, 4.0, 90.0, True), (9.5, 4.0, 90.0, False), (26.0, 12.0, 90.0, True), (26.0, 60.0, 90.0, False),
-    (26.0, 12.0, 27.0, False), (26.0, 12.0, 1.0, False), (np.nan, 4.0, 90.0, False),
-])  # fmt: skip
-def test_an_anchor_that_leaps_farther_than_it_is_carried_has_a_wrong_place(way, silent, other, leaps):
-    """Silent for so many seconds, a range left out apart; 6 m and 1 m/s are possible, and names of two that were exchanged."""
-    ranges = plain_ranges(np.zeros(5, int), np.array([0, 1, 1, 1, 2]), np.ones(5), 0.1)
-    left_out = np.array([1.0, 1.0, 1.0, 0.0, 1.0])
-    ranges = replace(ranges, stamps=np.array([0.0, 3.0, 10.0, 12.0, 10.0 + silent]), weights=left_out)
-    places = {"A": (other, 0.0), "B": (0.0, 0.0), "B@2": (way, 0.0)}
-    anchors = _with_times(tuple(replace(a, position=np.array(places[a.id])) for a in named(*places)), ranges, ONE)
-    assert [a.status for a in _without_leaps(anchors, ranges, ONE)] == ["ok", *["distrusted" if leaps else "ok"] * 2]
-    assert _without_leaps(anchors, None, ONE) == anchors
 
 
 @pytest.mark.parametrize(("short", "count", "distrusted"), [(3, 20, False), (4, 20, True), (4, 80, False), (5, 80, True)])
@@ -378,15 +340,6 @@ def test_an_anchor_with_ranges_shorter_than_the_distance_is_elsewhere_at_times(s
     found = _reason_of_short_ranges(short, count)
     assert bool(found) == distrusted
     assert not distrusted or f"{short} of its {count} ranges" in found
-
-
-def test_both_places_of_an_anchor_are_uncertain_where_one_is_mirror_ambiguous():
-    ranges = replace(plain_ranges(np.zeros(3, int), np.array([0, 1, 2]), np.ones(3), 0.1), stamps=np.array([0.0, 3.0, 10.0]))
-    a, b, later = _with_times(named("A", "B", "B@2"), ranges, ONE)
-    found = _without_leaps((a, replace(b, status="mirror-ambiguous"), later), ranges, ONE)
-    assert [anchor.status for anchor in found] == ["ok", "mirror-ambiguous", "distrusted"]
-    found = _without_leaps((a, b, replace(later, status="mirror-ambiguous")), ranges, ONE)
-    assert [anchor.status for anchor in found] == ["ok", "distrusted", "mirror-ambiguous"]
 
 
 @pytest.mark.parametrize(

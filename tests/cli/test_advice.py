@@ -9,10 +9,10 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite.assessment.recording import diagnose
 from uwblite.cli import main
-from uwblite.cli.formats import read_recording
 from uwblite.cli.wording import with_options
 from uwblite.errors import DataError
 from uwblite.io.carmen import write_log
+from uwblite.io.formats import read_recording
 from uwblite.screening.screen import screen
 
 

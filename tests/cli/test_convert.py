@@ -10,13 +10,15 @@ from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 
 
-def test_a_log_goes_to_tables_and_back(room_log, tmp_path, capsys):
+def test_a_log_goes_to_tables_and_back(short_log, tmp_path, capsys):
     tables, back = tmp_path / "tables", tmp_path / "back.log.gz"
-    assert main(["convert", str(room_log), str(tables) + "/"]) == 0
-    assert "4801 odometry readings, 735 ranges, 1200 scans" in capsys.readouterr().out
+    assert main(["convert", str(short_log), str(tables) + "/"]) == 0
+    one = read_log(short_log)
+    counts = f"501 odometry readings, {len(one.ranges.stamps)} ranges, {len(one.scans.stamps)} scans"
+    assert counts in capsys.readouterr().out
     assert main(["convert", str(tables), str(back)]) == 0
     assert "next: uwblite check" in capsys.readouterr().out
-    one, two = read_log(room_log), read_log(back)
+    two = read_log(back)
     np.testing.assert_array_equal(one.ranges.ranges, two.ranges.ranges)
     np.testing.assert_array_equal(one.scans.ranges, two.scans.ranges)
     np.testing.assert_allclose(one.odometry.poses, two.odometry.poses, atol=2e-6)
@@ -25,16 +27,17 @@ def test_a_log_goes_to_tables_and_back(room_log, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_log_goes_to_a_bag_and_back(room_log, tmp_path, capsys, storage):
+def test_a_log_goes_to_a_bag_and_back(short_log, tmp_path, capsys, storage):
     pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
     bag, back = tmp_path / "bag", tmp_path / "back.log"
-    assert main(["convert", str(room_log), str(bag), "--to", storage, "--end", "60"]) == 0
+    assert main(["convert", str(short_log), str(bag), "--to", storage, "--end", "15"]) == 0
     assert main(["convert", str(bag), "--list"]) == 0
     listed = capsys.readouterr().out
     assert "/scan" in listed
     assert "<- ranges" in listed
     assert main(["convert", str(bag), str(back)]) == 0
-    one, two = read_log(room_log).crop(-np.inf, read_log(room_log).odometry.stamps[0] + 60.0), read_log(back)
+    one, two = read_log(short_log), read_log(back)
+    one = one.crop(end=one.odometry.stamps[0] + 15.0)
     np.testing.assert_allclose(one.ranges.ranges, two.ranges.ranges, atol=1e-4)
     np.testing.assert_array_equal(one.scans.ranges, two.scans.ranges)
     np.testing.assert_allclose(one.mounting.T_base_laser, two.mounting.T_base_laser, atol=1e-6)
@@ -122,19 +125,9 @@ def test_an_anchor_without_a_position_is_found_from_its_ranges(tmp_path, capsys)
     assert json.loads(capsys.readouterr().out)["unplaced_anchors"] == []
 
 
-@pytest.mark.parametrize(
-    ("name", "optimum"),
-    [
-        ("efpno_input_M3500_original", 137.912951),
-        ("efpno_manhattanOlson3500", 146.076613),
-        ("sesync_intel", 45.004696),
-        ("sesync_CSAIL", 40.555129),
-    ],
-)
-def test_public_graphs_reach_their_optimum(shared_data, name, optimum, capsys):
-    words = ["--from-odometry"] if "CSAIL" in name else []
-    assert main(["optimize", str(shared_data / "pose_graphs" / f"{name}.g2o.gz"), "--json", *words]) == 0
-    assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(optimum, rel=1e-6)
+def test_a_public_graph_reaches_its_optimum_from_its_odometry(shared_data, capsys):
+    assert main(["optimize", str(shared_data / "pose_graphs" / "sesync_CSAIL.g2o.gz"), "--json", "--from-odometry"]) == 0
+    assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(40.555129, rel=1e-6)
 
 
 def test_plaza_from_odometry(shared_data, tmp_path, capsys):

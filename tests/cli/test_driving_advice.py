@@ -45,6 +45,8 @@ class Place:
     anchors: tuple = ()
     start: tuple = (-2.6, -2.0, 0.0)
     lidar: float = 12.0
+    scans: tuple = (2.5, 120)
+    """1/s, and beams of each."""
     radio: float = np.inf
     silent: tuple = (np.inf, np.inf)
     """s, when the lidar is silent."""
@@ -60,7 +62,8 @@ def recorded(place, legs):
         radio = radio.rows(np.flatnonzero(radio.ranges < place.radio))
     scans = None
     if place.walls is not None:
-        scans = planted.scans(stamps, truth, place.walls, range_max=place.lidar, noise=0.01, rng=rng)
+        rate, beams = place.scans
+        scans = planted.scans(stamps, truth, place.walls, rate, beams, range_max=place.lidar, noise=0.01, rng=rng)
         first, last = place.silent
         scans = scans.rows(np.flatnonzero((scans.stamps < first) | (scans.stamps > last)))
     return planted.recording(wheels, radio, scans), truth
@@ -126,7 +129,7 @@ ROWS = {
         ),
     ),
     "the first part once more": (
-        Place(CORRIDOR, start=(-7.0, -6.0, 0.0), lidar=6.0, silent=(34.0, 60.0)),
+        Place(CORRIDOR, start=(-7.0, -6.0, 0.0), lidar=6.0, scans=(5.0, 180), silent=(34.0, 60.0)),
         OUT,
         [*OUT, *BACK],
         (

@@ -79,15 +79,13 @@ def test_a_folder_and_a_missing_file_are_one_line(tmp_path, capsys):
         assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_standard_input_is_read(tmp_path, short_log):
+def test_standard_input_is_read(short_log, monkeypatch, capsys):
     import gzip
+    import io
 
-    text = gzip.decompress(short_log.read_bytes())
-    done = subprocess.run(
-        [sys.executable, "-m", "uwblite", "check", "-"], input=text, capture_output=True, check=False, timeout=120
-    )
-    assert done.returncode == 0
-    assert b"501 odometry readings" in done.stdout
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(gzip.decompress(short_log.read_bytes()))))
+    assert main(["check", "-"]) == 0
+    assert "501 odometry readings" in capsys.readouterr().out
 
 
 def test_an_unforeseen_fault_is_one_line_and_a_traceback_on_request(monkeypatch, capsys):

@@ -18,7 +18,7 @@ def system(tmp_path, monkeypatch):
     (tmp_path / "proc" / "self").mkdir(parents=True)
     monkeypatch.setattr(memory, "_PROC", str(tmp_path / "proc"))
     monkeypatch.setattr(memory, "_CGROUPS", str(tmp_path / "cgroup"))
-    monkeypatch.setattr(memory, "address_space", lambda: 0)
+    monkeypatch.setattr(memory, "shell_limits", lambda: [])
     monkeypatch.setattr(sys, "maxsize", (1 << 63) - 1)
 
     def write(name, text):
@@ -80,7 +80,7 @@ def test_maps_that_are_made_at_a_time_share_the_memory_but_not_the_addresses(sys
     assert "4 such maps at a time need about 1600 MB" in four.text
     assert "--jobs" in four.text
     assert not four.hopeless, "each of them would fit alone"
-    monkeypatch.setattr(memory, "address_space", lambda: 500_000_000)
+    monkeypatch.setattr(memory, "shell_limits", lambda: [memory.Limit("the shell", 500_000_000, of_addresses=True)])
     assert "4 such maps" in memory.shortage(400.0, maps=4).text
     system("proc/meminfo", "")
     assert memory.shortage(400.0, maps=4) is None
@@ -94,12 +94,13 @@ def test_a_group_that_does_not_hold_the_libraries_is_refused_before_they_are_loa
     assert capsys.readouterr().err == line
 
 
-def test_what_is_mapped_and_not_used_counts_in_the_address_space(system, monkeypatch):
-    monkeypatch.setattr(memory, "address_space", lambda: 300_000_000)
-    system("proc/self/statm", "61000 1000 3 4 0 5 0\n")
+@pytest.mark.parametrize(("kind", "unused"), [("of_addresses", 60_000), ("of_data", 4_000)])
+def test_what_is_mapped_and_not_used_counts_in_the_limits_of_the_shell(system, monkeypatch, kind, unused):
+    monkeypatch.setattr(memory, "shell_limits", lambda: [memory.Limit("the shell's limit", 300_000_000, **{kind: True})])
+    system("proc/self/statm", "61000 1000 100 4 0 4900 0\n")
     page = memory._pages().mapped // 61_000
-    assert memory.shortage(299.0 - 60_000 * page / 1e6) is None
-    assert "ulimit -v" in memory.shortage(301.0 - 60_000 * page / 1e6).text
+    assert memory.shortage(299.0 - unused * page / 1e6) is None
+    assert "shell's limit" in memory.shortage(301.0 - unused * page / 1e6).text
 
 
 def test_a_system_of_32_bits_addresses_so_much(system, monkeypatch):
@@ -154,23 +155,31 @@ def test_a_map_that_takes_long_says_so_beforehand(short_log, monkeypatch, capsys
 
 LIMITED = """
 import resource, sys
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]) * 1_000_000,) * 2)
-sys.argv = ["uwblite", *sys.argv[2:]]
+resource.setrlimit(getattr(resource, sys.argv[1]), (int(sys.argv[2]) * 1_000_000,) * 2)
+sys.argv = ["uwblite", *sys.argv[3:]]
 from uwblite.__main__ import start
 sys.exit(start())
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the address space is limited on Linux")
-@pytest.mark.parametrize("megabytes", [60, 150, 260])
-def test_with_too_little_address_space_the_end_comes_soon_and_in_one_line(megabytes, short_log, tmp_path):
-    words = [str(megabytes), "map", str(short_log), "--out", str(tmp_path / "map"), "-q"]
+@pytest.mark.parametrize(
+    ("kind", "megabytes", "need", "command"),
+    [
+        ("RLIMIT_AS", 60, "300 MB of addresses", "ulimit -v"), ("RLIMIT_AS", 260, "300 MB of addresses", "ulimit -v"),
+        ("RLIMIT_DATA", 60, "200 MB of data", "ulimit -d"), ("RLIMIT_DATA", 150, "200 MB of data", "ulimit -d"),
+    ],
+)  # fmt: skip
+def test_where_the_shell_allows_too_little_the_end_comes_soon_and_in_one_line(
+    kind, megabytes, need, command, short_log, tmp_path
+):
+    words = [kind, str(megabytes), "map", str(short_log), "--out", str(tmp_path / "map"), "-q"]
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, *words], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 1, done.stdout + done.stderr
-    assert done.stderr.startswith("uwblite: error: out of memory; numpy and scipy alone need 300 MB of addresses")
-    assert f"{megabytes} MB (ulimit -v)" in done.stderr
+    assert done.stderr.startswith(f"uwblite: error: out of memory; numpy and scipy alone need {need}")
+    assert f"{megabytes} MB ({command})" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

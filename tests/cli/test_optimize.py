@@ -9,11 +9,11 @@ from helpers.planted_graphs import at_random, lawn, loop
 
 from uwblite import se2
 from uwblite.cli import main
-from uwblite.cli.formats import write_graph
 from uwblite.graph.graph import PriorEdges
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.solver import SolverConfig, optimize
+from uwblite.io.formats import write_graph
 from uwblite.io.g2o import read_g2o
 from uwblite.io.graph_file import GraphFile
 

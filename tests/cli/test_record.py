@@ -10,9 +10,8 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import main
-from uwblite.drivers import ports
 from uwblite.drivers.devices import DEVICES
-from uwblite.drivers.transport import check_url
+from uwblite.drivers.transport import PluggedIn, check_url
 from uwblite.errors import ConfigError
 
 REFUSED = {
@@ -195,7 +194,7 @@ def test_without_pyserial_nothing_is_tried_for_ever(tmp_path, monkeypatch, capfd
 
 def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
     """A Raspberry Pi's header has a UART, whether something hangs on it or not."""
-    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [ports.PluggedIn("/dev/ttyS0", "ttyS0", "")])
+    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [PluggedIn("/dev/ttyS0", "ttyS0", "")])
     assert main(["devices"]) == 1
     output = capfd.readouterr()
     assert "all is well" not in output.err + output.out
@@ -204,7 +203,9 @@ def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
 
 
 def test_with_a_usb_device_nothing_is_said_to_be_missing(monkeypatch, capfd):
-    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [ports.PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")])
+    monkeypatch.setattr(
+        "uwblite.cli.devices.plugged_in", lambda: [PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")]
+    )
     assert main(["devices", "--list"]) == 0
     assert "no USB device" not in capfd.readouterr().err
 

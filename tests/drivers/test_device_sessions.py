@@ -15,7 +15,7 @@ from helpers.driver_harness import of_kind, simulate
 from uwblite.drivers.dwm1001_driver import Dwm1001Driver
 from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud
 from uwblite.drivers.scip import Reply
-from uwblite.drivers.scip_commands import Geometry
+from uwblite.drivers.scip_commands import Geometry, ScanRequest
 from uwblite.drivers.scip_driver import ScipDriver
 from uwblite.drivers.session import Session
 
@@ -79,7 +79,7 @@ def test_lidar_reports_who_it_is_and_its_geometry():
 @pytest.mark.parametrize("options", [{"cluster": 3}, {"skip": 1}, {"wide": False}, {"start": 128, "end": 640}])
 def test_lidar_sub_sampled(options):
     device, sent = lidar()
-    actions, _ = simulate(ScipDriver(**options), device, 4.0)
+    actions, _ = simulate(ScipDriver(ScanRequest(**options)), device, 4.0)
     scans = of_kind(actions, LaserScan)
     assert len(scans) > (12 if "skip" in options else 20)
     assert not of_kind(actions, Lost)
@@ -100,7 +100,7 @@ def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
     device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 60_000, clock_skew=skew))
     rng = random.Random(0)
     delay = lambda: 0.04 if rng.random() < 0.02 else rng.expovariate(1000)  # noqa: E731
-    actions, _ = simulate(ScipDriver(44, 107), device, 120.0, jitter=delay)
+    actions, _ = simulate(ScipDriver(ScanRequest(44, 107)), device, 120.0, jitter=delay)
     scans = of_kind(actions, LaserScan)
     assert len(scans) > 1180
     assert not names(actions) & {"lidar-clock-reset", "lidar-restart"}

@@ -11,6 +11,7 @@ from emulators.world import LogWorld, RoomWorld, WorldClock
 from helpers.driver_harness import ROOT
 from simulation import laser
 
+from uwblite.drivers.scip_commands import ScanRequest
 from uwblite.drivers.scip_driver import ScipDriver
 from uwblite.drivers.session import Session
 from uwblite.drivers.transport import open_port
@@ -119,7 +120,7 @@ def test_urls_that_do_not_open_are_one_clear_error(url):
 
 
 def test_steps_that_the_unit_does_not_have_are_refused_at_once():
-    session = Session(ScipDriver(0, 900))
+    session = Session(ScipDriver(ScanRequest(0, 900)))
     session.start(0.0)
     session.tick(1.0)
     session.feed(b"QT\n00P\n\n", 1.1)

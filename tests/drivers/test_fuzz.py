@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 
 from uwblite.drivers.create2 import Create2Protocol
 from uwblite.drivers.devices import DEVICES, open_device
-from uwblite.drivers.dwm1001 import TlvProtocol
 from uwblite.drivers.dwm1001_shell import ShellProtocol
-from uwblite.drivers.gyro_line import gyro_format
+from uwblite.drivers.dwm1001_tlv import TlvProtocol
 from uwblite.drivers.kobuki import KobukiProtocol
 from uwblite.drivers.ldlidar import LdLidarProtocol
 from uwblite.drivers.lds01 import Lds01Protocol
 from uwblite.drivers.linktrack import Bu03Protocol, LinkTrackProtocol
-from uwblite.drivers.odometry_line import LineFormat, values_by
+from uwblite.drivers.odometry_line import LineFormat, gyro_format, values_by
 from uwblite.drivers.rplidar import RpLidarProtocol
 from uwblite.drivers.scip import ScipProtocol
 from uwblite.drivers.text_lines import LineProtocol

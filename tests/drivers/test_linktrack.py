@@ -10,7 +10,7 @@ from helpers.driver_harness import check_transcript, feed_whole, good
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Note
 from uwblite.drivers.linktrack import Bu03Protocol, LinkTrackProtocol
-from uwblite.drivers.uwb_driver import MUCH
+from uwblite.drivers.uwb_line import MUCH
 
 PROTOCOLS = {"linktrack": LinkTrackProtocol, "bu03": Bu03Protocol}
 RNG = random.Random(4)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from uwblite.drivers.link import Mounting
-from uwblite.drivers.log_text import LogText
+from uwblite.drivers.link import Host, Mounting
+from uwblite.drivers.log_file import LogText
 
 
 class Written:
@@ -18,8 +18,8 @@ class Written:
 
 def text_at(*moments):
     """Return a text whose clock shows these moments, s, one after the other; it began at 50 s, 1000 s before wall time."""
-    clock, log = iter(moments), Written()
-    return LogText(log, Mounting(params=(("anchor_height", "2.0"),)), lambda: next(clock), 50.0, 1000.0, "robot"), log
+    clock, log = iter((50.0, *moments)), Written()
+    return LogText(log, Mounting(params=(("anchor_height", "2.0"),)), Host("robot", lambda: next(clock), 1000.0)), log
 
 
 @pytest.mark.parametrize(("moment", "elapsed"), [(50.25, "0.250"), (49.0, "0.000"), (3650.0, "3600.000")])

@@ -6,8 +6,9 @@ import random
 import pytest
 from helpers.driver_harness import check_transcript, feed_whole, good
 
+from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Note, OdometryPose
-from uwblite.drivers.odometry_line import LineFormat, OdometryLineDriver, parse_format, values_by
+from uwblite.drivers.odometry_line import LineFormat, OdometryLineDriver, odometry_format, values_by
 from uwblite.drivers.text_lines import Line, LineProtocol
 from uwblite.errors import ConfigError
 
@@ -41,7 +42,7 @@ def test_lines_that_do_not_fit_are_corrupt(line):
 
 
 def test_prefix_and_skipped_columns():
-    spec = parse_format({"columns": "-,t,x,y,theta", "prefix": "ODO ", "time_unit": "0.001", "angle_unit": "0.0174532925"})
+    spec = odometry_format("-,t,x,y,theta", prefix="ODO ", time_unit=0.001, angle_unit=0.0174532925)
     (sample,) = protocol(spec).feed(b"[info] started\n#ODO 77 2500 1.0 2.0 90\n", 3.0)
     (pose,) = OdometryLineDriver(spec).measured(sample)
     assert (pose.x, pose.y) == (1.0, 2.0)
@@ -51,7 +52,7 @@ def test_prefix_and_skipped_columns():
 
 def test_ticks_follow_a_circle_and_wrap():
     """A full turn on a circle of 1 m radius in 2,000 steps closes to the rounding of the ticks."""
-    spec = parse_format({"columns": "t,left,right", "tick": "1e-4", "wheel_base": "0.3", "tick_modulus": "65536"})
+    spec = odometry_format("t,left,right", tick=1e-4, wheel_base=0.3, tick_modulus=65536)
     driver = OdometryLineDriver(spec)
     for k in range(2001):
         angle = 2 * math.pi * k / 2000
@@ -64,12 +65,19 @@ def test_ticks_follow_a_circle_and_wrap():
 
 @pytest.mark.parametrize(
     "options",
-    [{"columns": "t,x"}, {"columns": "t,x,y,theta,theta"}, {"columns": "t,left,right"}, {"colums": "t"}, {"tick": "abc"},
-     {"columns": "t,left,right", "tick": "0", "wheel_base": "0.3"}, {"columns": "t,x,y,psi"}],
-)  # fmt: skip
+    [
+        "columns=t,x",
+        "columns=t,x,y,theta,theta",
+        "columns=t,left,right",
+        "colums=t",
+        "tick=abc",
+        "columns=t,left,right&tick=0&wheel_base=0.3",
+        "columns=t,x,y,psi",
+    ],
+)
 def test_formats_that_make_no_pose_are_refused(options):
     with pytest.raises(ConfigError):
-        parse_format(options)
+        open_device("odometry", f"line:/dev/null?{options}")
 
 
 def test_memory_is_bounded():

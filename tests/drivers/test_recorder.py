@@ -14,7 +14,7 @@ from helpers.virtual_recording import VirtualTime
 from uwblite.drivers import link as link_module
 from uwblite.drivers.devices import DEVICES, open_device
 from uwblite.drivers.events import Corrupt
-from uwblite.drivers.link import Link
+from uwblite.drivers.link import Host, Link
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
 from uwblite.drivers.transport import open_port
@@ -87,10 +87,8 @@ def record(tmp_path, ports, seconds, open_one, wall=None):
     """Record in simulated time and return the recorder and the notes; `open_one` and `wall` get (URL and) the clock."""
     links = [Link(name, spec, open_device(sensor, spec)[0]) for name, (sensor, spec) in ports.items()]
     log, notes, clock = LogFile(tmp_path / "run.log", sync=60.0), [], VirtualTime()
-    recorder = Recorder(
-        links, log, monotonic=clock, wall_offset=0.0, host="h", on_note=lambda t, n: notes.append((t, n)),
-        open_port=lambda url, baud: open_one(url, clock), wall=wall and (lambda: wall(clock())),
-    )  # fmt: skip
+    host = Host("h", clock, 0.0, wall and (lambda: wall(clock())), lambda url, baud: open_one(url, clock))
+    recorder = Recorder(links, log, host, on_note=lambda t, n: notes.append((t, n)))
     recorder._selector = Waiting(clock)
     recorder.begin([])
     with mock.patch.object(link_module, "Opening", OpenedAtOnce):

@@ -44,11 +44,11 @@ def test_transcript_in_every_split_and_among_noise(name):
 
 
 @pytest.mark.parametrize("name", LIDARS)
-@pytest.mark.parametrize("wobble", [0.0, 0.02])
-def test_scans_are_right_in_range_and_time(name, wobble):
-    """Jitter of 1 ms on the line; stamps within 2 ms, and readings within the 1 mm that the lidars resolve."""
+def test_scans_are_right_in_range_and_time(name):
+    """Turns of a length that varies by 2 %, jitter of 1 ms on the line; stamps within 2 ms, and readings within the
+    1 mm that the lidars resolve."""
     rng = random.Random(3)
-    actions, turns, _ = run(name, 5.0, device=emulator(name, wobble=wobble), jitter=lambda: rng.expovariate(1000.0))
+    actions, turns, _ = run(name, 5.0, device=emulator(name, wobble=0.02), jitter=lambda: rng.expovariate(1000.0))
     scans = of_kind(actions, LaserScan)
     assert len(scans) >= len(turns) - 3
     assert len({(len(s.ranges), s.angle_min, s.angle_increment, s.range_max) for s in scans}) == 1
@@ -80,7 +80,7 @@ def test_damage_costs_frames_but_invents_nothing(name, fault):
 
 @pytest.mark.parametrize("name", LIDARS)
 def test_the_wrong_bit_rate_is_survived(name):
-    actions, _, _ = run(name, 6.0, line=FaultyLine([parse_fault("baud")], seed=1))
+    actions, _, _ = run(name, 3.0, line=FaultyLine([parse_fault("baud")], seed=1))
     assert not of_kind(actions, LaserScan)
 
 

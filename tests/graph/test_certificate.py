@@ -8,14 +8,13 @@ from helpers.planted_graphs import every_kind, loop, plain_ranges, relative_edge
 from scipy import sparse
 
 from uwblite import se2
-from uwblite.graph.certificate import _gap, _is_positive, certificate_matrix, certify
+from uwblite.graph.certificate import TangentForm, _gap, _is_positive, certificate_matrix, certify
 from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
-from uwblite.graph.tangent_forms import TangentForm
 from uwblite.io.g2o import read_g2o
 
 CAREFUL = SolverConfig(relative_decrease=1e-15)

@@ -5,22 +5,35 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import calibrated_loop, dense_system, loop
+from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_system, loop, relative_edges
 
+from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph import joint_covariance
 from uwblite.graph.graph import Graph
 from uwblite.graph.joint_covariance import JointCovariance, calibration_covariance
-from uwblite.graph.marginals import marginals
 
 
 @pytest.mark.parametrize("chosen", [np.arange(0, 60, 7), np.array([40, 3, 17]), np.array([5]), np.array([0]), np.arange(60)])
-def test_joint_covariances_of_chosen_poses_are_those_of_all(chosen):
+def test_joint_covariances_of_chosen_poses_are_those_of_the_dense_inverse(chosen):
     graph, _ = calibrated_loop()
-    i, j = np.meshgrid(chosen, chosen)
-    i, j = i.ravel(), j.ravel()
-    joint = JointCovariance(graph, chosen)
-    np.testing.assert_allclose(joint.relative(i, j), marginals(graph).relative(i, j), rtol=1e-6, atol=1e-12)
+    i, j = (ends.ravel() for ends in np.meshgrid(chosen, chosen))
+    covariance = dense_covariance(graph)
+    for a, b, relative in zip(i, j, JointCovariance(graph, chosen).relative(i, j), strict=True):
+        J = np.hstack(se2.between_jacobians(graph.poses[a], graph.poses[b]))
+        joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
+        np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
+
+
+def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
+    truth = np.cumsum(np.full((5, 3), 0.2), axis=0)
+    sigma = np.array([0.1, 0.05, 0.02])
+    graph = Graph(truth, edges=(relative_edges(truth, range(4), range(1, 5), sigma),))
+    relative = JointCovariance(graph, np.arange(5)).relative([1, 2, 3], [2, 3, 4])
+    # The edge's error Z^-1 (Xi^-1 Xj) stands in the frame of pose j, which is turned by 0.2 against that of pose i.
+    c, s = np.cos(0.2), np.sin(0.2)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(relative, np.tile(turn @ np.diag(sigma**2) @ turn.T, (3, 1, 1)), atol=1e-12)
 
 
 def test_joint_covariances_where_something_is_not_measured():

@@ -1,22 +1,17 @@
+"""Covariances of unknowns, of the shape of a path, and of unknowns that a model lacks."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import calibrated_loop, dense_system, loop, relative_edges
+from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
-from uwblite.graph.marginals import CommonErrors, marginals
+from uwblite.graph.joint_covariance import JointCovariance
+from uwblite.graph.marginals import CommonErrors, about_best_fit, added_unknown, added_unknown_and_moves, marginals, shape_error
 from uwblite.graph.solver import optimize
 from uwblite.graph.variance_components import variances_of_kinds
-
-
-def dense_covariance(graph):
-    """Return the covariance of every block of unknowns with every other, zero where fixed, by a dense inverse."""
-    H, _, number = dense_system(graph)
-    padded = np.zeros((len(H) + 1, len(H) + 1))
-    padded[:-1, :-1] = np.linalg.inv(H)
-    return lambda a, i, b, j: padded[np.ix_(number[a][i], number[b][j])]
 
 
 @pytest.mark.parametrize("n", [8, 60, 300])
@@ -41,31 +36,6 @@ def test_fixed_unknowns_have_no_covariance():
     np.testing.assert_allclose(found.covariances.anchors[2], covariance("anchors", 2, "anchors", 2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("few", [True, False])
-def test_relative_covariances_follow_from_the_joint_one(few):
-    graph, _ = calibrated_loop()
-    rng = np.random.default_rng(0)
-    i, j = rng.integers(0, 3 if few else 60, 200), rng.integers(0, 60, 200)
-    i[:2], j[:2] = [0, 5], [5, 0]  # from and to the fixed pose
-    covariance, found = dense_covariance(graph), marginals(graph)
-    for a, b, relative in zip(i, j, found.relative(i, j), strict=True):
-        J = np.hstack(se2.between_jacobians(graph.poses[a], graph.poses[b]))
-        joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
-        np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(found.relative(j, i)[2], found.relative(j[2], i[2])[0], rtol=1e-9)
-
-
-def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
-    truth = np.cumsum(np.full((5, 3), 0.2), axis=0)
-    sigma = np.array([0.1, 0.05, 0.02])
-    graph = Graph(truth, edges=(relative_edges(truth, range(4), range(1, 5), sigma),))
-    relative = marginals(graph).relative([1, 2, 3], [2, 3, 4])
-    # The edge's error Z^-1 (Xi^-1 Xj) stands in the frame of pose j, which is turned by 0.2 against that of pose i.
-    c, s = np.cos(0.2), np.sin(0.2)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(relative, np.tile(turn @ np.diag(sigma**2) @ turn.T, (3, 1, 1)), atol=1e-12)
-
-
 @pytest.mark.slow
 def test_covariances_are_those_of_repeated_experiments():
     """300 graphs that differ by their noise: errors over predicted sigmas have mean square 1 to sqrt(2 / 300) each."""
@@ -86,7 +56,7 @@ def test_covariances_are_those_of_repeated_experiments():
         away = graph.anchors[0] - anchors[0]
         sums += [
             error @ np.linalg.solve(found.covariances.poses[8], error) / 3,
-            across @ np.linalg.solve(found.relative([3], [12])[0], across) / 3,
+            across @ np.linalg.solve(JointCovariance(graph, np.array([3, 12])).relative([3], [12])[0], across) / 3,
             away @ np.linalg.solve(found.covariances.anchors[0], away) / 2,
         ]
     np.testing.assert_allclose(sums / repeats, 1.0, atol=4.0 * np.sqrt(2.0 / 2 / repeats))
@@ -179,3 +149,98 @@ def test_redundancy_is_the_diagonal_of_the_dense_projection():
     for edges, part in zip(graph.edges, parts, strict=True):
         np.testing.assert_allclose(found.redundancy(edges).ravel(), checked[part], atol=1e-7)
     assert checked.sum() == pytest.approx(len(checked) - jacobian.shape[1])
+
+
+def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
+    """Errors drawn from a covariance of no structure, small beside the path; a similarity is z -> a z + b."""
+    rng = np.random.default_rng(2)
+    poses = rng.normal(loc=[40.0, -20.0, 0.0], scale=10.0, size=(7, 3))
+    root = 1e-3 * rng.normal(size=(21, 21))
+    errors = (root @ rng.normal(size=(21, 4000))).reshape(7, 3, -1)
+    path, drawn = poses[:, 0] + 1j * poses[:, 1], errors[:, 0] + 1j * errors[:, 1]
+    fit = np.column_stack([path, np.ones(7)])
+    left = drawn - fit @ np.linalg.lstsq(fit, drawn, rcond=None)[0]
+    # Of a mean of 4,000 squares that scatter by about themselves.
+    expected = pytest.approx(np.mean(np.abs(left) ** 2), rel=4 / np.sqrt(4000))
+    assert shape_error(poses, root @ root.T) ** 2 == expected
+
+
+def test_moves_turns_and_growth_of_the_whole_are_no_error_of_its_shape():
+    poses = np.random.default_rng(3).normal(scale=5.0, size=(9, 3))
+    modes = np.zeros((4, 9, 3))
+    modes[0, :, 0] = modes[1, :, 1] = 1.0
+    modes[2, :, 0], modes[2, :, 1] = -poses[:, 1], poses[:, 0]
+    modes[3] = poses
+    modes = modes.reshape(4, -1).T
+    assert shape_error(poses, modes @ modes.T) == pytest.approx(0.0, abs=1e-6)
+    assert shape_error(poses, np.eye(27)) == pytest.approx(np.sqrt((18 - 4) / 9))
+
+
+def test_covariances_about_the_best_fit_are_those_of_many_draws_that_were_fitted():
+    rng = np.random.default_rng(5)
+    poses = rng.normal(loc=[40.0, -20.0, 0.0], scale=10.0, size=(6, 3))
+    root = 1e-3 * rng.normal(size=(18, 18))
+    errors = (root @ rng.normal(size=(18, 4000))).T.reshape(-1, 6, 3)
+    fits = np.array([se2.align(poses[:, :2] + e[:, :2], poses[:, :2]) for e in errors])
+    left = np.array([se2.compose(fit, poses + e) - poses for fit, e in zip(fits, errors, strict=True)])
+    left[..., 2] = se2.wrap_angle(left[..., 2])
+    drawn = np.einsum("nki,nkj->kij", left, left) / len(left)
+    stated = about_best_fit(poses, root @ root.T)
+    scale = np.sqrt(np.einsum("kii->ki", stated))
+    both = scale[:, :, None] * scale[:, None, :]
+    np.testing.assert_allclose(drawn / both, stated / both, atol=0.1)
+
+
+def test_a_move_of_the_whole_bends_it_nowhere():
+    poses = np.random.default_rng(3).normal(scale=5.0, size=(9, 3))
+    modes = np.tile(np.eye(3), (9, 1, 1))
+    modes[:, 0, 2], modes[:, 1, 2] = -poses[:, 1], poses[:, 0]
+    modes = modes.reshape(27, 3)
+    np.testing.assert_allclose(about_best_fit(poses, modes @ modes.T), 0.0, atol=1e-9)
+
+
+def test_each_is_as_if_solved_for_with_all_others():
+    graph = optimize(loop()[0])[0]
+    ranges, rng = graph.edges[2], np.random.default_rng(1)
+    shifts = rng.normal(size=(3, len(ranges), 1))
+    values, sigmas = added_unknown(graph, ranges, shifts)
+    normal, gradient, number = dense_system(graph)
+    lin, weights = ranges.linearize(graph), edge_weights(ranges, graph)
+    for shift, value, sigma in zip(shifts, values, sigmas, strict=True):
+        column = np.zeros(len(normal) + 1)
+        for e in range(len(ranges)):
+            for name, index, jacobian in lin.blocks:
+                np.add.at(column, number[name][index[e]], weights[e] * jacobian[e].T @ shift[e])
+        column = column[:-1, None]
+        own = np.sum(weights[:, None] * shift**2)
+        bordered = np.block([[normal, column], [column.T, np.array([[own]])]])
+        right = np.append(gradient, np.sum(weights[:, None] * shift * lin.residuals))
+        # The frame is free in the loop: the least solution, and a covariance without its directions.
+        inverse = np.linalg.pinv(bordered, hermitian=True)
+        np.testing.assert_allclose([value, sigma], [-(inverse @ right)[-1], np.sqrt(inverse[-1, -1])], rtol=1e-5)
+
+
+def test_a_planted_one_is_found():
+    graph = optimize(loop()[0])[0]
+    ranges = graph.edges[2]
+    pattern = np.sin(np.arange(len(ranges)))[:, None]
+    before, _ = added_unknown(graph, ranges, pattern[None])
+    longer = replace(ranges, ranges=ranges.ranges - 0.5 * pattern[:, 0] * ranges.sigma)
+    changed = optimize(replace(graph, edges=(*graph.edges[:2], longer)))[0]
+    after, sigma = added_unknown(changed, changed.edges[2], pattern[None])
+    # All residuals grew by half of the pattern: half of a unit less is what takes it off.
+    np.testing.assert_allclose(before - after, 0.5, rtol=0.02)
+    assert sigma[0] > 0.0
+
+
+def test_the_places_are_said_that_poses_would_have_with_it():
+    graph = loop()[0]
+    graph = optimize(replace(graph, fixed_poses=np.arange(len(graph.poses)) == 0))[0]
+    ranges, odd = graph.edges[2], np.sin(np.arange(len(graph.edges[2])))[:, None]
+    values, sigmas, moves = added_unknown_and_moves(graph, ranges, 2.0 * odd[None])
+    np.testing.assert_array_equal(added_unknown(graph, ranges, 2.0 * odd[None]), [values, sigmas])
+    with_it = replace(ranges, ranges=ranges.ranges - values[0] * 2.0 * odd[:, 0] * ranges.sigma)
+    expected = (optimize(replace(graph, edges=(*graph.edges[:2], with_it)))[0].poses - graph.poses)[:, :2]
+    assert np.abs(expected).max() > 5e-4
+    # To first order, and with the robust weights as they stand.
+    np.testing.assert_allclose(moves[0], expected, atol=0.15 * np.abs(expected).max())

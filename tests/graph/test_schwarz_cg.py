@@ -78,7 +78,7 @@ def test_pieces_end_with_their_chains():
 def test_the_minimum_is_that_of_the_factorisation(monkeypatch):
     graph, truth = tied(700, 20)
     found, summary = optimize(graph)
-    monkeypatch.setattr("uwblite.graph.factorization._MANY", 10_000)
+    monkeypatch.setattr("uwblite.graph.elimination._MANY", 10_000)
     expected, direct = optimize(graph)
     assert summary.converged
     assert summary.chi2 == pytest.approx(direct.chi2, rel=1e-6)

@@ -10,12 +10,10 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import ConfigError, DataError
-from uwblite.grid.bresenham import mark_rays
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, from_counts
-from uwblite.grid.ray_counter import WEIGHT_UNIT, RayCounter
-from uwblite.grid.scan_rays import empty_reach, extent, in_runs, moved_scans, scan_rays, seen_reach
-from uwblite.grid.tracing import Sweeps, from_sweeps
+from uwblite.grid.ray_counter import WEIGHT_UNIT, RayCounter, mark_rays
+from uwblite.grid.tracing import Sweeps, empty_reach, extent, from_sweeps, in_runs, moved_scans, scan_rays, seen_reach
 from uwblite.sensor_log import LaserScans
 
 DEFAULT = GridConfig()

@@ -110,6 +110,14 @@ def loop(seed=0, n=60, anchors=3, noise=True):
     return Graph(np.array(start), guess, (odometry, closures, ranges)), truth, where
 
 
+def dense_covariance(graph):
+    """Return the covariance of every block of unknowns with every other, zero where fixed, by a dense inverse."""
+    H, _, number = dense_system(graph)
+    padded = np.zeros((len(H) + 1, len(H) + 1))
+    padded[:-1, :-1] = np.linalg.inv(H)
+    return lambda a, i, b, j: padded[np.ix_(number[a][i], number[b][j])]
+
+
 def dense_system(graph):
     """Return H, g and the numbers of the free scalars, assembled edge by edge from the Jacobians."""
     from uwblite.graph.graph import edge_weights

@@ -1,10 +1,11 @@
 """`uwblite record` in simulated time: the real recorder and sessions against emulated devices, without ports or waiting."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 from unittest import mock
 
 from uwblite.drivers import link as link_module
-from uwblite.drivers.link import Link, Mounting
+from uwblite.drivers.link import Host, Link, Mounting
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
 from uwblite.errors import DeviceError
@@ -124,7 +125,7 @@ def live_devices(devices, seconds, *, begin=None):
     seconds : after which somebody stops it.
     begin : called with the clock's time at the start.
     """
-    from uwblite.cli import named_devices as module
+    from uwblite.cli import record as module
 
     clock, ports = VirtualTime(), {}
     real = Recorder.run
@@ -133,8 +134,8 @@ def live_devices(devices, seconds, *, begin=None):
         ports[url] = VirtualPort(devices[url], clock)
         return ports[url]
 
-    def recorder(links, log, **words):
-        made = Recorder(links, log, **(words | {"monotonic": clock, "wall_offset": 0.0, "open_port": open_port}))
+    def recorder(links, log, host, *rest, **words):
+        made = Recorder(links, log, replace(host, monotonic=clock, wall_offset=0.0, open_port=open_port), *rest, **words)
         made._selector = VirtualSelector(clock, ports)
         if begin:
             begin(clock.now)
@@ -180,10 +181,8 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), par
         return ports[url]
 
     log = LogFile(path)
-    recorder = Recorder(
-        links, log, monotonic=clock, wall_offset=0.0, host="virtual", mounting=Mounting(laser, tuple(params), more_lasers),
-        open_port=open_port,
-    )  # fmt: skip
+    host = Host("virtual", clock, 0.0, open_port=open_port)
+    recorder = Recorder(links, log, host, Mounting(laser, tuple(params), more_lasers))
     recorder._selector = VirtualSelector(clock, ports)
     if begin:
         begin(clock.now)

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.io.carmen_readings import Block, Pending, decode_equal_widths
+from uwblite.io.carmen_laser import Block, Pending, decode_equal_widths
 
 
 @given(st.integers(1, 6), st.integers(1, 2), st.lists(st.integers(0, 10**8 - 1), min_size=6, max_size=6), st.booleans())
@@ -26,7 +26,7 @@ WORD = st.text("0123456789.+-ex", min_size=1, max_size=9).map(str.encode)
 @given(st.lists(st.one_of(WORD, st.floats(0, 99, width=16).map(lambda v: b"%.2f" % v)), min_size=1, max_size=6))
 def test_readings_are_what_float_reads_or_the_line_is_broken(words):
     block = Block.of(b"A 2 " + b" ".join(words) + b" 0\n")
-    (values,), (error,) = block.decode_rows(len(words), [Pending(1, 2, None, 0.0)])
+    (values,), (error,) = block.decode_rows(len(words), [Pending(1, 2, 0.0)])
     try:
         wanted = np.clip(np.array(words, np.float64), -1.0, 1e30).astype(np.float32)
     except ValueError:

@@ -5,9 +5,9 @@ import pytest
 from helpers.room_recording import two_rounds, walls_seen
 
 from uwblite import se2
-from uwblite.cli.formats import read_graph, read_recording
 from uwblite.errors import FormatError
 from uwblite.io.carmen import write_log
+from uwblite.io.formats import read_graph, read_recording
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
 POSES = two_rounds()[:1200:8]

@@ -1,9 +1,20 @@
-"""Columns among cells: circles planted on a grid, seen from all sides or from one, beside walls and beside each other."""
+"""Columns among cells and among rays: seen from all sides or from one, beside walls and beside each other; and what is none."""
 
 import numpy as np
 import pytest
 
-from uwblite.lidar.columns import Landmarks, _scores, find_columns, fit_circle
+from uwblite import se2
+from uwblite.lidar.columns import (
+    Landmarks,
+    _scores,
+    find_columns,
+    fit_circle,
+    fitted_circles,
+    join_circles,
+    refined_columns,
+    surroundings,
+)
+from uwblite.odometry.attached import ScanPoints
 
 CELL = 0.05
 
@@ -100,3 +111,85 @@ def test_a_third_of_the_circle_is_too_little(share, is_found):
 def test_of_two_columns_that_look_alike_the_nearer_one_is_taken():
     both = np.concatenate([circle((1.5, -1.0), 0.25), circle((2.6, -1.0), 0.25)])
     np.testing.assert_allclose(find_columns(both, expected((2.0, -1.0))).positions, [(1.5, -1.0)], atol=1e-3)
+
+
+POSES = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a), a + 2.0] for a in np.arange(0.0, 6.2, 0.5)])
+RADIUS = 0.35
+
+
+def seen(poses, shape, noise=0.01, seed=0):
+    """Rays from poses to what stands about the origin, by a function of origin and direction."""
+    rng, bearing = np.random.default_rng(seed), np.arange(-np.pi, np.pi, 2.0 * np.pi / 1024)
+    parts = []
+    for k, pose in enumerate(poses):
+        way = np.column_stack([np.cos(pose[2] + bearing), np.sin(pose[2] + bearing)])
+        reach = shape(pose[:2], way) + noise * rng.standard_normal(len(way))
+        hit = np.flatnonzero(np.isfinite(reach))
+        points = se2.transform(se2.inverse(pose), pose[:2] + reach[hit, None] * way[hit])
+        parts.append((np.full(len(hit), k), points, hit))
+    keyframe, points, ray = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return ScanPoints(keyframe, points, np.zeros_like(points), ray, keyframe)
+
+
+def round_column(origin, way):
+    along = -(way @ origin)
+    inside = RADIUS**2 - origin @ origin + along**2
+    return np.where((inside > 0.0) & (along > 0.0), along - np.sqrt(np.maximum(inside, 0.0)), np.inf)
+
+
+def square(origin, way):
+    """A box of 50 cm, whose corner looks round to a poor scanner."""
+    with np.errstate(divide="ignore"):
+        low, high = (-0.25 - origin) / way, (0.25 - origin) / way
+    near, far = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+    return np.where((near < far) & (near > 0.0), near, np.inf)
+
+
+def rays_in_map(rays):
+    at = se2.transform(POSES[rays.keyframe], rays.points)
+    way = at - POSES[rays.keyframe, :2]
+    reach = np.hypot(*way.T)
+    return at, way / reach[:, None], np.maximum(0.01, 0.01 * reach)
+
+
+def test_circles_of_many_scans_are_a_column_where_it_stands():
+    rays = seen(POSES, round_column)
+    columns = join_circles(fitted_circles(rays), POSES)
+    assert len(columns) == 1
+    np.testing.assert_allclose(columns[0], [0.0, 0.0, RADIUS], atol=0.05)
+    np.testing.assert_allclose(refined_columns(columns, *rays_in_map(rays))[0], [0.0, 0.0, RADIUS], atol=0.003)
+
+
+def test_a_column_seen_from_too_few_keyframes_is_none():
+    rays = seen(POSES[:2], round_column)
+    assert len(fitted_circles(rays).radius) == 2
+    assert len(join_circles(fitted_circles(rays), POSES)) == 0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_box_is_no_column(seed):
+    rays = seen(POSES, square, seed=seed)
+    columns = join_circles(fitted_circles(rays), POSES)
+    assert len(refined_columns(columns, *rays_in_map(rays))) == 0
+
+
+def test_rays_that_do_not_bend_are_no_circle():
+    rays = seen(POSES, lambda origin, way: np.full(len(way), 30.0))
+    assert len(fitted_circles(rays).radius) == 0
+
+
+@pytest.mark.parametrize("size", [10.0, 3000.0])
+def test_points_near_columns_are_found_by_the_squares_they_lie_in(size):
+    """All that are near, and of each the nearest column, as if every point were compared with every column."""
+    rng = np.random.default_rng(2)
+    columns = np.column_stack([rng.uniform(0.0, size, (7, 2)), rng.uniform(0.1, 0.8, 7)])
+    anywhere, close = rng.uniform(-5.0, size + 5.0, (4000, 2)), rng.standard_normal((999, 2))
+    at = np.concatenate([anywhere, columns[rng.integers(7, size=999), :2] + close])
+    rows, which, away = surroundings(columns, 0.3).nearest(at)
+    apart = np.hypot(*(at[:, None] - columns[None, :, :2]).transpose(2, 0, 1))
+    np.testing.assert_array_equal(which, apart.argmin(axis=1)[rows])
+    np.testing.assert_allclose(away, apart.min(axis=1)[rows], rtol=1e-12)
+    near = np.flatnonzero((apart < columns[:, 2] + 0.3).any(axis=1))
+    assert len(near) > 100
+    assert np.isin(near, rows).all()
+    assert len(surroundings(columns[:0], 0.3).nearest(at)[0]) == 0

@@ -73,7 +73,7 @@ def test_noise_is_learnt_from_the_rays_of_each_place_on_a_surface():
     rays = SurfaceRays(nothing, nothing, np.column_stack([x, y]), way, np.full(4000, 0.02), np.arange(4000))
     wall = Surfaces(np.array([False]), np.array([[0.0, 2.0]]), np.array([-np.pi / 2]), np.zeros(1), np.ones(1))
     noise = noise_of(rays, wall, np.zeros((1, 3)), np.zeros((1, 3)))
-    assert noise.relative(np.array([2.5]))[0] == pytest.approx(1.0, abs=0.15)
+    assert noise.ratio == pytest.approx(1.0, abs=0.15)
     place = np.floor(x).astype(int)
     sums = [((y - 2.0)[place == k] / 0.02).sum() ** 2 for k in range(-4, 4)]
     assert noise.alike[0] == pytest.approx(8 / 6 * np.sum(sums) / np.sum(((y - 2.0) / 0.02) ** 2), rel=0.15)
@@ -82,11 +82,10 @@ def test_noise_is_learnt_from_the_rays_of_each_place_on_a_surface():
 
 def test_sums_are_those_of_single_rays():
     """Every product of derivatives and residuals, robustly weighted, with walls and columns in parts of one keyframe each."""
-    rays, noise = rays_that_end(0.01).by_keyframe(SURFACES), RayNoise(np.linspace(0.7, 1.2, 6), np.array([2.0, 5.0]))
+    rays, noise = rays_that_end(0.01).by_keyframe(SURFACES), RayNoise(0.8, np.array([2.0, 5.0]))
     mounted, kernel = se2.compose(POSES, np.array([0.1, 0.05, 0.02])), 2.5
     lines = linearized(rays, SURFACES, mounted, POSES)
-    relative = noise.relative(np.hypot(*rays.points.T))
-    root = 1.0 / ((1.0 + (lines.residual / (kernel * relative)) ** 2) * relative * np.sqrt(noise.alike[rays.surface]))
+    root = 1.0 / ((1.0 + (lines.residual / (kernel * noise.ratio)) ** 2) * noise.ratio * np.sqrt(noise.alike[rays.surface]))
     by_pose, by_surface, residual = lines.by_pose * root[:, None], lines.by_surface * root[:, None], lines.residual * root
     found = weighted_sums(MeasuredSurfaces(SURFACES, rays, noise), mounted, POSES, kernel)
     assert len(found.keyframe) == 4
@@ -106,7 +105,7 @@ def test_sums_are_those_of_single_rays():
 
 def test_rays_some_at_a_time_say_what_they_say_at_once(monkeypatch):
     rays = rays_that_end(0.01).by_keyframe(SURFACES)
-    found = MeasuredSurfaces(SURFACES, rays, RayNoise(np.ones(6), np.ones(2)))
+    found = MeasuredSurfaces(SURFACES, rays, RayNoise(1.0, np.ones(2)))
     whole, noise = weighted_sums(found, POSES, POSES, 3.0), noise_of(rays, SURFACES, POSES, POSES)
     monkeypatch.setattr("uwblite.lidar.surface_rays._RAYS_AT_ONCE", 7)
     parts = weighted_sums(found, POSES, POSES, 3.0)
@@ -116,7 +115,7 @@ def test_rays_some_at_a_time_say_what_they_say_at_once(monkeypatch):
         if name == "across":
             one, other = one.sum(axis=0), other.sum(axis=0)
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12 * np.abs(other).max())
-    np.testing.assert_array_equal(noise_of(rays, SURFACES, POSES, POSES).by_distance, noise.by_distance)
+    assert noise_of(rays, SURFACES, POSES, POSES).ratio == noise.ratio
 
 
 def test_a_pillar_that_is_not_round_does_not_fit_a_circle():
@@ -136,5 +135,5 @@ def test_a_pillar_that_is_not_round_does_not_fit_a_circle():
         reach = reach + 0.02 * rng.standard_normal(900)
         nothing, sigma = np.zeros(900, dtype=np.intp), np.full(900, 0.02)
         rays = SurfaceRays(keyframe, nothing, reach[:, None] * way, way, sigma, np.arange(900))
-        found = MeasuredSurfaces(column, rays.by_keyframe(column), RayNoise(np.ones(6), np.ones(2)))
+        found = MeasuredSurfaces(column, rays.by_keyframe(column), RayNoise(1.0, np.ones(2)))
         assert least < misfit(found, poses, poses)[0] < most

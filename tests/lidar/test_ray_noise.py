@@ -1,4 +1,4 @@
-"""Noise of rays as residuals show it: planted scales by distance, planted errors of places."""
+"""Noise of rays as residuals show it: planted scales, planted errors of places."""
 
 import numpy as np
 import pytest
@@ -18,16 +18,14 @@ def planted(own, shared, seed=0):
     return own * rng.standard_normal(len(surface)) + shared * of_place, place, surface
 
 
-def test_noise_by_distance_is_the_one_planted():
+@pytest.mark.parametrize("true", [0.3, 1.0, 1.5])
+def test_the_noise_is_the_one_planted(true):
     residual, place, surface = planted(1.0, 0.0)
-    reach = np.exp(np.random.default_rng(1).uniform(np.log(0.5), np.log(23.0), len(residual)))
-    true = np.array([1.5, 1.0, 0.7, 0.4, 0.3])[np.searchsorted([1.5, 3.0, 6.0, 12.0], reach)]
-    noise = learnt_noise(residual * true, reach, place, surface, np.zeros(SURFACES, dtype=bool))
+    noise = learnt_noise(residual * true, place, surface, np.zeros(SURFACES, dtype=bool))
     # Relative standard deviation of a median absolute deviation of n normal values: 1.17 / sqrt(n).
-    fewest = min(np.sum(true == value) for value in np.unique(true))
-    np.testing.assert_allclose(noise.relative(reach), true, rtol=4.0 * 1.17 / np.sqrt(fewest))
-    few = learnt_noise(residual[:50], reach[:50], place[:50], surface[:50], np.zeros(SURFACES, dtype=bool))
-    np.testing.assert_array_equal(few.by_distance, UNLEARNT.by_distance)
+    assert noise.ratio == pytest.approx(true, rel=4.0 * 1.17 / np.sqrt(len(residual)))
+    few = learnt_noise(residual[:50], place[:50], surface[:50], np.zeros(SURFACES, dtype=bool))
+    assert few.ratio == UNLEARNT.ratio
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.2, 0.5])
@@ -35,7 +33,7 @@ def test_what_rays_of_a_place_have_in_common_counts_against_them(shared):
     """The variance of a sum of n residuals with a common part c is n (1 + (n - 1) c); half of the surfaces are columns."""
     residual, place, surface = planted(np.sqrt(1.0 - shared**2), shared, seed=3)
     curved = np.arange(SURFACES) >= SURFACES // 2
-    noise = learnt_noise(residual, np.full(len(residual), 2.0), place, surface, curved)
+    noise = learnt_noise(residual, place, surface, curved)
     expected = 1.0 + (EACH - 1) * shared**2
     # Relative standard deviation of a mean of chi2 over the places of one kind, and what the fit would have taken away.
     spread = 4.0 * np.sqrt(2.0 / (SURFACES / 2 * PLACES))
@@ -45,13 +43,13 @@ def test_what_rays_of_a_place_have_in_common_counts_against_them(shared):
 
 def test_surfaces_of_few_places_show_nothing():
     residual, place, surface = planted(1.0, 0.5)
-    noise = learnt_noise(residual, np.full(len(residual), 2.0), place % 4, surface, np.zeros(SURFACES, dtype=bool))
+    noise = learnt_noise(residual, place % 4, surface, np.zeros(SURFACES, dtype=bool))
     np.testing.assert_array_equal(noise.alike, [ALIKE, ALIKE])
 
 
 def test_outliers_change_little():
     residual, place, surface = planted(1.0, 0.0, seed=5)
     residual[::50] += 40.0 * np.sign(residual[::50])
-    noise = learnt_noise(residual, np.full(len(residual), 2.0), place, surface, np.zeros(SURFACES, dtype=bool))
-    assert noise.by_distance[1] == pytest.approx(1.0, abs=0.08)
+    noise = learnt_noise(residual, place, surface, np.zeros(SURFACES, dtype=bool))
+    assert noise.ratio == pytest.approx(1.0, abs=0.08)
     assert noise.alike[0] < 2.0

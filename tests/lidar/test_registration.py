@@ -6,8 +6,8 @@ from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.clouds import joined
-from uwblite.lidar.object_likelihood import ObjectPolicy, matched_by_chance, objects
+from uwblite.lidar.clouds import Clouds, joined
+from uwblite.lidar.object_likelihood import ObjectLikelihood, ObjectPolicy, matched_by_chance, objects
 from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, of_fallible
 from uwblite.lidar.scan_matching import PairPoints, pair_points
 from uwblite.lidar.visibility import nearest_by_bearing
@@ -101,6 +101,38 @@ def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
     assert moving[on_thing].mean() > 0.9
     assert moving[(clouds.owner == 1) & (x < 1.0)].mean() < 0.1
     assert not moving[clouds.owner == 0].any()
+
+
+def crowd(moving, seed):
+    """Return clouds of a standing robot among 12 posts, a share of which is elsewhere in each scan."""
+    rng = np.random.default_rng(seed)
+    bearing = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    parts = []
+    for _ in range(60):
+        away = np.where(rng.random(12) < moving, rng.uniform(1.5, 4.5, 12), 3.0)
+        turn = np.linspace(-0.06, 0.06, 9)
+        angle = (bearing[:, None] + turn).ravel()
+        normals = -np.column_stack([np.cos(angle), np.sin(angle)])
+        points = -normals * np.repeat(away, 9)[:, None] + 0.005 * rng.standard_normal((len(angle), 2))
+        owner, scatter = np.zeros(len(angle), np.int32), np.full(len(angle), 1e-4)
+        parts.append(Clouds(np.array([0, len(angle)]), points, normals, owner, scatter))
+    return joined(parts)
+
+
+@pytest.mark.parametrize(("moving", "seen"), [(0.0, 0.0), (0.2, 0.2)])
+def test_how_often_things_move_is_learnt(moving, seen):
+    """Of the posts that are elsewhere in one of two scans, 0.32 of all, half are nearer than what hides them from the other.
+
+    They are 0.16 of all and, with those of both, 0.18 of 0.82 that say anything; one in ten is by chance where it was before.
+    """
+    clouds = crowd(moving, 4)
+    i = np.arange(59)
+    points, raster, still = pair_points(clouds, i + 1, 150), rasterize(clouds, 0.1, 0.5), np.zeros((59, 3))
+    chance = matched_by_chance(clouds, raster, i, points, still)
+    judge = ObjectLikelihood(clouds, raster, nearest_by_bearing(clouds), SIGMA, chance)
+    judge.learn_moves(i, points, still)
+    # Three standard deviations of a share of 580 posts, and what is expected beforehand.
+    assert judge.moves == pytest.approx(seen, abs=3.0 * np.sqrt(max(seen, 1e-3) / 580))
 
 
 def test_clouds_without_surfaces_leave_the_prior_as_it_is():

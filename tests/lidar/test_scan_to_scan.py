@@ -26,13 +26,13 @@ def odometry_steps(truth, clouds, stated):
 
 def tracked(truth, clouds, stated, by_ranges=None):
     """Return the scan odometry of a chain whose odometry reports the steps said (k - 1, 3)."""
-    wheels = replace(chained(truth, NOISE), motion=stated)
+    wheels = replace(chained(truth, NOISE), motion=stated, slips=by_ranges)
     poses = [truth[0]]
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
     steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig(), by_ranges)
+    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, TrackingConfig())
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +67,18 @@ def test_clouds_judge_the_slips_that_ranges_show(walk):
     np.testing.assert_array_equal(np.flatnonzero(with_ranges), np.arange(blind.start, blind.stop))
     assert not with_ranges[seen].any()
     assert not without.any()
+
+
+def test_that_ranges_show_no_slip_is_no_evidence_against_one(walk):
+    """A path of few ranges follows the wheels, slips and all."""
+    truth, clouds, exact = walk
+    stated = exact.copy()
+    slips = np.arange(8, 14)
+    stated[slips] += [0.25, 0.0, 0.2]
+    found = [tracked(truth, clouds, stated, shown).slips for shown in (None, np.full(len(exact), 1e-6))]
+    np.testing.assert_array_equal(*found)
+    # The first may be a turn as the wheels can make it.
+    assert np.isin(slips[1:], np.flatnonzero(found[1] > 0.5)).all()
 
 
 def test_slips_are_found_by_a_search(walk):

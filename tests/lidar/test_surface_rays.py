@@ -8,11 +8,10 @@ from helpers.planted_rays import POSES, rays_that_end
 from helpers.wall_rays import seen
 
 from uwblite import se2
-from uwblite.lidar.pieces import straight_pieces
+from uwblite.lidar.columns import surroundings
 from uwblite.lidar.ray_noise import UNLEARNT
-from uwblite.lidar.round_columns import surroundings
 from uwblite.lidar.surface_rays import NEAR, MeasuredSurfaces, around_columns, as_rays, on_columns, points_on, surfaces_of
-from uwblite.lidar.walls import find_walls
+from uwblite.lidar.walls import find_walls, straight_pieces
 from uwblite.odometry.attached import ScanPoints
 
 

@@ -19,6 +19,7 @@ from uwblite.odometry.slips import (
     SPEED,
     TURN_RATE,
     covariance_of,
+    expected,
     log_densities,
     posterior,
     slip_sigma,
@@ -94,6 +95,10 @@ def test_wheels_that_stand_still_while_they_slip_do_not_hold_a_measured_step():
     assert np.all(np.abs(step - measured[4]) < np.array([0.025, 0.025, 0.01]))
     others = np.arange(8) != 4
     np.testing.assert_allclose(loose.sqrt_information[others], wheels.sqrt_information[others])
+    noted = expected(replace(wheels, slips=1.0 - others))
+    np.testing.assert_array_equal(noted.sqrt_information, loose.sqrt_information)
+    assert noted.slips is None
+    assert expected(wheels) is wheels
 
 
 def test_densities_of_steps_are_those_of_the_mixture():

@@ -157,7 +157,7 @@ def torn(estimate, task, at, by, visits=False):
     return replace(estimate, graph=graph, steps=scans(poses, i, i + 1), closures=closures)
 
 
-@pytest.mark.parametrize("by", [(1.5, 0.0, 0.0), (0.3, 0.2, 0.5), (0.0, 0.0, -1.2)])
+@pytest.mark.parametrize("by", [(1.5, 0.0, 0.0), (0.3, 0.2, -0.8)])
 def test_where_the_path_is_torn_no_anchor_is_moved(by):
     """One step of the path explains the ranges to all anchors."""
     estimate, task = planted()

@@ -100,6 +100,14 @@ def test_added_keyframes_keep_poses_measurements_and_what_is_stated_of_them(exac
     assert np.abs(dense.ranges.residuals(dense.graph) * dense.ranges.sigma[:, None]).max() < 1e-3
 
 
+def test_scans_of_a_late_clock_are_added_where_they_were_taken(exact):
+    """Keyframes that follow the lidar's clock already have the scans at both ends of a step."""
+    recordings, _ = exact
+    usual = denser(recordings, CUT, 2)
+    moved = denser(later(recordings, 0.06), CUT, 2, 0.06)
+    np.testing.assert_allclose(moved.stamps, usual.stamps + 0.06, atol=1e-9)
+
+
 def test_pieces_of_a_step_have_its_variance_together(exact):
     recordings, estimate = exact
     after = denser(recordings, CUT, 2)
@@ -108,3 +116,13 @@ def test_pieces_of_a_step_have_its_variance_together(exact):
     whole, pieces = covariances(estimate.odometry), covariances(dense.odometry)
     for k, (first, last) in enumerate(pairwise(number)):
         np.testing.assert_allclose(pieces[first:last].sum(axis=0), whole[k], rtol=1e-4)
+
+
+def test_pieces_of_a_step_slip_as_it_does(exact):
+    recordings, estimate = exact
+    slips = np.linspace(0.0, 1.0, len(estimate.odometry))
+    slipping = replace(estimate, odometry=replace(estimate.odometry, slips=slips))
+    dense = with_keyframes(slipping, recordings, denser(recordings, CUT, 2))
+    number = np.searchsorted(dense.recordings.stamps, recordings.stamps)
+    for k, (first, last) in enumerate(pairwise(number)):
+        np.testing.assert_array_equal(dense.odometry.slips[first:last], slips[k])

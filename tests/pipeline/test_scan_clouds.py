@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from helpers.planted import box, odometry, recording, scans, wander
 
+from uwblite.graph.work import Work
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import denser, gather
-from uwblite.work import Work
 
 CONFIG = MappingConfig()
 

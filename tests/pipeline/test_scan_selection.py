@@ -14,7 +14,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
 from uwblite.pipeline import scan_selection
-from uwblite.pipeline.odometry_units import with_given_mounting_and_clock
+from uwblite.pipeline.calibration_checks import with_given_mounting_and_clock
 from uwblite.pipeline.scan_selection import prepared, thinned
 from uwblite.sensor_log import Odometry, SensorLog
 

@@ -13,9 +13,14 @@ import pytest
 from helpers.results import EVIL, small_result
 
 from uwblite.graph.graph import UnknownKey
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
-from uwblite.report.html import render
+from uwblite.report import svg_map
+from uwblite.report.html import Heading, render
 
+FRAME = np.array([[-10.0, -10.0], [10.0, 10.0]])
+"""Corners of a map, m."""
 VOID = {"meta", "link", "input", "br", "img"}
 
 
@@ -58,7 +63,7 @@ def png():
 
 
 def page(**options):
-    return render(small_result(**options), title="run.log", command="uwblite map run.log --out map/", grid_png=png())
+    return render(small_result(**options), Heading("run.log", "uwblite map run.log --out map/"), png())
 
 
 def test_everything_that_belongs_in_it_is_there():
@@ -76,7 +81,7 @@ def test_everything_that_belongs_in_it_is_there():
 
 
 def test_verdict_and_map_come_first_and_how_it_was_made_last():
-    text = render(small_result(), title="run.log", command="uwblite map", lead="4 min 00 s", facts=(("sha256", "ab" * 32),))
+    text = render(small_result(), Heading("run.log", "uwblite map", "4 min 00 s", (("sha256", "ab" * 32),)))
     parts = ("<h1>", 'id="warnings"', "4 min 00 s", "<svg", 'id="anchors"', "abababab", "uwblite map<")
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
@@ -94,14 +99,14 @@ def test_every_cell_of_a_wide_table_names_its_column():
 
 def test_a_squared_height_is_shown_as_a_height():
     squared = CalibrationEstimate(UnknownKey("height2", "5C0B"), 0.09, 0.08, "m2", "squared height", "estimated")
-    text = render(replace(small_result(), calibration=(squared,)), title="a", command="b")
+    text = render(replace(small_result(), calibration=(squared,)), Heading("a", "b"))
     assert "height of anchor 5C0B above or below the tag</td>" in text
     assert ">0.30 m, below 0.50 m</td>" in text
 
 
 def test_figures_of_stages_have_words():
     figures = {"keyframes": 186, "searched": 0, "used": 0, "alike": [1.0, 1.5], "shift": [1, 2], "converged": True}
-    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), title="a", command="b")
+    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), Heading("a", "b"))
     assert ">186 keyframes</td>" in text
 
 
@@ -123,7 +128,7 @@ def test_marked_ranges_are_those_that_disagree():
 def test_rejected_closures_are_counted_by_outcome():
     result = small_result()
     more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
-    text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
+    text = render(replace(result, closures=(*result.closures, *more)), Heading("a", "b"))
     assert re.search(f">{OUTCOMES['few-matches']}</td><td[^>]*>5</td>", text)
     assert "only 12% of its points" in text
 
@@ -138,22 +143,43 @@ def test_text_of_a_log_stays_text():
     evil = page(evil=EVIL)
     assert EVIL not in evil
     assert Page(evil).tags.count("script") == Page(page()).tags.count("script") == 1
-    titled = render(small_result(), title=EVIL, command=EVIL, facts=((EVIL, EVIL),))
+    titled = render(small_result(), Heading(EVIL, EVIL, facts=((EVIL, EVIL),)))
     assert Page(titled).tags.count("script") == 1
 
 
 def test_same_result_same_bytes_unless_timings_are_asked_for():
     assert page(seconds=1.0) == page(seconds=2.0)
-    one, two = (render(small_result(seconds=s), title="a", command="b", timings=True) for s in (1.0, 2.0))
+    one, two = (render(small_result(seconds=s), Heading("a", "b"), timings=True) for s in (1.0, 2.0))
     assert one != two
     assert "seconds" in one
 
 
 def test_works_without_lidar_and_without_radio():
     bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), findings=())
-    text = render(bare, title="a", command="b")
+    text = render(bare, Heading("a", "b"))
     assert "No warnings." in text
     assert "<image" not in text
+
+
+def side_of(place, walls=()):
+    """Return where the name 5C0B stands beside a place of a map of 20 x 20 m with walls at points."""
+    geometry = GridGeometry(0.1, FRAME[0], 200, 200)
+    log_odds = np.full((200, 200), -4.0, dtype=np.float32)
+    log_odds[geometry.cell_of(np.array(walls, dtype=float).reshape(-1, 2))] = 4.0
+    return svg_map.free_sides([("5C0B", np.array(place))], OccupancyGrid(geometry, log_odds, 1), FRAME, (14.0 / 360.0,))[0]
+
+
+@pytest.mark.parametrize(("walls", "free"), [("", "right"), ("r", "left"), ("rl", "below"), ("rlb", "above"), ("lba", "right")])
+def test_the_name_of_an_anchor_stands_where_no_wall_is(walls, free):
+    """As on a phone, 18 pixels a metre."""
+    middles = {"r": (1.5, 0.0), "l": (-1.5, 0.0), "b": (0.0, -0.8), "a": (0.0, 1.0)}
+    assert side_of((0.0, 0.0), [middles[side] for side in walls]) == free
+
+
+def test_a_name_leaves_the_map_on_no_side():
+    assert side_of((9.8, 0.0)) == "left"
+    assert side_of((np.nan, np.nan)) == "right"
+    assert svg_map.free_sides([("5C0B", np.zeros(2))], None, FRAME, (0.03, 0.01)) == ["right"]
 
 
 def test_an_unplaced_anchor_is_listed_and_not_drawn():
@@ -161,7 +187,7 @@ def test_an_unplaced_anchor_is_listed_and_not_drawn():
     lost = replace(
         result.anchors[0], id="lost", position=np.full(2, np.nan), covariance=np.full((2, 2), np.nan), status="unplaced"
     )
-    text = render(replace(result, anchors=(*result.anchors, lost)), title="a", command="b")
+    text = render(replace(result, anchors=(*result.anchors, lost)), Heading("a", "b"))
     assert "unplaced" in text
     assert "nan" not in text
     assert text.count("<ellipse") == 2
@@ -238,6 +264,6 @@ def test_kept_and_rejected_closures_are_distinguished():
 def test_the_name_of_an_anchor_at_the_edge_has_room():
     result = small_result()
     far = replace(result.anchors[0], position=np.array([500.0, 0.0]))
-    text = render(replace(result, anchors=(far,)), title="run.log", command="uwblite", grid_png=None)
+    text = render(replace(result, anchors=(far,)), Heading("run.log", "uwblite"))
     x, _, width, _ = map(float, re.search(r'id="map-view" viewBox="([^"]*)"', text)[1].split())
     assert x + width > 500.0 + 0.1 * width

@@ -11,8 +11,20 @@ from uwblite.io.png import decode_png, encode_png
 from uwblite.report import picture
 from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATH, PATHS, PROPOSED, START, WIDTH, Canvas, text_mask
 from uwblite.report.error_map import draw_errors
-from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
-from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
+from uwblite.report.picture import (
+    INK,
+    PAPER,
+    WALL,
+    Key,
+    Overlay,
+    PictureAnchor,
+    _paste,
+    _rows,
+    draw_map,
+    foot_height,
+    round_length,
+    shaded,
+)
 
 
 def room(rows=80, cols=120, resolution=0.05):
@@ -33,14 +45,14 @@ PATH_IN_ROOM = np.stack([np.linspace(-1.0, 3.0, 50), np.linspace(2.0, 4.0, 50), 
 
 def test_everything_is_on_it():
     anchors = [PictureAnchor("5C0B", np.array([0.0, 3.0]), np.diag([0.04, 0.01])), PictureAnchor("lost", np.full(2, np.nan))]
-    image = draw_map(room(), PATH_IN_ROOM, anchors=anchors, closures=np.array([[0.0, 2.0, 2.0, 4.0]]), caption="a room")
+    image = draw_map(room(), PATH_IN_ROOM, Overlay(anchors, np.array([[0.0, 2.0, 2.0, 4.0]])), caption="a room")
     assert image.dtype == np.uint8
     for colour in (WALL, PAPER, (255, 255, 255), ANCHOR):
         assert share(image, colour) > 1e-4
     for colour in (PATH, ACCEPTED):
         assert share(image, colour, 60) > 1e-4
     np.testing.assert_array_equal(decode_png(encode_png(image)), image)
-    again = draw_map(room(), PATH_IN_ROOM, anchors=anchors, closures=np.array([[0.0, 2.0, 2.0, 4.0]]), caption="a room")
+    again = draw_map(room(), PATH_IN_ROOM, Overlay(anchors, np.array([[0.0, 2.0, 2.0, 4.0]])), caption="a room")
     np.testing.assert_array_equal(again, image)
 
 
@@ -69,7 +81,7 @@ def test_thin_walls_survive_every_scale(size, resolution):
 def test_parts_may_be_missing():
     assert draw_map(None, PATH_IN_ROOM).shape[2] == 3
     assert draw_map(None, np.zeros((0, 3))).shape[2] == 3
-    assert draw_map(room(), np.zeros((0, 3)), closures=np.zeros((0, 4))).shape[2] == 3
+    assert draw_map(room(), np.zeros((0, 3)), Overlay(closures=np.zeros((0, 4)))).shape[2] == 3
     parted = PATH_IN_ROOM.copy()
     parted[25] = np.nan
     assert share(draw_map(room(), parted), PATH, 60) > 0
@@ -138,7 +150,7 @@ def test_a_polygon_is_what_lies_within_all_its_edges(seed, size):
 def test_an_anchor_that_may_stand_anywhere_takes_no_longer_than_others():
     """Its ellipse is many times the picture; only what is in the picture is looked at."""
     anchor = PictureAnchor("far", np.array([0.0, 3.0]), np.diag([1e6, 1e4]))
-    image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
+    image = draw_map(room(), PATH_IN_ROOM, Overlay([anchor]))
     assert share(image, ANCHOR, 40) > 0
 
 
@@ -148,7 +160,7 @@ def test_what_strays_far_takes_neither_memory_nor_the_room_of_the_rest(far):
     anchors = [PictureAnchor("near", np.array([0.0, 3.0])), PictureAnchor("far", np.array([-far, far]), np.eye(2) * far)]
     closures = np.array([[0.0, 2.0, far, far]])
     tracemalloc.start()
-    image = draw_map(room(), path, anchors=anchors, closures=closures)
+    image = draw_map(room(), path, Overlay(anchors, closures))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200e6
@@ -180,7 +192,7 @@ def test_the_legend_is_of_what_is_drawn_and_never_cut():
     assert len(_rows(2000, keys)) == 1
     assert len(_rows(240, keys)) > 1
     anchor = PictureAnchor("A", np.zeros(2))
-    plain, with_anchor = draw_map(room(), PATH_IN_ROOM), draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
+    plain, with_anchor = draw_map(room(), PATH_IN_ROOM), draw_map(room(), PATH_IN_ROOM, Overlay([anchor]))
     assert share(plain[-26:], ANCHOR) == 0
     assert share(with_anchor[-60:], ANCHOR) > 0
 
@@ -201,7 +213,7 @@ def test_the_origin_and_the_axes_are_on_it():
 
 def test_ellipses_and_names_at_the_edge_are_whole():
     anchor = PictureAnchor("A-LONG-NAME", np.array([3.9, 3.0]), np.diag([0.25, 0.01]))
-    image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor], size=700)
+    image = draw_map(room(), PATH_IN_ROOM, Overlay([anchor]), size=700)
     edge = image[: -foot_height(image.shape[1], KEYS) - 60, -3:]
     assert share(edge, ANCHOR, 60) == 0
 
@@ -241,14 +253,14 @@ def test_names_of_anchors_do_not_cover_walls():
     log_odds = np.full_like(grid.log_odds, -4.0)
     log_odds[:, -1] = 4.0
     walled = OccupancyGrid(grid.geometry, log_odds)
-    plain, named = (draw_map(walled, np.zeros((0, 2)), anchors=[PictureAnchor(name, inside)]) for name in ("", "5C0B"))
+    plain, named = (draw_map(walled, np.zeros((0, 2)), Overlay([PictureAnchor(name, inside)])) for name in ("", "5C0B"))
     written = np.any(plain != named, axis=2)
     assert written.any()
     assert not np.any(written & np.all(plain == WALL, axis=2))
 
 
 def test_proposed_anchors_have_a_colour_and_an_entry_of_their_own():
-    image = draw_map(room(), PATH_IN_ROOM, anchors=[PictureAnchor("new1", np.array([0.0, 1.0]), proposed=True)])
+    image = draw_map(room(), PATH_IN_ROOM, Overlay([PictureAnchor("new1", np.array([0.0, 1.0]), proposed=True)]))
     assert np.any(np.all(image == PROPOSED, axis=2))
     assert not np.any(np.all(image == ANCHOR, axis=2))
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwblite.sensor_log.anchor_names import first_place, last_places, name_and_number, place_name, radio_name
+from uwblite.sensor_log.sensors import first_place, last_places, name_and_number, place_name, radio_name
 
 
 def test_names_of_places():

@@ -1,5 +1,7 @@
 """The tools that measure the live pose: what they count, on a world small enough to be counted by hand."""
 
+import copy
+
 import grounds
 import localization
 import navigation
@@ -9,6 +11,17 @@ import pytest
 from uwblite import se2
 
 ROOM = grounds.Place("room", 7, 1, easy=True)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A robot that stands in the room; drawing its world takes a second."""
+    return navigation.Robot(ROOM, 1, np.array([3.0, 3.0, 0.0]))
+
+
+@pytest.fixture
+def robot(made):
+    return copy.deepcopy(made)
 
 
 def test_pursuit_drives_along_a_path_and_stops_at_its_end():
@@ -27,15 +40,14 @@ def test_pursuit_drives_along_a_path_and_stops_at_its_end():
     assert abs(pose[1]) < 0.005
 
 
-def test_the_rim_of_a_robot_is_nearer_than_its_middle():
-    robot = navigation.Robot(ROOM, 1, np.array([1.0, 0.5, 0.0]))
+def test_the_rim_of_a_robot_is_nearer_than_its_middle(robot):
+    robot.put(np.array([1.0, 0.5, 0.0]))
     assert robot.clearance() <= 0.5 - navigation.RADIUS + 1e-12
     robot.pose = np.array([1.0, 0.1, 0.0])
     assert robot.clearance() < 0
 
 
-def test_wheels_err_and_the_robot_moves_as_reported():
-    robot = navigation.Robot(ROOM, 1, np.array([3.0, 3.0, 0.0]))
+def test_wheels_err_and_the_robot_moves_as_reported(robot):
     for _ in range(100):
         robot.drive(0.2, 0.0)
     true, output = robot.pose[0] - 3.0, robot.odometry[0]
@@ -44,8 +56,7 @@ def test_wheels_err_and_the_robot_moves_as_reported():
     assert 0 < abs(output - true) < 0.1
 
 
-def test_a_sweep_of_a_standing_robot_sees_the_walls():
-    robot = navigation.Robot(ROOM, 1, np.array([3.0, 3.0, 0.0]))
+def test_a_sweep_of_a_standing_robot_sees_the_walls(robot):
     readings = robot.scan()
     seen = readings[np.isfinite(readings)]
     assert len(seen) > 300

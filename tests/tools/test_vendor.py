@@ -90,7 +90,7 @@ def test_a_copy_holds_what_it_needs_and_no_more():
     files = {part: vendor.files_for(modules) for part, modules in vendor.PARTS.items()}
     rooms = {part: {f.relative_to(vendor.PACKAGE).parts[0] for f in found} for part, found in files.items()}
     assert len(files["solve"]) < len(files["covariances"]) < 30
-    assert rooms["covariances"] <= {"graph", "arrays.py", "config.py", "errors.py", "se2.py", "work.py"}
+    assert rooms["covariances"] <= {"graph", "arrays.py", "config.py", "errors.py", "se2.py"}
     assert rooms["drivers"] <= {"drivers", "clocks", "errors.py"}
     assert "cli" not in set().union(*rooms.values())
     assert "server" not in set().union(*rooms.values())

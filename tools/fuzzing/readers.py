@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwblite.cli import main
-from uwblite.cli.formats import format_of, read_graph, read_recording
-from uwblite.config import merge, parse_toml
+from uwblite.config import merge, parse_toml, to_toml
 from uwblite.drivers.devices import DEVICES
 from uwblite.errors import UwbliteError
 from uwblite.grid.geometry import GridGeometry
@@ -23,12 +22,12 @@ from uwblite.io.carmen_live import LogTail
 from uwblite.io.constraints_file import parse_constraints, read_anchors
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
 from uwblite.io.csv_table import read_csv
+from uwblite.io.formats import format_of, read_graph, read_recording
 from uwblite.io.g2o import read_g2o
 from uwblite.io.librsf import read_librsf
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
-from uwblite.io.settings_toml import to_toml
 from uwblite.io.tum import read_relations, read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig

@@ -42,6 +42,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "refused": _of("odometry-alone"),
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
+        "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
         "made-up-stamps": _TIMES,
         "stamps-of-receipt": _TIMES,
@@ -49,14 +50,15 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "hardly-moving": _of(_PLACES, "uncertain straight-path no-turns moves-across-heading"),
         "scans-do-not-match": _of(_BY_SCANS, "wheels-against-lidar range-scatter odometry-alone"),
         "laser-turned-over": _of(_BY_SCANS, "wheels-against-lidar range-scatter anchors-moved-together"),
-        "carried": _BY_SCANS | _BY_RANGES,
         "wheels-stand-still": _BY_RANGES | _BY_SCANS,
         "marked-ranges": _of(_PLACES, "uncertain odometry-alone untied-parts few-in-reach few-ranges"),
         "shared-name": _of(_PLACES, "spikes"),
         "repeated-ranges": _of("few-ranges anchor-unplaced no-anchor odometry-alone uncertain"),
         "repeated-scans": _of("odometry-alone untied-parts silences"),
         "worse-than-parts": _of(_PLACES, "path-displaced odometry-steps free-space-violation"),
-        "wheels-against-lidar": _of(_BY_SCANS, "range-scatter anchors-moved-together moved-anchor"),
+        "wheels-against-lidar": _of(_BY_SCANS, _PLACES, "carried range-scatter path-displaced"),
+        "scales": _of(_PLACES, "range-scatter poor-fit free-space-violation path-displaced unusual-calibration"),
+        "carried": _BY_SCANS | _BY_RANGES,
         "turn-factor": _of("unusual-calibration"),
         "mirrored": _of("unusual-calibration odometry-unit"),
         "loose-links": _of("free-space-violation no-closure untied-parts anchors-moved-together path-displaced"),
@@ -74,7 +76,12 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
 """By the kind of a cause, the kinds that it explains; a cause stands before those causes that it explains."""
 _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
     {
-        "radio": _of(_TIMES, _BY_RANGES, "carried spikes few-in-reach few-ranges no-ranges untied-parts odometry-alone"),
+        "radio": _of(
+            _TIMES,
+            _BY_RANGES,
+            "ranges-outside-odometry worse-than-parts range-scatter carried spikes few-in-reach few-ranges no-ranges",
+            "untied-parts odometry-alone",
+        ),
         "lidar": _of(_TIMES, _BY_SCANS, _PLACES, "wheels-against-lidar carried no-lidar range-scatter path-displaced"),
     }
 )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..findings import WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, warning
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
@@ -16,12 +16,12 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.sensors import name_and_number
 from .causes import explained
 from .certainty import check_certainty, check_other_side
 from .decisions import RULES
 from .drift_tests import check_drifts, check_turn_scales
-from .range_agreement import check_sustained_outliers, check_wheels_against_lidar
+from .range_agreement import check_range_agreement, check_wheels_against_lidar
 from .repairs import check_recordings, say
 from .residual_tests import check_residuals
 from .untied_parts import check_untied_parts, check_untied_recordings
@@ -61,12 +61,12 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: say(view.task.stages.facts, RULES),
     lambda view: check_repairs(view.task),
     lambda view: check_certainty(view.estimate, view.sigma, view.task),
-    lambda view: check_anchors(view.anchors, view.task),
+    lambda view: check_anchors(view.anchors),
+    lambda view: check_range_agreement(view.anchors, view.table, view.task),
     lambda view: check_moved_together(view.anchors, view.table, view.task),
     lambda view: check_sensors(view.grid, view.task),
     lambda view: check_closures(view.estimate, view.grid),
     lambda view: check_calibration(view.calibrated, view.usual, view.task),
-    lambda view: check_sustained_outliers(view.table, view.estimate.anchor_ids, view.task) if view.table else (),
     lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
     lambda view: check_drifts(view.estimate, view.task),
     lambda view: check_untied_parts(view.estimate, view.task),
@@ -94,10 +94,10 @@ def check_repairs(task: Task) -> list[Finding]:
     return [finding for finding in found if finding.kind != WHEELS_AGAINST_LIDAR]
 
 
-def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:
-    """Warn of anchors that are not ok; doubt a map with which most ranges, or without lidar half of the anchors, disagree.
+def check_anchors(anchors: Sequence[AnchorEstimate]) -> Iterator[Finding]:
+    """Warn of anchors that are not ok; doubt a map without any.
 
-    A name with two anchors counts as distrusted. Mirror ambiguity is a doubt where every anchor in reach has it.
+    Mirror ambiguity is a doubt where every anchor in reach has it.
     """
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
@@ -108,40 +108,12 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Fin
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone; drive curves near the anchors"
         yield doubt("no-anchor", text)
-    count = sum(a.ranges for a in anchors if a.status != "unplaced")
-    agreeing = sum(a.used_share * a.ranges for a in anchors if a.status != "unplaced")
-    if agreeing < _LEAST_AGREEING * count:
-        text = (
-            f"only {agreeing / count:.0%} of the ranges agree with the map: they are not distances to stationary anchors, or "
-            "the trajectory is wrong; check the anchors' ids, and the unit and the clock of the radio"
-        )
-        yield doubt("ranges-disagree", text, share=agreeing / count)
-    if task.recordings.have_scans:
-        return
-    left_out = sum(finding.kind == "shared-name" for finding in task.stages.findings)
-    # An anchor that was moved counts once.
-    named = ({name_and_number(a.id)[0] for a in anchors if a.status in kinds} for kinds in (_PLACED, _PLACED[-1:]))
-    placed, wrong = (left_out + len(names) for names in named)
-    if wrong and 2 * wrong >= placed:
-        text = (
-            f"{wrong} of {placed} anchors are distrusted or left out, and only ranges and odometry constrain the trajectory: "
-            + ("the others may be too few" if wrong == left_out else "a wrong trajectory is likelier than so many bad anchors")
-            + "; check the odometry, or give the anchors' places"
-        )
-        yield doubt("ranges-disagree", text, distrusted=wrong, placed=placed)
-
-
-_PLACED = ("ok", "mirror-ambiguous", "distrusted")
-"""Statuses of anchors with a place."""
-_LEAST_AGREEING = 0.3
-"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
     """Doubt a map in which half of the anchors changed at one time, unless they changed places only.
 
-    Swapped wheels, a changed radio or clock, or a lidar that displaces the trajectory have the same effect. An
-    anchor has changed where it was moved, and where its ranges agree with the map on one side of that time only. With a lidar,
+    Swapped wheels, a changed radio or clock, or a lidar that displaces the trajectory have the same effect. With a lidar,
     a single anchor may have been moved, and between recordings all of them.
     """
     lidar = task.recordings.have_scans
@@ -154,10 +126,9 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
         these = [k for since, k in moves if start <= since < start + _ONE_TIME]
         early, late = stamps < start, stamps > max(anchors[k].since for k in these)
         both = set(base[early].tolist()) & set(base[late].tolist())
-        one_sided = {n for n in both if _one_sided(table["agrees"], early & (base == n), late & (base == n))}
-        changed = {names[k][0] for k in these} | one_sided
-        renamed = _exchanged(these, anchors, names) and not one_sided
-        if len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both))) and not renamed:
+        changed = {names[k][0] for k in these}
+        enough = len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both)))
+        if enough and not _exchanged(these, anchors, names):
             when = float(start - task.recordings.stamps[0])
             yield doubt(
                 "anchors-moved-together",
@@ -175,15 +146,6 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
             return
 
 
-def _one_sided(agrees: Floats, early: Bools, late: Bools) -> bool:
-    """Return whether only the early or only the late ones of ranges (m,) agree with the map, 1 or 0; too few ranges give 0."""
-    if min(early.sum(), late.sum()) < _FEW_ON_A_SIDE:
-        return False
-    return bool(abs(agrees[early].mean() - agrees[late].mean()) > _ONE_SIDED)
-
-
-_FEW_ON_A_SIDE, _ONE_SIDED = 10, 0.6
-"""Least number of ranges, and of the difference of the shares that agree: behind furniture the share falls by half."""
 _ONE_TIME = 30.0
 """Moves within so much of each other count as simultaneous, s."""
 SAME_PLACE = 1.5
@@ -234,8 +196,7 @@ def check_calibration(
 
     Ranges that are too long where the wheels counted nothing are a doubt: scans along a bare wall show only some of
     such stretches, and a map that lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar
-    shows whether the unit is that of the wheels or of the radio. So is a scale of turns near 0, which slip does not explain:
-    scans in a wrong order match a map with other turns.
+    shows whether the unit is that of the wheels or of the radio.
 
     Parameters
     ----------
@@ -252,15 +213,13 @@ def check_calibration(
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
         unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
-        unrelated = value.key.kind == "heading_scale" and abs(1.0 + value.value) < _UNRELATED
-        add = doubt if short or unclear or unrelated else warning
+        add = doubt if short or unclear else warning
         yield add(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
             + unit_of
-            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else "")
-            + ("; the odometry's turns have nothing in common with those of the map" if unrelated else ""),
+            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else ""),
             name=value.name,
             value=value.value,
             sigma=value.sigma,
@@ -274,30 +233,34 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
     Ranges alone do not distinguish a map from its mirror image: a trajectory mirrored together with its anchors has the same
     ranges. Only the sign of the odometry's turns, a laser, or given anchors do. Where turns must be scaled by a
     factor far from 1, the mirror image fits as well with the negative factor, and the sign is undetermined. A laser that
-    measures the opposite turns may itself be upside down.
+    measures the opposite turns may itself be upside down; of scans in a wrong order a map with unrelated turns is made.
     """
     graph = estimate.graph
     given = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")
     if given > 2 or task.config.calibration.heading_scale <= 0.0:
         return
-    of_turns = graph.calibration.of_kinds("heading_scale")
-    for error in graph.calibration.values[of_turns].tolist():
-        factor = 1.0 + error
-        if task.recordings.have_scans:
-            wrong = factor < 0.0
-            text = (
-                f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
-                "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
-            )
-        else:
-            wrong = True
+    for error in graph.calibration.values[graph.calibration.of_kinds("heading_scale")].tolist():
+        factor, kind = 1.0 + error, "mirrored"
+        if -_SLIPS_AT_MOST <= error <= _WRONG_TURNS or (task.recordings.have_scans and factor >= _UNRELATED):
+            continue
+        if not task.recordings.have_scans:
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the ranges only when multiplied by {factor:.2f}, "
                 f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
                 "or give the places of three anchors"
             )
-        if wrong and not -_SLIPS_AT_MOST <= error <= _WRONG_TURNS:
-            yield doubt("mirrored", text, factor=factor)
+        elif factor > -_UNRELATED:
+            kind = WHEELS_AGAINST_LIDAR
+            text = (
+                "wheels and lidar measure different motions throughout: their turns have nothing in common (factor "
+                f"{factor:.2f}); check the order of scans and beams, and whether the wheels count"
+            )
+        else:
+            text = (
+                f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
+                "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
+            )
+        yield doubt(kind, text, factor=factor)
 
 
 def check_fit(task: Task) -> Iterator[Finding]:

@@ -9,8 +9,8 @@ from ..arrays import Bools, Floats, runs_of
 from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
-from ..sensor_log.anchor_names import first_place, name_and_number
-from .repairs import check_recordings
+from ..sensor_log.sensors import first_place, name_and_number
+from .repairs import check_recordings, spans
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -26,38 +26,61 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
     return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs_of(bad) if b - a >= 2]
 
 
-def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> Iterator[Finding]:
-    """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
+def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
+    """Warn of each anchor whose ranges disagree with the map for long; doubt a map that most ranges contradict.
 
-    Without a lidar, ranges alone determine the path: where half of the anchors disagree for long, that is a doubt.
+    A line of sight was blocked, or an anchor was moved. Without a lidar, ranges alone determine the path: half of the anchors
+    that disagree, or are distrusted or left out, are a doubt as well. An anchor that was moved counts once.
 
     Parameters
     ----------
-    table : MapResult.range_table. anchor_ids : names.
+    anchors : in the order of the table's numbers. table : MapResult.range_table; empty without ranges.
     """
-    several = len(task.recordings) > 1
+    placed = [a for a in anchors if a.status != "unplaced"]
+    of_place = {a.id: name_and_number(a.id)[0] for a in placed}
+    wrong = {of_place[a.id] for a in placed if a.status == "distrusted"}
+    for finding in _outliers(anchors, table, task) if table else ():
+        yield finding
+        wrong |= {of_place[finding.anchor]} if finding.anchor in of_place else set()
+    count, agreeing = sum(a.ranges for a in placed), sum(a.used_share * a.ranges for a in placed)
+    if agreeing < _LEAST_AGREEING * count:
+        text = (
+            f"only {agreeing / count:.0%} of the ranges agree with the map: they are not distances to stationary anchors, or "
+            "the trajectory is wrong; check the anchors' ids, and the unit and the clock of the radio"
+        )
+        yield doubt("ranges-disagree", text, share=agreeing / count)
+    moved = {name for name, number in map(name_and_number, of_place) if number > 1}
+    left_out = sum(finding.kind == "shared-name" for finding in task.stages.findings)
+    bad, heard = len(wrong | moved) + left_out, len(set(of_place.values())) + left_out
+    if (wrong or left_out or bad > 1) and 2 * bad >= heard and not task.recordings.have_scans:
+        text = (
+            f"{bad} of {heard} anchors were moved, disagree for long, are distrusted or left out, and only ranges and odometry "
+            "constrain the trajectory: a wrong one is likelier than so many bad anchors, and the others may be too few; check "
+            "the odometry, map the parts before and after separately, or give the anchors' places"
+        )
+        yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
+
+
+_LEAST_AGREEING = 0.3
+"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
+
+
+def _outliers(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
+    """Warn of each anchor whose ranges disagree with the map for long, recording by recording."""
     for recording in task.recordings.each:
-        start, where = float(recording.frames.stamps[0]), f"recording {recording.number + 1}: " if several else ""
-        heard = wrong = 0
-        for k, name in enumerate(anchor_ids):
+        start = float(recording.frames.stamps[0])
+        where = f"recording {recording.number + 1}: " if len(task.recordings) > 1 else ""
+        for k, anchor in enumerate(anchors):
             own = (table["anchor"] == k) & (table["weight"] > 0) & (table["recording"] == recording.number)
             stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
-            heard, wrong = heard + bool(own.any()), wrong + bool(stretches)
             if stretches:
-                when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
-                yield warning(
+                when = spans([(a - start, b - start) for a, b in stretches])
+                found = warning(
                     "sustained-outliers",
-                    f"{where}anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
-                    "its line of sight was blocked, or it was moved; these ranges are down-weighted",
-                    anchor=name,
-                    stretches=stretches,
+                    f"{where}anchor {anchor.id} disagrees with the map for long ({when}): its line of sight was blocked, or it "
+                    "was moved; these ranges are down-weighted",
                 )
-        if wrong and 2 * wrong >= heard and not recording.has_scans:
-            text = (
-                f"{where}{wrong} of {heard} anchors disagree with the map for long, and only ranges and odometry constrain the "
-                "path: the others may be too few; map the parts before and after separately, or give the anchors' places"
-            )
-            yield doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
+                yield replace(found, recording=recording.number + 1, anchor=anchor.id, stretches=tuple(stretches))
 
 
 def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> Iterator[Finding]:

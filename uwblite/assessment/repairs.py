@@ -80,6 +80,15 @@ def clock_jump(clock: str, sensor: str, by: float, at: float, moved: float) -> F
     return warning("clock-jump", text)
 
 
+def late_ranges(late: float) -> Finding:
+    """Doubt ranges whose clock is off by seconds, as the path by the wheels shows; what is left of the offset bends the map."""
+    text = (
+        f"the ranges are stamped about {late:.0f} s late for the odometry, whose path they fit then: their stamps were moved "
+        f"by {-late:+.1f} s; use one clock"
+    )
+    return replace(doubt("late-ranges", text), sensor="radio")
+
+
 def outside_odometry(sensor: str, count: int, total: int, off: float) -> Finding:
     """Warn of readings outside the odometry's time; doubt a recording of which most are: its clocks differ."""
     most = count > _MOST_OUTSIDE * total
@@ -290,6 +299,7 @@ RULES = by_kind(
     stamps_of_receipt,
     clock_set_back,
     clock_jump,
+    late_ranges,
     outside_odometry,
     stamps_in_bursts,
     repeated_odometry,

@@ -12,15 +12,16 @@ from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
-from ..graph.pose_edges import RelativePoseEdges, ScanEdges
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..loop_closure.loose_links import untied_breaks
-from ..loop_closure.slid_stretches import scans_fixing
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import LEAST_POINTS, blocked
 from ..radio.range_noise import short_term_sigma
 from .moments import between_keyframes, seconds
+from .repairs import listed
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -46,9 +47,7 @@ _SCALE = 0.12
 def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
     """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, contradict."""
     yield from check_range_scatter(estimate, residuals, grid, task)
-    yield from check_odometry_steps(estimate, task)
-    yield from check_untied_breaks(estimate, task)
-    yield from check_slips(estimate, task)
+    yield from check_odometry(estimate, task)
     yield from check_scales(estimate, task)
     yield from check_support(estimate, task)
 
@@ -77,13 +76,16 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
             typical = float(np.median(_spread_by_anchor(residuals[free], ranges.anchor[free])))
     if typical <= most:
         return
+    kind = "range-scatter"
     text = f"the ranges scatter by {typical:.1f} m about the map: they are not distances to stationary anchors; check the ids"
     if typical > _TIMES_NOISE * short:
+        # The ranges are good distances: what is wrong is the path, or to which time or anchor they belong.
+        kind = "ranges-disagree"
         text = (
             f"the ranges differ from the map by {typical:.2f} m (median), but from one to the next by {short:.2f} m only: the "
             "radio's clock, anchor ids or the trajectory are wrong"
         )
-    yield doubt("range-scatter", text, typical=typical, short_term=short)
+    yield doubt(kind, text, typical=typical, short_term=short)
 
 
 def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Bools:
@@ -92,90 +94,76 @@ def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Boo
     return blocked(ranges.tag_positions(graph.poses), graph.anchors[ranges.anchor], walls)
 
 
-def check_odometry_steps(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be.
+def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
+    """Find steps of the odometry that the map contradicts far beyond their noise, whatever that was estimated to be.
 
-    Where scans fix these steps, the wheels slipped and the map followed: good to know. Elsewhere they are a doubt.
+    Where scans tie both sides of such steps, the wheels slipped and the map followed: good to know. Where ranges alone do, a
+    robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
-    wheels, graph = estimate.odometry, estimate.graph
-    if len(wheels) < _WINDOW:
+    wheels, recordings = estimate.odometry, task.recordings
+    if not len(wheels):
         return
+    whitened = wheels.residuals(estimate.graph)
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
-    off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
-    fixed = scans_fixing(graph)[wheels.i] > 0
-    say, text = doubt, "most steps of the odometry contradict the map far beyond their noise, and no scan measures them"
-    stretch = _stretch(off & ~fixed)
-    if stretch is None and (stretch := _stretch(off)) is not None:
-        say, text = warning, "the wheels slipped: the map follows the lidar, which measures the steps there"
+    off = np.where(measured, np.abs(whitened).max(axis=1), 0.0)
+    far, stretch = np.flatnonzero(off > _JUMP), _stretch(off > _SUDDEN)
     if stretch is not None:
+        lidar = recordings.have_scans
+        why = "the wheels slipped, and the map does not follow them" if lidar else "they slipped, or ranges or clocks are wrong"
         span = int(wheels.i[stretch[0]]), int(wheels.j[stretch[1]])
-        a, b = (seconds(task.recordings, k) for k in span)
-        found = say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
-        yield between_keyframes(found, task.recordings, span)
+        start, end = (seconds(recordings, k) for k in span)
+        text = f"between t = {start:.0f} and {end:.0f} s most steps of the wheels contradict the map beyond their noise: {why}"
+        found = (warning if lidar else doubt)("odometry-steps", text, start=start, end=end)
+        yield between_keyframes(found, recordings, span)
+        measured[stretch[0] : stretch[1] + 1] &= off[stretch[0] : stretch[1] + 1] < _SUDDEN
+    if recordings.have_scans:
+        measured[far] = False
+        loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
+        far = np.intersect1d(far, loose)
+        yield from _loose_links(np.setdiff1d(loose, far) if estimate.placed.any() else loose, estimate, recordings)
+    if estimate.placed.any() and len(far):
+        yield _slips(far, whitened, wheels, recordings)
 
 
-def check_slips(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Find single steps of the odometry that are far off by the ranges, where no lidar measures them instead.
-
-    A robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
-    """
-    wheels, graph = estimate.odometry, estimate.graph
-    if not len(wheels) or not estimate.placed.any():
-        return
-    whitened = wheels.residuals(graph)
-    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information), whitened))
-    far = (np.abs(whitened).max(axis=1) > _JUMP) & (1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK)
-    far &= ~np.isin(wheels.i, _measured_by_lidar(graph))
-    at = np.flatnonzero(far)
-    if len(at):
-        when = ", ".join(f"{seconds(task.recordings, int(wheels.i[k])):.0f}" for k in at[:5])
-        way, turn = float(np.hypot(off[at, 0], off[at, 1]).max()), float(off[at, 2].max())
-        text = (
-            f"at t = {when}{' ...' if len(at) > 5 else ''} s the ranges contradict the odometry by up to {way:.2f} m and "
-            f"{turn:.2f} rad: the wheels slipped or were stuck, or the robot was carried"
-        )
-        say = doubt if max(way, turn) > _CARRIED else warning
-        spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
-        yield between_keyframes(say("odometry-slips", text, way=way, turn=turn), task.recordings, *spans)
-
-
-def _measured_by_lidar(graph: Graph) -> Ints:
-    """Return the keyframes whose step to the next one the lidar measures."""
-    scans = [edges for edges in graph.edges if isinstance(edges, ScanEdges)]
-    return np.concatenate([np.zeros(0, dtype=np.intp), *(np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1] for e in scans)])
+def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Recordings) -> Finding:
+    """Return the finding on single steps (s,) that are far off by the ranges, where no scans tie their sides."""
+    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at]))
+    when = listed([seconds(recordings, k) for k in wheels.i[at].tolist()])
+    way, turn = float(np.hypot(off[:, 0], off[:, 1]).max()), float(off[:, 2].max())
+    text = (
+        f"at t = {when} s the ranges contradict the odometry by up to {way:.2f} m and {turn:.2f} rad: the wheels slipped or "
+        "were stuck, or the robot was carried"
+    )
+    add = doubt if max(way, turn) > _CARRIED else warning
+    spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
+    return between_keyframes(add("odometry-slips", text, way=way, turn=turn), recordings, *spans)
 
 
 def _stretch(off: Bools) -> tuple[int, int] | None:
     """Return the first and last step of a stretch in which most steps are off (e,); None where there is none."""
-    share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid")
+    share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid") if len(off) >= _WINDOW else np.zeros(1)
     if share.max() < _MOST:
         return None
     last = len(share) - 1 - int(np.argmax(share[::-1] >= _MOST)) + _WINDOW
     return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
 
 
-def check_untied_breaks(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall.
+def _loose_links(loose: Ints, estimate: Estimate, recordings: Recordings) -> Iterator[Finding]:
+    """Doubt a map with steps (l,) that no odometry measured and scans leave free in a direction, as along a bare wall.
 
     Ranges connect the parts before and after, unless those of half of the anchors contradict the map in one of them.
     """
-    wheels, stamps = estimate.odometry, task.recordings.stamps
-    if not task.recordings.have_scans:
-        return
-    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
-    links = untied_breaks(wheels, estimate.graph, measured, task.recordings.path)
+    wheels, stamps = estimate.odometry, recordings.stamps
+    links = wheels.j[loose]
     if estimate.placed.any() and estimate.ranges is not None:
-        links = _contradicted_by_ranges(wheels.j[links], estimate.graph, estimate.ranges)
-    else:
-        links = wheels.j[links]
+        links = _contradicted_by_ranges(links, estimate.graph, estimate.ranges)
     at = (stamps[links - 1] - stamps[0]).tolist()
     if at:
         yield doubt(
             "loose-links",
-            f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s the odometry fails where "
-            "the lidar cannot measure the travelled distance, as along a bare wall, and no loop closure connects the parts "
-            "before and after, nor do ranges that agree: they may be misplaced to each other; drive through the first part "
-            "once more",
+            f"at t = {listed(at)} s the odometry fails where the lidar cannot measure the travelled distance, as along a bare "
+            "wall, and no loop closure connects the parts before and after, nor do ranges that agree: they may be misplaced "
+            "to each other; drive through the first part once more",
             at=at,
         )
 

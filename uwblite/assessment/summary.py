@@ -10,15 +10,15 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
-from ..graph.covariances import Covariances, about_best_fit, shape_error
 from ..graph.graph import Graph
+from ..graph.marginals import Covariances, about_best_fit, shape_error
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.sensors import name_and_number
 from . import plausibility
 from .residual_tests import NO_DISTANCES
 
@@ -32,8 +32,6 @@ _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _IMPLAUSIBLE_BIAS = 1.6
 """Constant error of an anchor's ranges, m, twice that of the worst radios: its place is more probably wrong."""
-_OTHER_BIAS = 1.0
-"""m, plus three standard deviations: constant errors of anchors that differ by more mean that a place is wrong."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -49,8 +47,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     # Relative to the scatter of a typical anchor's ranges; relative to its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
-    anchors = _with_times(_without_strange_biases(anchors), ranges, recordings)
-    anchors = anchors if recordings.have_scans else _without_leaps(anchors, ranges, recordings)
+    anchors = _with_times(anchors, ranges, recordings)
     listed = {
         u.key: u
         for r in recordings.each
@@ -163,20 +160,6 @@ def _anchor(
     )
 
 
-def _without_strange_biases(anchors: tuple[AnchorEstimate, ...]) -> tuple[AnchorEstimate, ...]:
-    """Return the anchors, distrusted where their constant error is far from that of the others; of two neither is."""
-    biases = np.array([a.bias for a in anchors])
-    if np.isfinite(biases).sum() < 3:
-        return anchors
-    off = biases - np.nanmedian(biases)
-    return tuple(
-        replace(a, status="distrusted", reason=f"its ranges fit only with a constant error {by:+.1f} m from the others'")
-        if a.status == "ok" and abs(by) > max(_OTHER_BIAS, 3.0 * a.bias_sigma)
-        else a
-        for a, by in zip(anchors, off.tolist(), strict=True)
-    )
-
-
 def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
     """Return the reason why an anchor is distrusted, '' where it is not.
 
@@ -232,42 +215,6 @@ def _shown_in(k: int, bases: NDArray[np.str_], ranges: RangeEdges, recording: In
     return int((both if len(both) else recording[own]).min())
 
 
-def _without_leaps(
-    anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None, recordings: Recordings
-) -> tuple[AnchorEstimate, ...]:
-    """Return the anchors, two places of one distrusted where nobody carries it from one to the other in the time between.
-
-    Without a lidar, ranges alone constrain the path, and one of the two may be a mirror image, or the move may be false; where
-    one is known to be ambiguous, so is the move. Exchanged names also change at once, but to the place of another anchor.
-    """
-    names = [name_and_number(a.id)[0] for a in anchors]
-    bases = np.array(names)
-    leaps: dict[int, str] = {}
-    for k, a in enumerate(anchors):
-        earlier = [j for j, b in enumerate(anchors) if names[j] == names[k] and b.since < a.since]
-        if ranges is None or not earlier:
-            continue
-        before = max(earlier, key=lambda j: anchors[j].since)
-        recording = recordings.of_keyframe[ranges.pose]
-        there = (ranges.anchor == before) & ranges.alive & (recording == _shown_in(k, bases, ranges, recording))
-        pause = a.since - float(ranges.stamps[there].max(initial=-np.inf))
-        way = float(np.hypot(*(a.position - anchors[before].position)))
-        others = np.array([b.position for j, b in enumerate(anchors) if names[j] != names[k]]).reshape(-1, 1, 2)
-        apart = np.hypot(*np.moveaxis(others - [a.position, anchors[before].position], -1, 0))
-        if way > _LEAP + _CARRYING * pause and not np.any(apart < plausibility.SAME_PLACE):
-            leaps |= dict.fromkeys((before, k), f"it would have been carried {way:.0f} m within {pause:.0f} s")
-        elif "mirror-ambiguous" in (a.status, anchors[before].status):
-            leaps |= dict.fromkeys((before, k), "its other place is mirror-ambiguous, and so is whether and when it was moved")
-    return tuple(
-        replace(a, status="distrusted", reason=leaps[k]) if k in leaps and a.status == "ok" else a
-        for k, a in enumerate(anchors)
-    )
-
-
-_LEAP, _CARRYING = 6.0, 1.0
-"""m, error of both places together, and m/s, speed at which an anchor is taken down, carried and put up again."""
-
-
 def _count(name: str, recordings: Recordings) -> int:
     """Return how many ranges to an anchor the recordings hold."""
     measured = [(r.log.ranges, r.anchor_ids.index(name)) for r in recordings.each if name in r.anchor_ids]
@@ -277,7 +224,7 @@ def _count(name: str, recordings: Recordings) -> int:
 def _calibration(
     k: int, unknown: Unknown, graph: Graph, covariance: Covariances, by_steps: float | None
 ) -> CalibrationEstimate:
-    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
+    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (calibration_checks)."""
     value = float(graph.calibration.values[k])
     if by_steps is not None:
         return CalibrationEstimate(unknown.key, value, by_steps, unknown.unit, unknown.meaning, "estimated")

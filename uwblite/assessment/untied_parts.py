@@ -17,7 +17,7 @@ from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording
-from ..sensor_log.anchor_names import radio_name
+from ..sensor_log.sensors import radio_name
 
 _SILENT, _DRIVEN = 10.0, 3.0
 """Time without any scan, s, and distance meanwhile, m, after which an odometry that failed may have any error."""

@@ -1,4 +1,4 @@
-"""The command line: log_verbs.py and map_verbs.py declare the verbs, and the module of that name does the work of each.
+"""The command line: verbs.py declares the verbs, and the module of that name does the work of each.
 
 What answers `--help` and usage errors imports nothing heavy, for they must come at once on a small computer: the module of a
 verb, with numpy, scipy and serial, is loaded when its options have been read. This package alone prints, and this file alone
@@ -20,28 +20,9 @@ from .. import __version__
 from ..errors import UsageError, UwbliteError
 from ..report.printable import printable
 from . import console, memory
-from . import log_verbs as logs
-from . import map_verbs as maps
 from .interruption import interruptible
 from .options import Verb
-
-VERBS = {
-    "map": maps.MAP,
-    "batch": maps.BATCH,
-    "view": maps.VIEW,
-    "localize": maps.LOCALIZE,
-    "plan": maps.PLAN,
-    "check": logs.CHECK,
-    "record": logs.RECORD,
-    "watch": logs.WATCH,
-    "devices": logs.DEVICES,
-    "plan-anchors": maps.PLAN_ANCHORS,
-    "convert": logs.CONVERT,
-    "evaluate": maps.EVALUATE,
-    "optimize": logs.OPTIMIZE,
-    "config": logs.CONFIG,
-}
-"""In the order in which a user meets them; `uwblite VERB` is `run` of the module of that name, with _ for -."""
+from .verbs import VERBS
 
 _DESCRIPTION = """\
 Maps from wheel odometry, ultra-wideband ranges to unknown anchors and a short-range 2D lidar.
@@ -208,7 +189,7 @@ def failure(error: BaseException) -> tuple[int, str]:
     if isinstance(error, UwbliteError):
         return 2 if isinstance(error, UsageError) else 1, str(error)
     # A library that does not fit is an ImportError; one that is absent is a ModuleNotFoundError.
-    unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.address_space()
+    unfit = isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError) and memory.shell_limits()
     if isinstance(error, MemoryError) or unfit:
         return 1, f"out of memory; {error if isinstance(error, memory.NoRoom) else _LESS_MEMORY + memory.allowed()}"
     if isinstance(error, OSError):

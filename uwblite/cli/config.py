@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..io.settings_toml import to_toml
+from ..config import to_toml
 from . import console
 from .inputs import effective_config
 

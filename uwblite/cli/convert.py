@@ -13,12 +13,12 @@ from ..errors import ConfigError
 from ..io.carmen import write_log
 from ..io.corrected_log import write_graph_with_scans
 from ..io.csv_folder import write_csv_folder
+from ..io.formats import format_of, format_of_name, graph_format, read_graph, refuse_existing, write_graph
 from ..io.ros_results import FILES, write_nav2_bundle
 from ..io.stored_result import read_result
 from ..io.tum import read_tum, write_trajectory
 from ..sensor_log import Odometry, SensorLog
 from . import console
-from .formats import format_of, format_of_name, graph_format, read_graph, refuse_existing, write_graph
 from .inputs import bag_choices, recording
 
 _RECORDINGS = ("log", "csv", "mcap", "sqlite3", "tum", "kitti")

@@ -5,12 +5,10 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field
 
-from ..drivers.device_options import Options, Setup
-from ..drivers.devices import DEVICES, SENSORS, DeviceKind, kinds_on_usb
+from ..drivers.devices import DEVICES, SENSORS, DeviceKind, Setup, kinds_on_usb
 from ..drivers.events import Action, Note, Reopen, Send, SetBaud, SetDtr
-from ..drivers.ports import plugged_in
 from ..drivers.session import Session
-from ..drivers.transport import Port, check_url, open_port
+from ..drivers.transport import Port, check_url, open_port, plugged_in
 from ..errors import DeviceError
 from .console import note, say, say_json
 
@@ -42,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         for kind in (kind for sensor in SENSORS for kind in DEVICES.values() if kind.sensor == sensor):
             say(f"--{kind.sensor} {kind.name}:PORT".ljust(28) + kind.title)
             if kind.options:
-                say(f"    options: {kind.options}")
+                say(f"    options: {kind.options_text()}")
         return 0
     for path in args.ports:
         check_url(path)
@@ -114,7 +112,7 @@ def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
 
 def _ask(port: Port, kind: DeviceKind, seen: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
-    driver = kind.make(Options(kind.name, {}), Setup(stream=False))
+    driver = kind.driver({}, Setup(stream=False))
     session, notes = Session(driver), []
 
     def do(actions: list[Action]) -> bool:

@@ -9,12 +9,12 @@ import numpy as np
 from ..config import merge, override, parse_toml
 from ..errors import ConfigError, UsageError
 from ..io.bag_topics import BagTopics
+from ..io.formats import read_recording
 from ..io.log_parts import each_once
 from ..io.source import read_settings
 from ..io.uwb_mapping import UwbMapping, parse_mappings
 from ..sensor_log import SensorLog, SensorMounting
 from . import console
-from .formats import read_recording
 
 if TYPE_CHECKING:
     from ..pipeline.mapping_config import MappingConfig

@@ -50,7 +50,7 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
     """Follow devices or a log and return the exit code."""
     with stopped_by(signal.SIGINT, signal.SIGTERM) as stopped:
         if devices:
-            from .named_devices import record_into
+            from .record import record_into
 
             record_into(args, tracker.take, lambda: bool(stopped), tracker.wait)
         else:

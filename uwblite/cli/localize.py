@@ -9,15 +9,15 @@ from typing import Any
 from ..errors import ConfigError, UsageError
 from ..io.files import write_text
 from ..io.folders import replacing_folder
+from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.result_text import covariance_csv, json_lines, notices
 from ..io.stored_result import read_result
 from ..io.tum import write_tum
 from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
-from ..report.picture import PictureAnchor, draw_map
+from ..report.picture import Overlay, PictureAnchor, draw_map
 from . import console
-from .formats import refuse_existing
 from .inputs import effective_config, recording
 from .live import run_live, tell_doubts
 from .wording import signed
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     summary = _summary(found, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
     anchors, caption = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors], os.path.basename(args.log)
-    picture = draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption) if "picture" in files else None
+    picture = draw_map(earlier.grid, found.trajectory, Overlay(anchors), caption=caption) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, found, picture, json_lines(about | summary))
     if args.json:

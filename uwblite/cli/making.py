@@ -11,14 +11,14 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from ..config import override
+from ..config import differences, override, to_toml
 from ..constraints import Constraints
 from ..errors import ConfigError
 from ..io.constraints_file import parse_constraints, read_anchors
 from ..io.files import sha256_of
+from ..io.formats import read_recording
 from ..io.result_text import RunRecord, base_name
 from ..io.results import write_result
-from ..io.settings_toml import differences, to_toml
 from ..io.source import read_settings
 from ..map_result import MapResult
 from ..mapping import MappingConfig, Progress, Stage, build_map
@@ -26,7 +26,6 @@ from ..pipeline.mapping_config import preset
 from ..pipeline.scan_selection import prepared
 from ..sensor_log import SensorLog
 from .cost import expected_cost, long_wait, together
-from .formats import read_recording
 from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
 from .memory import FreedMemory, shortage
 from .wording import findings_with_options, with_options

@@ -5,12 +5,13 @@ import os
 import shlex
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import UsageError
 from ..findings import DOUBT, folded
 from ..io.corrected_log import poses_of_scans, write_corrected_log
 from ..io.folders import sole_writer
+from ..io.formats import format_of
 from ..io.result_text import notices
 from ..io.results import check_target
 from ..mapping import Stage
@@ -18,7 +19,6 @@ from ..report.printable import duration
 from ..screening.screen import screen
 from . import console
 from .cost import expected_cost, long_wait, together
-from .formats import format_of
 from .inputs import name_recordings_once
 from .making import Made, Recordings, make, peak_memory, read_logs, settings
 from .memory import shortage
@@ -163,34 +163,42 @@ def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
     return lines
 
 
-if TYPE_CHECKING:
-    from ..mapping import Stage
-
-_WITH_LIDAR = (
-    ("keyframes", 0.04), ("edges", 0.01), ("bootstrap", 0.02), ("first optimisation", 0.03), ("constraints", 0.01),
-    ("clouds", 0.04), ("keyframes added", 0.03), ("scan-to-scan matching", 0.36), ("clouds made again", 0.06),
-    ("ranges re-estimated", 0.02), ("loose links", 0.01), ("long stretches", 0.01), ("loop closure", 0.18),
-    ("second optimisation", 0.01), ("joint refinement", 0.11), ("matched once more", 0.01), ("surfaces", 0.05),
-    ("map consistency", 0.01),
-    ("landmark distances", 0.01), ("occupancy grid", 0.05), ("summary", 0.01),
-)  # fmt: skip
-"""Means over two recordings with radio and lidar and six with lidar alone; in the order in which they come."""
-_WITHOUT_LIDAR = (
-    ("keyframes", 0.03), ("edges", 0.01), ("bootstrap", 0.24), ("first optimisation", 0.26), ("constraints", 0.01),
-    ("second optimisation", 0.01), ("landmark distances", 0.01), ("occupancy grid", 0.01), ("summary", 0.42),
-)  # fmt: skip
-"""Means over two recordings with radio alone; the last optimisation counts to the summary."""
+_SHARES = {
+    "keyframes": (0.04, 0.03),
+    "edges": (0.01, 0.01),
+    "bootstrap": (0.02, 0.24),
+    "first optimisation": (0.03, 0.26),
+    "constraints": (0.01, 0.01),
+    "clouds": (0.04, 0.0),
+    "keyframes added": (0.03, 0.0),
+    "scan-to-scan matching": (0.36, 0.0),
+    "clouds made again": (0.06, 0.0),
+    "ranges re-estimated": (0.02, 0.0),
+    "loose links": (0.01, 0.0),
+    "long stretches": (0.01, 0.0),
+    "loop closure": (0.18, 0.0),
+    "second optimisation": (0.01, 0.01),
+    "joint refinement": (0.11, 0.0),
+    "matched once more": (0.01, 0.0),
+    "surfaces": (0.05, 0.0),
+    "map consistency": (0.01, 0.0),
+    "landmark distances": (0.01, 0.01),
+    "occupancy grid": (0.05, 0.01),
+    "summary": (0.01, 0.42),
+}
+"""Share of the work of each stage, in the order in which they come: with lidar the means over two recordings with radio and six
+without, and the means over two with radio alone, where the last optimisation counts to the summary."""
 
 
 class Overall:
     """Turns the progress of stages into the progress of all."""
 
     def __init__(self, *, lidar: bool = True) -> None:
-        self._shares = _WITH_LIDAR if lidar else _WITHOUT_LIDAR
+        self._shares = [(name, with_lidar if lidar else alone) for name, (with_lidar, alone) in _SHARES.items()]
         self.share = 0.0
         """Of the whole work, 0..1; never falls."""
 
-    def take(self, stage: "Stage", done: int, total: int) -> float:
+    def take(self, stage: Stage, done: int, total: int) -> float:
         """Return the share of the whole work that is done; a stage that is not known leaves it as it is.
 
         Parameters

@@ -10,6 +10,8 @@ _PROC, _CGROUPS = "/proc", "/sys/fs/cgroup"
 _LIBRARIES, _BUFFERS = 300_000_000, 130_000_000
 """Bytes that numpy and scipy map with the buffers of OpenBLAS: 230 MB in Debian 12, 128 MB of them for the first product of
 matrices, and 270 MB in PyPI's wheels, where each has an OpenBLAS of its own; the buffers alone where they are loaded."""
+_PRIVATE = 200_000_000
+"""Bytes of them that are mapped for one process alone to write."""
 _RESIDENT = 76_000_000
 """Bytes of memory that Python, numpy, scipy and this package take before anything is read."""
 _ADDRESSES = 1 << 31
@@ -24,7 +26,14 @@ class Limit(NamedTuple):
     name: str
     bytes: int
     of_addresses: bool = False
-    """It counts what is mapped, used or not, libraries too."""
+    """It counts what is mapped, used or not, libraries too, and for each process alone."""
+    of_data: bool = False
+    """It counts what is mapped, used or not, for a process alone to write."""
+
+    @property
+    def of_a_process(self) -> bool:
+        """Whether it counts each process by itself."""
+        return self.of_addresses or self.of_data
 
 
 class NoRoom(MemoryError):
@@ -47,10 +56,10 @@ def shortage(megabytes: float, maps: int = 1) -> Shortage | None:
     maps : how many of that size are made at a time, each in a process: addresses are limited for each, memory for all.
     """
     shares = [(_needed(megabytes, limit) / limit.bytes, limit) for limit in limits()]
-    worst, limit = max(((one * (1 if limit.of_addresses else maps), limit) for one, limit in shares), default=(0.0, None))
+    worst, limit = max(((one * (1 if limit.of_a_process else maps), limit) for one, limit in shares), default=(0.0, None))
     if limit is None or worst <= 1.0:
         return None
-    who = "this map needs" if maps == 1 or limit.of_addresses else f"{maps} such maps at a time need"
+    who = "this map needs" if maps == 1 or limit.of_a_process else f"{maps} such maps at a time need"
     text = f"{who} about {worst * limit.bytes / 1e6:.0f} MB of memory; {limit.name} is {limit.bytes / 1e6:.0f} MB"
     cure = f"{'' if maps == 1 else 'fewer --jobs, '}a larger --resolution, --every-nth-scan or a part of the recording"
     return Shortage(f"{text}: {cure} {'needs' if maps == 1 else 'need'} less", max(one for one, _ in shares) > 2.0)
@@ -58,10 +67,9 @@ def shortage(megabytes: float, maps: int = 1) -> Shortage | None:
 
 def _needed(megabytes: float, limit: Limit) -> float:
     """Return bytes as this limit counts them."""
-    if not limit.of_addresses:
-        return 1e6 * megabytes
     pages = _pages()
-    return 1e6 * megabytes + max(pages.mapped - pages.resident, 0)
+    unused = pages.mapped - pages.resident if limit.of_addresses else pages.private - pages.used if limit.of_data else 0
+    return 1e6 * megabytes + max(unused, 0)
 
 
 def limits() -> list[Limit]:
@@ -69,19 +77,19 @@ def limits() -> list[Limit]:
     found = [Limit("this computer's memory", total)] if (total := _memory("MemTotal", "SwapTotal")) else []
     if sys.maxsize < _ADDRESSES:
         found.append(Limit("what a 32-bit system can address", _ADDRESSES, of_addresses=True))
-    if addresses := address_space():
-        found.append(Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True))
-    return found + ([Limit("the limit of this control group", group)] if (group := group_limit()) else [])
+    return found + shell_limits() + ([Limit("the limit of this control group", group)] if (group := group_limit()) else [])
 
 
-def address_space() -> int:
-    """Return the limit of the address space, bytes; 0 = none."""
+def shell_limits() -> list[Limit]:
+    """Return the limits that the shell sets for each process; its commands in brackets."""
     try:
         import resource
     except ImportError:
-        return 0
-    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return 0 if soft == resource.RLIM_INFINITY else soft
+        return []
+    addresses, data = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA))
+    found = [Limit("the limit of the address space (ulimit -v)", addresses, of_addresses=True)]
+    found.append(Limit("the limit of the data (ulimit -d)", data, of_data=True))
+    return [limit for limit in found if limit.bytes != resource.RLIM_INFINITY]
 
 
 @contextmanager
@@ -96,11 +104,11 @@ def within_limits() -> Iterator[None]:
     NoRoom : the libraries do not fit.
     """
     for limit in limits():
-        if not limit.of_addresses and limit.bytes < _RESIDENT:
+        if not limit.of_a_process and limit.bytes < _RESIDENT:
             need = f"numpy and scipy alone need {_RESIDENT / 1e6:.0f} MB"
             raise NoRoom(f"{need}; {limit.name} is {limit.bytes / 1e6:.0f} MB")
     group = group_limit()
-    if group or address_space():
+    if group or shell_limits():
         _load_libraries()
     pages = _pages()
     if not group or not pages.private:
@@ -119,20 +127,21 @@ def within_limits() -> Iterator[None]:
 
 def allowed() -> str:
     """Return what to say after "out of memory" of the limits that end a process by an error."""
-    shell, group = address_space(), group_limit()
-    return (f"; the shell allows {shell / 1e6:.0f} MB (ulimit -v)" if shell else "") + (
-        f"; this control group allows {group / 1e6:.0f} MB" if group else ""
-    )
+    shell = [f"; the shell allows {at.bytes / 1e6:.0f} MB ({at.name.rpartition('(')[2]}" for at in shell_limits()]
+    group = group_limit()
+    return "".join(shell) + (f"; this control group allows {group / 1e6:.0f} MB" if group else "")
 
 
 def _load_libraries() -> None:
     """Let OpenBLAS map its buffers while there is room: it tries for ever where it cannot."""
     import mmap
 
-    try:
-        mmap.mmap(-1, _BUFFERS if "scipy" in sys.modules else _LIBRARIES).close()
-    except OSError as error:
-        raise NoRoom(f"numpy and scipy alone need {_LIBRARIES / 1e6:.0f} MB of addresses{allowed()}") from error
+    loaded = "scipy" in sys.modules
+    for what, size, access in (("addresses", _LIBRARIES, mmap.MAP_SHARED), ("data", _PRIVATE, mmap.MAP_PRIVATE)):
+        try:
+            mmap.mmap(-1, _BUFFERS if loaded else size, access).close()
+        except OSError as error:
+            raise NoRoom(f"numpy and scipy alone need {size / 1e6:.0f} MB of {what}{allowed()}") from error
     import numpy as np
     from scipy.linalg import blas
 

@@ -11,17 +11,16 @@ from typing import Any, NamedTuple
 from ..config import override
 from ..errors import ConfigError
 from ..graph.certificate import Certificate, certify
-from ..graph.gnc import optimize_gnc, outlier_thresholds
+from ..graph.gnc import misfit, optimize_gnc, outlier_thresholds, with_kernel
 from ..graph.graph import Graph
-from ..graph.loop_edges import misfit, with_kernel
 from ..graph.robust import Kernel
 from ..graph.solver import ALL_WORK_DONE, Progress, SolverConfig, SolverSummary, optimize
+from ..io.formats import graph_format, read_graph, refuse_existing, write_graph
 from ..io.graph_file import GraphFile
 from ..io.tum import write_tum
 from ..radio.graph_starts import Start, starts, starts_nearby
 from ..radio.incremental import optimize_incrementally
 from . import console
-from .formats import graph_format, read_graph, refuse_existing, write_graph
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,9 +1,12 @@
-"""What the options of all verbs are made of: readers of their values, and the groups that several verbs share."""
+"""What the rows of verbs.py are made of: options and readers of their values, and the groups that several verbs share."""
 
 import argparse
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
+
+Add = Callable[[Any], object]
+"""Declares options in a parser or a group of its options."""
 
 
 class Verb(NamedTuple):
@@ -12,47 +15,41 @@ class Verb(NamedTuple):
     help: str
     epilog: str
     """Examples first."""
-    add_arguments: Callable[[argparse.ArgumentParser], None]
+    options: tuple[Add, ...]
     matrices: bool = True
     """Whether it makes or reads maps in this process, for which numpy and scipy must fit into memory."""
 
-
-def option(group: Any, name: str, help_text: str, kind: Callable[[str], Any] = str, default: Any = None, **more: Any) -> None:
-    """Declare an option ``--name METAVAR`` whose value `kind` reads; without METAVAR it is a switch."""
-    words = name.split(" ", 1)
-    if len(words) == 1:
-        group.add_argument(name, action="store_true", help=help_text)
-    else:
-        group.add_argument(words[0], metavar=words[1], type=kind, default=default, help=help_text, **more)
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare its options."""
+        for add in self.options:
+            add(parser)
 
 
-def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --preset, --config and --set."""
-    group = parser.add_argument_group("settings (a later one wins: preset, file, --set)")
-    option(group, "--preset NAME", "start from a preset: default or paper")
-    option(group, "--config FILE.toml", "settings from a file, as `uwblite config` prints it", place)
-    option(group, "--set NAME=VALUE", "change one setting, e.g. icp.max_iterations=30; repeatable", action="append", default=[])
+def option(name: str, help_text: str, kind: Callable[[str], Any] = str, default: Any = None, **more: Any) -> Add:
+    """Return an option ``--name METAVAR`` whose value `kind` reads, a switch ``--name``, or a place ``name``.
+
+    Parameters
+    ----------
+    more : further arguments of argparse; a name without METAVAR takes nothing else.
+    """
+    word, _, metavar = name.partition(" ")
+    if metavar:
+        more |= {"metavar": metavar, "type": kind, "default": default}
+    elif more or default is not None:
+        more |= {"default": default}
+    elif word.startswith("-"):
+        more = {"action": "store_true"}
+    return lambda parser: parser.add_argument(word, help=help_text, **more)
 
 
-def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare how the sensors are mounted; the log's own PARAM lines hold where these are not given."""
-    group = parser.add_argument_group("mounting (overrides what stands in the log)")
-    option(group, "--laser-pose X,Y,THETA", "laser on the base: m, m, rad", numbers(3))
-    option(group, "--laser-flipped", "the laser is mounted upside down")
-    option(group, "--tag X,Y,Z", "UWB tag on the base, z above the floor: m", numbers(3))
-    option(group, "--anchor-height H", "height of all anchors above the floor, m", number())
+def group(title: str, *options: Add) -> Add:
+    """Return options below a title."""
+    return lambda parser: Verb("", "", options).add_arguments(parser.add_argument_group(title))
 
 
-def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare which topics of a ROS bag are read; recordings of other kinds have none."""
-    bag = parser.add_argument_group("ROS bags (topics are guessed by their types where these are not given)")
-    option(bag, "--odometry-topic TOPIC", "nav_msgs/Odometry of the wheels", default="")
-    scans = "sensor_msgs/LaserScan; of a .log its messages, e.g. ROBOTLASER2 for the second lidar"
-    option(bag, "--scan-topic TOPIC", scans, default="")
-    option(bag, "--imu-topic TOPIC", "sensor_msgs/Imu for the heading; none = the odometry's", default="")
-    option(bag, "--uwb-topic TOPIC", "ranges; repeatable", action="append", default=[])
-    option(bag, "--uwb-mapping FILE.toml", "where ranges stand in messages: docs/formats.md", place)
-    option(bag, "--base-frame FRAME", "frame of the robot (the odometry's child frame)", default="")
+def either(*options: Add) -> Add:
+    """Return options of which one at most may be given."""
+    return lambda parser: Verb("", "", options).add_arguments(parser.add_mutually_exclusive_group())
 
 
 def number(
@@ -115,3 +112,29 @@ def page_address(text: str) -> tuple[str, int]:
     if not (port.isascii() and port.isdigit()) or not 0 < int(port) <= 65535:
         raise argparse.ArgumentTypeError(f"{text!r} is not a port such as 8000 or 0.0.0.0:8000")
     return host or LOCAL[0], int(port)
+
+
+SETTINGS = group(
+    "settings (a later one wins: preset, file, --set)",
+    option("--preset NAME", "start from a preset: default or paper"),
+    option("--config FILE.toml", "settings from a file, as `uwblite config` prints it", place),
+    option("--set NAME=VALUE", "change one setting, e.g. icp.max_iterations=30; repeatable", action="append", default=[]),
+)
+MOUNTING = group(
+    "mounting (overrides what stands in the log)",
+    option("--laser-pose X,Y,THETA", "laser on the base: m, m, rad", numbers(3)),
+    option("--laser-flipped", "the laser is mounted upside down"),
+    option("--tag X,Y,Z", "UWB tag on the base, z above the floor: m", numbers(3)),
+    option("--anchor-height H", "height of all anchors above the floor, m", number()),
+)
+BAG = group(
+    "ROS bags (topics are guessed by their types where these are not given)",
+    option("--odometry-topic TOPIC", "nav_msgs/Odometry of the wheels", default=""),
+    option(
+        "--scan-topic TOPIC", "sensor_msgs/LaserScan; of a .log its messages, e.g. ROBOTLASER2 for the second lidar", default=""
+    ),
+    option("--imu-topic TOPIC", "sensor_msgs/Imu for the heading; none = the odometry's", default=""),
+    option("--uwb-topic TOPIC", "ranges; repeatable", action="append", default=[]),
+    option("--uwb-mapping FILE.toml", "where ranges stand in messages: docs/formats.md", place),
+    option("--base-frame FRAME", "frame of the robot (the odometry's child frame)", default=""),
+)

@@ -9,13 +9,13 @@ import numpy as np
 from ..errors import ConfigError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.files import write_text
+from ..io.formats import refuse_existing
 from ..io.map_server import read_map
 from ..io.png import write_png
 from ..io.stored_result import StoredAnchor, read_result
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
-from ..report.picture import PictureAnchor, draw_map
+from ..report.picture import Overlay, PictureAnchor, draw_map
 from . import console
-from .formats import refuse_existing
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         raise
     write_text(table, _table(path))
     shown = [PictureAnchor(a.id, a.position) for a in anchors]
-    write_png(picture, draw_map(grid, path.poses, anchors=shown, caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
+    write_png(picture, draw_map(grid, path.poses, Overlay(shown), caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
     if args.json:
         console.say_json(_figures(args, path) | {"files": [table, picture], "exit_code": 0})
         return 0

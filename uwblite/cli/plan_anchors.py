@@ -7,13 +7,13 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..io.files import write_text
+from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.stored_result import StoredResult, read_result
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
 from ..report.error_map import draw_errors, side_by_side
 from ..report.picture import PictureAnchor
 from . import console
-from .formats import refuse_existing
 from .wording import signed
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from ..errors import ConfigError
 from ..io.files import sha256_of
+from ..io.formats import format_of
 from ..io.stored_result import StoredResult, read_result
 from ..server.app import app_of
 from ..server.web import server_for
 from . import console
 from .child import Child
-from .formats import format_of
 
 
 def run(args: argparse.Namespace) -> int:

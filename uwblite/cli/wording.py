@@ -13,16 +13,23 @@ if TYPE_CHECKING:
 
 
 OPTIONS = {
-    "mounting.laser_flipped": "--laser-flipped", "mounting.T_base_laser": "--laser-pose", "mounting.tag_position": "--tag",
-    "mounting.anchor_height": "--anchor-height", "crop": "--crop", "use_lidar=false": "--without lidar",
-    "range_unit": "uwblite convert --range-unit", "odometry_unit": "uwblite convert --odometry-unit",
-    "laser_unit": "uwblite convert --laser-unit", "time_unit": "uwblite convert --time-unit",
-    "angle_unit": "uwblite convert --angle-unit",
-    "end": "uwblite convert run.log before.log --end", "start": "uwblite convert run.log after.log --start",
-    "topics.odometry": "--odometry-topic", "topics.scan": "--scan-topic", "topics.imu": "--imu-topic",
-    "topics.base_frame": "--base-frame", "mappings": "--uwb-mapping", "folder": "--out", "force": "--force",
-    "append": "--append", "steps": "--lidar-steps", "shell": "--uwb shell:PORT",
-}  # fmt: skip
+    **{name: f"--{name}" for name in ("append", "crop", "force")},
+    **{f"{unit}_unit": f"uwblite convert --{unit}-unit" for unit in ("range", "odometry", "laser", "time", "angle")},
+    **{f"topics.{topic}": f"--{topic}-topic" for topic in ("odometry", "scan", "imu")},
+    "to": "--to",
+    "topics.base_frame": "--base-frame",
+    "mappings": "--uwb-mapping",
+    "mounting.laser_flipped": "--laser-flipped",
+    "mounting.T_base_laser": "--laser-pose",
+    "mounting.tag_position": "--tag",
+    "mounting.anchor_height": "--anchor-height",
+    "use_lidar=false": "--without lidar",
+    "start": "uwblite convert run.log after.log --start",
+    "end": "uwblite convert run.log before.log --end",
+    "folder": "--out",
+    "steps": "--lidar-steps",
+    "shell": "--uwb shell:PORT",
+}
 """What sets on the command line what a text of the library has in backticks, alone or with its value."""
 
 

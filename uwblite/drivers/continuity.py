@@ -7,7 +7,7 @@ what a sum would find and this cannot: a wrong reading that lies as near to the 
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Generic, TypeVar
 
 from .events import Action, Corrupt, RangeEpoch, RangeReading
@@ -51,12 +51,12 @@ class Continuity(Generic[Item]):
 
     Parameters
     ----------
-    follows : (earlier, later) -> whether one can go on from the other.
+    follows : (earlier, later) -> whether one can go on from the other. what : begins the words on those that are given up.
     summed : with a sum, one that leaps and from which the next goes on, as from the one before, came late; else it is damage.
     """
 
-    def __init__(self, follows: Callable[[Item, Item], bool], *, summed: bool = False) -> None:
-        self._follows, self._summed = follows, summed
+    def __init__(self, follows: Callable[[Item, Item], bool], what: str = "reading that", *, summed: bool = False) -> None:
+        self._follows, self._what, self._summed = follows, what, summed
         self.last: Item | None = None
         """The latest that passed."""
         self.waiting: list[Item] = []
@@ -85,6 +85,16 @@ class Continuity(Generic[Item]):
         if passed:
             self.last, self.waiting = item, []
         return passed, dropped
+
+    def confirmed(self, item: Item, witnesses: int, use: Callable[[Item], Iterable[Action]]) -> list[Action]:
+        """Return what the readings mean that pass with the next one, and Corrupt for those that are given up."""
+        passed, dropped = self.take(item, witnesses)
+        given_up: list[Action] = [Corrupt(b"", f"{self._what} leaps away and back")] * len(dropped)
+        return [*given_up, *(action for each in passed for action in use(each))]
+
+    def unconfirmed(self) -> list[Action]:
+        """Return Corrupt for the readings that still wait at the end."""
+        return [Corrupt(b"", f"{self._what} nothing confirmed")] * len(self.waiting)
 
 
 class LinkHealth:
@@ -143,10 +153,9 @@ class RangeGuard:
         rounds: dict[float, list[Ranged]] = {}
         for item in sorted(passed, key=lambda item: item[0].stamp):
             rounds.setdefault(item[0].stamp, []).append(item)
-        return [*[Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up), *(
-            RangeEpoch(stamp, tuple([reading for _, reading in items]), items[0][0].spread)
-            for stamp, items in rounds.items()
-        )]  # fmt: skip
+        damaged: list[Action] = [Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up)
+        epochs = (RangeEpoch(t, tuple([reading for _, reading in items]), items[0][0].spread) for t, items in rounds.items())
+        return [*damaged, *epochs]
 
     def _follows(self, before: Ranged, after: Ranged) -> bool:
         seconds = max(after[0].stamp - before[0].stamp, 0.0)

@@ -8,11 +8,23 @@ that died, is brought round.
 from typing import Any
 
 from .continuity import LinkHealth, RangeGuard
-from .dwm1001 import BAUD, QUERIES, STATUS_GET, TlvProtocol
-from .dwm1001_advice import advise, not_joined
-from .dwm1001_blocks import NodeConfig, Status, UpdateRate, Value, short_id
-from .dwm1001_poll import FixPoller
+from .dwm1001_poll import NOT_JOINED, FixPoller
 from .dwm1001_shell import ENTER, NodeInfo, PositionLine, Prompt, RangeLine, ShellProtocol, TextLine, parse_node_info
+from .dwm1001_tlv import (
+    BAUD,
+    CFG_GET,
+    NODEID_GET,
+    PANID_GET,
+    STATUS_GET,
+    UPD_RATE_GET,
+    VER_GET,
+    NodeConfig,
+    Status,
+    TlvProtocol,
+    UpdateRate,
+    Value,
+    short_id,
+)
 from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
 
@@ -23,18 +35,52 @@ PROBES = ((STATUS_GET, PATIENCE), (ENTER, 0.6), (STATUS_GET, PATIENCE), (STATUS_
 """What finds out the mode: the status in generic mode; Enter in the shell, which also wakes a sleeping tag."""
 QUIET = 0.15, 0.35
 """s: lines may still come at first; after that, a stream that was stopped must be silent."""
-ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
-"""The value that completes the answer to a query."""
+QUERIES = (
+    (VER_GET, lambda event: _is_value(event, "hardware")),
+    (NODEID_GET, lambda event: _is_value(event, "node_id")),
+    (PANID_GET, lambda event: _is_value(event, "pan_id")),
+    (CFG_GET, lambda event: isinstance(event, NodeConfig)),
+    (UPD_RATE_GET, lambda event: isinstance(event, UpdateRate)),
+)
+"""What a module is asked once, and what completes the answer."""
 SHORTEST_PERIOD = 0.1
 """s between fixes at the highest rate."""
-SILENT = Note(
-    "error", "uwb-silent", "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
-    " check that the port is the DWM1001's and that no other program has it",
-)  # fmt: skip
-UNREADABLE = Note(
-    "error", "uwb-unreadable", "uwb: bytes come, but none that a DWM1001 sends: check that the port is its own, and that it"
-    f" talks at {BAUD} bit/s",
-)  # fmt: skip
+_BRIDGE = "The USB bridge of the DEV board can hang: unplug it and plug it in again"
+_PORT = "check that the port is the DWM1001's"
+SILENT = Note("error", "uwb-silent", f"uwb: no answer. {_BRIDGE}; {_PORT} and that no other program has it")
+_FOREIGN = "uwb: bytes come, but none that a DWM1001 sends"
+UNREADABLE = Note("error", "uwb-unreadable", f"{_FOREIGN}: {_PORT}, and that it talks at {BAUD} bit/s")
+_SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
+
+
+def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float) -> list[Note]:
+    """Name every setting that makes ranges rare or absent, the worst first, and how to mend each.
+
+    Parameters
+    ----------
+    tag : the node is a tag, not an anchor. active : its radio is on. stationary : stationary detection is on.
+    joined : it is part of a network; None = not known yet. low_power : low-power mode is on. period : s between fixes.
+    """
+    resting = f"stationary detection is on: the rate falls to once in 10 s at rest: {_SHELL}, `acts` shows its arguments;"
+    rows = (
+        (not tag, "error", "not-a-tag", f"this node is an anchor: {_SHELL}, type `nmt` (it restarts)"),
+        (tag and not active, "error", "uwb-off", f"the tag's radio is off or passive: {_SHELL}, type `nmt`"),
+        (joined is False, NOT_JOINED.level, NOT_JOINED.name, NOT_JOINED.text.removeprefix("uwb: ")),
+        (
+            stationary,
+            "warning",
+            "stationary-detection",
+            f"{resting} set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)",
+        ),
+        (low_power, "warning", "low-power", f"low-power mode makes ranges come in bursts: {_SHELL}, type `nmt`"),
+        (
+            period > SHORTEST_PERIOD,
+            "warning",
+            "slow-update-rate",
+            f"a fix only every {period:.1f} s: {_SHELL}, type `aurs 1 1` for ten a second",
+        ),
+    )
+    return [Note(level, name, f"uwb: {text}") for hurts, level, name, text in rows if hurts]
 
 
 class Dwm1001Driver(Driver):
@@ -188,11 +234,15 @@ class Dwm1001Driver(Driver):
             yield Param("uwb_tag_id", self.info.short_id)
         if self.info.firmware:
             yield Param("uwb_tag_firmware", self.info.firmware)
-        yield from self.say_once(*advise(
-            tag=self.info.mode in ("tn", ""), active=self.info.activity in ("act", ""),
-            stationary=settings.get("stat_det") == "1", joined=self.joined,
-            low_power=settings.get("lp") == "1", period=self.period,
-        ))  # fmt: skip
+        findings = advise(
+            tag=self.info.mode in ("tn", ""),
+            active=self.info.activity in ("act", ""),
+            stationary=settings.get("stat_det") == "1",
+            joined=self.joined,
+            low_power=settings.get("lp") == "1",
+            period=self.period,
+        )
+        yield from self.say_once(*findings)
 
     def _read_lines(self) -> Script[None]:
         """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
@@ -224,13 +274,7 @@ class Dwm1001Driver(Driver):
     # ---- TLV
 
     def _query(self) -> Script[None]:
-        for name, request in QUERIES.items():
-
-            def answers(event: Any, name: str = name) -> bool:
-                if isinstance(event, Value):
-                    return event.name == ANSWERS.get(name)
-                return isinstance(event, NodeConfig if name == "cfg_get" else UpdateRate)
-
+        for request, answers in QUERIES:
             yield from self.ask(request, answers, PATIENCE)
         for name, key in (("uwb_tag_id", "node_id"), ("uwb_pan_id", "pan_id")):
             if key in self.values:
@@ -239,10 +283,15 @@ class Dwm1001Driver(Driver):
             yield Param("uwb_tag_firmware", self._firmware())
         config = self.config
         if config is not None:
-            yield from self.say_once(*advise(
-                tag=not config.anchor, active=config.uwb_mode == 2, stationary=config.stationary_detection,
-                joined=None, low_power=config.low_power, period=self.period,
-            ))  # fmt: skip
+            findings = advise(
+                tag=not config.anchor,
+                active=config.uwb_mode == 2,
+                stationary=config.stationary_detection,
+                joined=None,
+                low_power=config.low_power,
+                period=self.period,
+            )
+            yield from self.say_once(*findings)
 
     def _firmware(self) -> str:
         return ".".join(str(byte) for byte in self.values["firmware"].to_bytes(4, "big"))
@@ -264,12 +313,16 @@ class Dwm1001Driver(Driver):
         findings = []
         if self.joined is not None:
             details["network state"] = "joined" if self.joined else "not joined"
-            findings += [] if self.joined else [not_joined()]
+            findings += [] if self.joined else [NOT_JOINED]
         if network == 0:
             text = "the network id is 0: in the shell type `nis 0xC0DE` (with 0x), then `reset`"
             findings.append(Note("error", "no-network-id", text))
         title = "DWM1001 anchor" if self.config and self.config.anchor else self.title
         return Identity(title, tuple(details.items()), tuple(findings))
+
+
+def _is_value(event: Any, name: str) -> bool:
+    return isinstance(event, Value) and event.name == name
 
 
 def _source(events: list[Any]) -> str:

@@ -10,9 +10,7 @@ has no checksum: a fix is read twice and must agree, unless the link is too slow
 from typing import Any
 
 from ..clocks.device_clock import GAP
-from .dwm1001 import LOC_GET, STATUS_GET
-from .dwm1001_advice import not_joined
-from .dwm1001_blocks import ERRORS, Answer, Distances, Status
+from .dwm1001_tlv import ERRORS, LOC_GET, STATUS_GET, Answer, Distances, Status
 from .events import Corrupt, Lost, Note, RangeEpoch, RangeReading, Send
 from .session import Driver, Script, Wait
 
@@ -42,6 +40,14 @@ MAX_FAILURES = 40
 """Requests without an answer after which the module is started again."""
 UNJOINED = 3.0
 """s without a fix after which a tag is reported to have no network."""
+
+
+NOT_JOINED = Note(
+    "warning",
+    "not-joined",
+    "uwb: the tag has not joined a network: one anchor must be the initiator and on, all nodes need the same network id, and"
+    " none may be in firmware-update mode",
+)
 
 
 def _slow(width: float) -> Note:
@@ -163,7 +169,7 @@ class FixPoller:
         """Wait until the next fix may come."""
         now = self._driver.now
         if not status.joined and now - self._last_fix > UNJOINED:
-            yield from self._driver.say_once(not_joined())
+            yield from self._driver.say_once(NOT_JOINED)
         due = now if self._latest is None else self._last_fix + self._period - self._lead - (self._trip or 0.0)
         late = now - self._last_fix - self._period
         pause = DENSE if late < LATE else SPARSE if late < LONG_AGO else IDLE

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .events import Corrupt, RangeReading, corrupt
-from .line_reader import Line, LineReader
+from .framing import LineReader, RawLine
 
 ENTER = b"\r\r"
 PROMPT = b"dwm> "
@@ -34,10 +34,6 @@ class RangeLine:
     stamp: float
     """s, arrival of its first byte."""
     readings: tuple[RangeReading, ...]
-    anchors: tuple[tuple[float, float, float], ...]
-    """Configured positions of the anchors, m."""
-    position: tuple[float, float, float, int] | None = None
-    """The module's estimate x, y, z, m, and quality 0..100; None with fewer than three anchors, or where it found none."""
     source: str = "lec"
     """"lec" or "les"."""
 
@@ -47,8 +43,6 @@ class PositionLine:
     """One line of ``lep``; on a listener it is of another tag."""
 
     stamp: float
-    position: tuple[float, float, float, int]
-    """x, y, z, m, and quality 0..100."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,27 +55,21 @@ class TextLine:
 
 Event = Prompt | RangeLine | PositionLine | TextLine | Corrupt
 
-COMMANDS = (
-    "?", "help", "quit", "ps", "pms", "reset", "si", "ut", "f", "les", "lec", "lep", "utps", "utpg", "nmg", "nmt", "nmtl",
-    "nma", "nmi", "nmp", "nmo", "la", "lb", "nls", "aurs", "aurg", "apg", "aps", "acts", "acas", "nis", "scs", "scg", "tlv",
-    "av", "aid", "bpc", "stg", "stc", "udi", "uui", "twi", "gc", "gg", "gs", "gt", "frst", "nmb", "akc", "aks", "ans", "ang",
-)  # fmt: skip
-
-
-_NUMBER = r"(-?\d{1,6}\.\d\d)"
-_DISTANCE = r"(\d{1,4}\.\d\d)"
-_QUALITY = r"(\d{1,3})"
-_COORDINATE = r"(-?\d{1,6}\.\d\d|-?nan)"
-_ESTIMATE = rf"{_COORDINATE},{_COORDINATE},{_COORDINATE},{_QUALITY}"
-"""Of the module's location engine, which may not converge; the ranges beside it are good."""
-_BLOCK = re.compile(rf"([0-9A-F]{{4}})\[{_NUMBER},{_NUMBER},{_NUMBER}\]={_DISTANCE}")
-_LES = re.compile(
-    rf"((?:{_BLOCK.pattern.replace('(', '(?:')} )*{_BLOCK.pattern.replace('(', '(?:')})"
-    rf"(?: le_us=\d{{1,9}})?(?: est\[{_ESTIMATE}\])?$"
+_COMMAND = re.compile(
+    r"\?|help|quit|ps|pms|reset|si|ut|f|le[scp]|utp[sg]|nm[gtaipob]|nmtl|l[ab]|nls|aur[sg]|ap[gs]|ac[ta]s|nis|sc[sg]|tlv|av|aid|bpc"
+    r"|st[gc]|udi|uui|twi|g[cgst]|frst|ak[cs]|an[sg]"
 )
-_LEC_ROW = re.compile(rf"AN(\d),([0-9A-F]{{4}}),{_NUMBER},{_NUMBER},{_NUMBER},{_DISTANCE}(?:,|$)")
-_POS = re.compile(rf"POS,{_ESTIMATE}$")
-_LISTENER = re.compile(rf"POS,\d{{1,3}},([0-9A-F]{{4}}),{_NUMBER},{_NUMBER},{_NUMBER},{_QUALITY},x[0-9a-fA-F]{{2}}$")
+_NUMBER, _DISTANCE, _QUALITY = r"-?\d{1,6}\.\d\d", r"(\d{1,4}\.\d\d)", r"(?:100|\d{1,2})"
+_PLACE = f"{_NUMBER},{_NUMBER},{_NUMBER}"
+_ESTIMATE = rf"(?:(?:{_NUMBER}|-?nan),){{3}}{_QUALITY}"
+"""Of the module's location engine, which may not converge; the ranges beside it are good."""
+_BLOCK = re.compile(rf"([0-9A-F]{{4}})\[{_PLACE}\]={_DISTANCE}")
+_BLOCKS = _BLOCK.pattern.replace("(", "(?:")
+_LES = re.compile(rf"((?:{_BLOCKS} )*{_BLOCKS})(?: le_us=\d{{1,9}})?(?: est\[{_ESTIMATE}\])?$")
+_LEC_ROW = re.compile(rf"AN(\d),([0-9A-F]{{4}}),{_PLACE},{_DISTANCE}(?:,|$)")
+_LEC_END = re.compile(rf"POS,{_ESTIMATE}$")
+_POS = re.compile(rf"POS,{_PLACE},{_QUALITY}$")
+_LISTENER = re.compile(rf"POS,\d{{1,3}},[0-9A-F]{{4}},{_PLACE},{_QUALITY},x[0-9a-fA-F]{{2}}$")
 _LOG_ROW = re.compile(r"\[\d{6,}\.\d{3} [A-Z]{3}\] ")
 _ANSWER = re.compile(
     r"ok$|err(or)?\b|mode: |OUTPUT FRAME|[0-9a-f]{2}( [0-9a-f]{2})*$|x:-?\d+ y:|sensitivity|\*\* |[Uu]sage|uptime"
@@ -109,7 +97,7 @@ class ShellProtocol:
         return events
 
 
-def _parse(line: Line) -> list[Event]:
+def _parse(line: RawLine) -> list[Event]:
     """Find what a line holds; the rest of it before that is Corrupt."""
     text = line.data.decode("latin-1").rstrip()
     broken: Corrupt | None = None
@@ -135,21 +123,16 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
     head = re.match(r"DIST,(?:([1-4]),|(0),?$)", text[start:])
     if not head:
         return start, bad
-    at, readings, anchors = start + head.end(), [], []
+    at, readings = start + head.end(), []
     for index in range(int(head[1] or 0)):
         row = _LEC_ROW.match(text, at)
         if not row or int(row[1]) != index:
             return start, bad
-        readings.append(RangeReading(row[2], float(row[6]), 100))
-        anchors.append((float(row[3]), float(row[4]), float(row[5])))
+        readings.append(RangeReading(row[2], float(row[3]), 100))
         at = row.end()
-    position = None
-    if head[1] and (at < len(text) or text.endswith(",")):
-        estimate = _POS.match(text, at)
-        if not estimate:
-            return start, bad
-        position = _position(estimate.groups())
-    return start, _checked(RangeLine(stamp_at(start), tuple(readings), tuple(anchors), position, "lec"), text)
+    if head[1] and (at < len(text) or text.endswith(",")) and not _LEC_END.match(text, at):
+        return start, bad
+    return start, _checked(RangeLine(stamp_at(start), tuple(readings), "lec"), text)
 
 
 def _find_les(text: str, stamp_at: StampAt) -> Found:
@@ -161,20 +144,15 @@ def _find_les(text: str, stamp_at: StampAt) -> Found:
     ids = [block[1] for block in blocks]
     # A line that broke off runs into the next one: the same anchor again begins the newer line.
     first = max((i + 1 for i, name in enumerate(ids) if name in ids[i + 1 :]), default=0)
-    blocks = blocks[first:]
-    readings = tuple(RangeReading(block[1], float(block[5]), 100) for block in blocks)
-    anchors = tuple((float(block[2]), float(block[3]), float(block[4])) for block in blocks)
-    position = _position(match.groups()[1:]) if match[2] else None
-    start = blocks[0].start()
-    return start, _checked(RangeLine(stamp_at(start), readings, anchors, position, "les"), text)
+    readings = tuple(RangeReading(block[1], float(block[2]), 100) for block in blocks[first:])
+    start = blocks[first].start()
+    return start, _checked(RangeLine(stamp_at(start), readings, "les"), text)
 
 
 def _checked(line: RangeLine, text: str) -> Event:
     far = any(reading.range > MAX_RANGE for reading in line.readings)
-    twice = len({reading.anchor_id for reading in line.readings}) < len(line.readings)
-    quality = line.position is not None and line.position[3] > 100
-    if far or twice or quality:
-        return corrupt(text.encode("latin-1"), "distance, quality or anchors out of range")
+    if far or len({reading.anchor_id for reading in line.readings}) < len(line.readings):
+        return corrupt(text.encode("latin-1"), "distance or anchors out of range")
     return line
 
 
@@ -183,12 +161,9 @@ def _find_position(text: str, stamp_at: StampAt) -> Found:
     if start < 0:
         return 0, None
     # Behind the rows of a broken lec line a position is the end of that line.
-    own = None if "DIST," in text and text[:start].endswith(",") else _POS.match(text, start)
-    other = _LISTENER.match(text, start)
-    position = _position(own.groups()) if own else _position(other.groups()[1:]) if other else None
-    if position is None or position[3] > 100:
-        return start, corrupt(text.encode("latin-1"), "lep line cut or garbled")
-    return start, PositionLine(stamp_at(start), position)
+    if _LISTENER.match(text, start) or (_POS.match(text, start) and not ("DIST," in text and text[:start].endswith(","))):
+        return start, PositionLine(stamp_at(start))
+    return start, corrupt(text.encode("latin-1"), "lep line cut or garbled")
 
 
 def _find_text(text: str, stamp_at: StampAt) -> Found:
@@ -196,15 +171,8 @@ def _find_text(text: str, stamp_at: StampAt) -> Found:
     if row and text[row.start() :].isprintable():
         return row.start(), TextLine(stamp_at(row.start()), text[row.start() :])
     stripped = text.strip()
-    known = _ANSWER.match(stripped) or stripped.partition(" ")[0] in COMMANDS
+    known = _ANSWER.match(stripped) or _COMMAND.fullmatch(stripped.partition(" ")[0])
     return 0, TextLine(stamp_at(0), stripped) if known and stripped.isprintable() else None
-
-
-def _position(groups: Sequence[str]) -> tuple[float, float, float, int] | None:
-    if any("nan" in text for text in groups):
-        return None
-    x, y, z, quality = groups
-    return float(x), float(y), float(z), int(quality)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,16 +194,7 @@ class NodeInfo:
 
 
 def parse_node_info(lines: Sequence[str]) -> NodeInfo:
-    """Read the lines of `si` (or the one of `nmg`).
-
-    Parameters
-    ----------
-    lines : text of the TextLine events.
-
-    Returns
-    -------
-    NodeInfo : fields that did not occur keep their defaults.
-    """
+    """Read the text lines of `si` (or the one of `nmg`); fields that did not occur keep their defaults."""
     text = "\n".join(lines)
     address, pan = re.search(r"addr=x([0-9A-F]{16})", text), re.search(r"panid=x([0-9A-F]{1,4})", text)
     firmware = re.search(r"fw_ver=x([0-9a-fA-F]{8})", text)

@@ -18,17 +18,7 @@ class Corrupt:
 
 
 def corrupt(raw: bytes, why: str) -> Corrupt:
-    """Return a Corrupt event that keeps at most the first 64 bytes.
-
-    Parameters
-    ----------
-    raw : the bytes that did not fit.
-    why : one clause.
-
-    Returns
-    -------
-    Corrupt
-    """
+    """Return a Corrupt event that keeps at most the first 64 bytes of what did not fit, and why, one clause."""
     return Corrupt(bytes(raw[:64]), why)
 
 

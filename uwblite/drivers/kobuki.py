@@ -122,19 +122,17 @@ class KobukiDriver(BaseDriver):
         odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
         super().__init__(KobukiProtocol(), "Kobuki base", odometer, LOW_BATTERY)
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
-        self._series = Continuity(_follows, summed=True)
+        self._series = Continuity(_follows, "packet that", summed=True)
         self._packets = 0
         self._last: Feedback | None = None
 
     def take(self, event: Feedback) -> list[Action]:
         """Turn packets into poses. One that leaps, and the first, count only if the next one goes on from it."""
-        passed, dropped = self._series.take(event, 1)
-        given_up: list[Action] = [Corrupt(b"", "packet that leaps away and back")] * len(dropped)
-        return [*given_up, *(action for packet in passed for action in self._pose(packet))]
+        return self._series.confirmed(event, 1, self._pose)
 
     def stop(self) -> list[Action]:
         """Return Corrupt for a packet that nothing confirmed."""
-        return [Corrupt(b"", "packet that nothing confirmed")] * len(self._series.waiting)
+        return self._series.unconfirmed()
 
     def _pose(self, event: Feedback) -> list[Action]:
         self._packets += 1

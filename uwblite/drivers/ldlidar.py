@@ -14,7 +14,7 @@ import struct
 
 from ..clocks.device_clock import DeviceClock
 from .continuity import Continuity, device_time
-from .events import Action, Corrupt
+from .events import Action
 from .framing import FixedPackets
 from .spinning import SpinningDriver
 from .sweep import Fan, Samples
@@ -87,13 +87,11 @@ class LdLidarDriver(SpinningDriver):
     def __init__(self) -> None:
         clock = DeviceClock(CLOCK_TICK, CLOCK_MODULUS, period=READINGS / RATE)
         super().__init__(LdLidarProtocol(), FAN, clock)
-        self._series = Continuity(_follows, summed=True)
+        self._series = Continuity(_follows, "packet whose time", summed=True)
 
     def take(self, event: Samples) -> list[Action]:
         """Turn packets into scans. One whose time leaps, and the first, count only if the next one goes on from it."""
-        passed, dropped = self._series.take(event, 1)
-        given_up: list[Action] = [Corrupt(b"", "packet whose time leaps away and back")] * len(dropped)
-        return [*given_up, *(action for packet in passed for action in super(LdLidarDriver, self).take(packet))]
+        return self._series.confirmed(event, 1, super().take)
 
 
 def _follows(before: Samples, after: Samples) -> bool:

@@ -1,4 +1,4 @@
-"""One device of a recording: its port, its session, and its record."""
+"""One device of a recording: its port, its session, its record, and what all of them did in sentences."""
 
 import re
 import threading
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from ..errors import DeviceError
 from .events import Note, Send, SetBaud, SetDtr
 from .session import Session
-from .transport import Port
+from .transport import Port, open_port
 
 SILENCE = 3.0
 """s without a measurement before it is reported."""
@@ -53,6 +53,21 @@ class Mounting:
     """x, y, theta of the second lidar, the third ..."""
 
 
+@dataclass(frozen=True, slots=True)
+class Host:
+    """The computer that records."""
+
+    name: str
+    monotonic: Callable[[], float]
+    """s, a clock that never leaps."""
+    wall_offset: float
+    """s to add to it for the log's timestamps."""
+    wall: Callable[[], float] | None = None
+    """s, the computer's own clock, to report that it was set; stamps do not follow it."""
+    open_port: Callable[[str, int], Port] = open_port
+    """(url, baud) -> Port."""
+
+
 class Opening:
     """A port that is being opened by a thread of its own, so that nobody has to wait for it.
 
@@ -82,7 +97,7 @@ class Opening:
             result.close()
 
     def result(self) -> "Port | DeviceError | None":
-        """Return the port, why it cannot be opened, or None as long as that is not known."""
+        """Return the port, why not, None while that is unknown."""
         return self._result
 
     def give_up(self) -> None:
@@ -123,16 +138,12 @@ class Link:
     # ---- its port
 
     def connect(self, now: float, open_port: Callable[[str, int], Port]) -> Port | DeviceError | None:
-        """Open the port in the background, or take it when it is open.
+        """Open the port in the background; return it once it is open, why not, None while that is unknown.
 
         Parameters
         ----------
         now : s.
         open_port : (url, baud) -> Port.
-
-        Returns
-        -------
-        Port that is open now, DeviceError where it cannot be, None as long as that is not known.
         """
         if self.opening is None:
             self.opening = Opening(open_port, self.url, self.session.baud)
@@ -244,3 +255,38 @@ class Link:
         if not self.counts.messages:
             return end - start
         return self.counts.silent_time + (end - self.last_message if self.quiet else 0.0)
+
+
+def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
+    """Return what each device did, for people."""
+    lines = []
+    for link in links:
+        counts = link.counts
+        text = (
+            f"{link.name}: {counts.messages} messages ({counts.messages / max(end - start, 1e-9):.2f}/s),"
+            f" lost {counts.lost}, corrupt {sum(counts.corrupt.values())}, connected {counts.connects} times,"
+            f" silent {link.silent_time(start, end):.1f} s"
+        )
+        if counts.anchors:
+            text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
+        if counts.widest:
+            mean = counts.spread / counts.messages
+            text += f"; stamps within {1000 * mean:.1f} ms on average, {1000 * counts.widest:.1f} ms at worst"
+        lines.append(text)
+        lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
+    return lines
+
+
+def doubts(links: list[Link], start: float, end: float) -> list[str]:
+    """Return why a recording should not be trusted; empty when it can be."""
+    seconds, found = max(end - start, 1e-9), []
+    for link in links:
+        counts = link.counts
+        silent, total = link.silent_time(start, end), counts.messages + counts.lost
+        if not counts.messages:
+            found.append(f"{link.name}: no data at all")
+        elif silent > 0.1 * seconds:
+            found.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
+        elif counts.lost > 0.1 * total:
+            found.append(f"{link.name}: lost {counts.lost} of {total}")
+    return found

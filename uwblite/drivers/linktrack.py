@@ -1,4 +1,4 @@
-"""UWB boards with binary frames: Nooploop LinkTrack (Tag_Frame0) and Ai-Thinker BU03; `uwb_driver` reads them. Sans-I/O.
+"""UWB boards with binary frames: Nooploop LinkTrack (Tag_Frame0) and Ai-Thinker BU03; `uwb_line` reads them. Sans-I/O.
 
 LinkTrack, 921600 bit/s by default, 128 bytes, little-endian: ``55 01``, id, role, position, velocity, eight ranges (24-bit
 signed, mm, 0 = none) at byte 22, ..., local time (4, ms) at byte 108, ..., sum of all bytes before. Other frames begin

@@ -13,7 +13,8 @@ import threading
 from pathlib import Path
 
 from ..errors import DataError
-from .events import GyroHeading, LaserScan, OdometryPose, RangeEpoch
+from .events import GyroHeading, LaserScan, Measurement, OdometryPose, RangeEpoch
+from .link import Host, Link, Mounting
 
 _MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
 TAIL, _PIECE = 1 << 18, 1 << 20
@@ -68,18 +69,14 @@ def scan_line(
     robot : latest odometry, None = origin. The reader interpolates odometry itself; this is for other readers.
     tail : ipc timestamp, host and logger timestamp.
     number : of the robot's first (1), second ... lidar.
-
-    Returns
-    -------
-    str, without a line end.
     """
     count = len(scan.ranges)
     readings = " ".join([metre_text(value, scan.range_max) for value in scan.ranges])
     x, y, theta = (robot.x, robot.y, robot.theta) if robot else (0.0, 0.0, 0.0)
     cos, sin = math.cos(theta), math.sin(theta)
-    laser_pose = (x + cos * laser[0] - sin * laser[1], y + sin * laser[0] + cos * laser[1],
-                  math.remainder(theta + laser[2], 2 * math.pi))  # fmt: skip
-    poses = " ".join(number_text(v) for v in (*laser_pose, x, y, theta))
+    laser_x, laser_y = x + cos * laser[0] - sin * laser[1], y + sin * laser[0] + cos * laser[1]
+    laser_theta = math.remainder(theta + laser[2], 2 * math.pi)
+    poses = " ".join(number_text(v) for v in (laser_x, laser_y, laser_theta, x, y, theta))
     velocity = f"{number_text(robot.speed)} {number_text(robot.turn_rate)}" if robot else "0.000000 0.000000"
     return (
         f"ROBOTLASER{number} 0 {scan.angle_min:.9f} {scan.angle_increment * (count - 1):.9f} {scan.angle_increment:.9f}"
@@ -248,3 +245,71 @@ def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
 
 def _number(text: str) -> float | None:
     return float(text) if re.fullmatch(r"-?\d+(\.\d+)?", text) else None
+
+
+class LogText:
+    """Lines on their way to the log.
+
+    Parameters
+    ----------
+    log : where to write. mounting : sensors on the base. host : the computer that records.
+    """
+
+    def __init__(self, log: LogFile, mounting: Mounting, host: Host) -> None:
+        self._log, self._mounting, self._host = log, mounting, host
+        self._start = host.monotonic()
+        self._pose: OdometryPose | None = None
+        self._params: dict[str, str] = {}
+        self._lines: list[str] = []
+
+    def flush(self) -> None:
+        """Hand the lines to the log; DataError where it cannot be written any more."""
+        self._log.write(self._lines)
+        self._lines = []
+
+    def head(self, comments: list[str]) -> None:
+        """Write the head of the log."""
+        self._log.head.append("# CARMEN Logfile")
+        self._lines.append("# CARMEN Logfile")
+        for line in comments:
+            self.comment(line)
+        for name, value in self._mounting.params:
+            self.param(name, value)
+
+    def comment(self, text: str) -> None:
+        """Write a COMMENT with the time since the start."""
+        self._lines.append(f"COMMENT {number_text(self._elapsed())[:-3]} {' '.join(text.split())}")
+
+    def param(self, name: str, value: str) -> None:
+        """Write a PARAM unless it stands there already."""
+        if self._params.get(name) != value:
+            self._params[name] = value
+            line = f"PARAM {name} {value} {self._tail(self._host.monotonic())}"
+            self._lines.append(line)
+            self._log.head.append(line)
+
+    def write(self, measured: Measurement, link: Link) -> None:
+        """Write a measurement, and count what is counted by its content."""
+        tail, counts = self._tail(measured.stamp), link.counts
+        spread = getattr(measured, "spread", 0.0)
+        counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
+        if isinstance(measured, OdometryPose):
+            self._pose = measured
+            self._lines.append(pose_line(measured, tail))
+        elif isinstance(measured, GyroHeading):
+            self._lines.append(gyro_line(measured, tail))
+        elif isinstance(measured, RangeEpoch):
+            self._lines += range_lines(measured, tail, link.number)
+            counts.anchors.update(reading.anchor_id for reading in measured.readings)
+        else:
+            self.param(link.param_name("laser_time_increment"), f"{measured.time_increment:.9f}")
+            self.param(link.param_name("laser_range_min"), f"{measured.range_min:.3f}")
+            lasers = (self._mounting.laser, *self._mounting.more_lasers, (0.0, 0.0, 0.0))
+            laser = lasers[min(link.number, len(lasers)) - 1]
+            self._lines.append(scan_line(measured, laser, self._pose, tail, link.number))
+
+    def _elapsed(self) -> float:
+        return max(0.0, self._host.monotonic() - self._start)
+
+    def _tail(self, stamp: float) -> str:
+        return f"{stamp + self._host.wall_offset:.6f} {self._host.name} {self._elapsed():.6f}"

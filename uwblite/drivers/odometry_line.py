@@ -1,4 +1,4 @@
-"""Odometry of other bases: one text line per sample, columns by configuration. Sans-I/O.
+"""Odometry of other bases, and headings of gyros that print lines: one sample a line, columns by configuration. Sans-I/O.
 
 There is no standard for what hobby controllers print, so the columns are given: ``t,x,y,theta`` or ``t,left,right``
 (encoder ticks) in any order, ``-`` for a column to skip. A line that does not fit is Corrupt.
@@ -11,20 +11,20 @@ from typing import Any
 
 from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
-from .events import Action, Corrupt, Note, OdometryPose, Pose
+from .events import Action, Corrupt, GyroHeading, Note, OdometryPose, Pose
 from .odometer import WheelOdometer, wrapped
-from .text_lines import Line, LineDriver, LineProtocol, columns_of, number_of
+from .text_lines import Line, LineDriver, LineProtocol, columns_of, named_columns, number_of
 
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
 """m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base restarted."""
 LEAST_STEP = 0.1
 """s; over shorter times rounded numbers may seem faster."""
-COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
+COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate")
 
 
 @dataclass(frozen=True, slots=True)
 class LineFormat:
-    """How to read a line; see `parse_format` for the text form."""
+    """How to read a line; see `odometry_format` for the text form."""
 
     columns: tuple[str, ...] = ("t", "x", "y", "theta")
     """Names from COLUMNS, in the order printed. ``t`` may be missing: then the arrival stamps the sample."""
@@ -44,64 +44,25 @@ class LineFormat:
     """Text at the start of the lines to read; others are ignored."""
 
 
-def parse_format(options: dict[str, str]) -> LineFormat:
-    """Build a LineFormat from text options.
+def odometry_format(columns: str = "t,x,y,theta", **units: Any) -> LineFormat:
+    """Build the form of a base's lines.
 
     Parameters
     ----------
-    options : for example ``{"columns": "t,left,right", "tick": "1.2e-4", "wheel_base": "0.23"}``.
-
-    Returns
-    -------
-    LineFormat
+    columns : names from COLUMNS, parted by commas. units : other fields of LineFormat.
 
     Raises
     ------
-    ConfigError : an unknown name, a bad number, or columns that make no pose.
+    ConfigError : columns that make no pose.
     """
-    values: dict[str, object] = {}
-    for name, text in options.items():
-        if name not in _OPTIONS:
-            raise ConfigError(f"odometry line: unknown option {name!r}; known are {', '.join(_OPTIONS)}")
-        try:
-            values[name] = _OPTIONS[name](text)
-        except ValueError:
-            raise ConfigError(f"odometry line: {name}={text!r} is not a number that makes sense here") from None
-    spec = LineFormat(**values)  # type: ignore[arg-type]
-    names = [column for column in spec.columns if column != "-"]
-    unknown = [column for column in names if column not in COLUMNS]
-    if unknown or len(set(names)) < len(names):
-        raise ConfigError(f"odometry line: columns {spec.columns} must be different names of {', '.join(COLUMNS)}")
+    names = named_columns(columns, COLUMNS, "odometry line")
+    form = LineFormat(names, **units)
     ticks = {"left", "right"} <= set(names)
     if not ticks and not {"x", "y", "theta"} <= set(names):
         raise ConfigError("odometry line: columns must hold x,y,theta or left,right")
-    if ticks and (spec.tick <= 0 or (spec.wheel_base <= 0 and "theta" not in names)):
+    if ticks and (form.tick <= 0 or (form.wheel_base <= 0 and "theta" not in names)):
         raise ConfigError("odometry line: left,right need tick=<m per tick> and wheel_base=<m>")
-    return spec
-
-
-def _at_least(least: float, kind: type = float) -> Callable[[str], Any]:
-    def convert(text: str) -> Any:
-        value = kind(text)
-        if not least <= value <= _MOST:
-            raise ValueError
-        return value
-
-    return convert
-
-
-def _unit(text: str) -> float:
-    """Convert a factor, which is below 0 for an axis or a heading that counts the other way."""
-    _at_least(_TINY)(text.strip().lstrip("-"))
-    return float(text)
-
-
-_TINY, _MOST = 1e-12, 1e18
-_OPTIONS: dict[str, Callable[[str], Any]] = {
-    "columns": lambda text: tuple(column.strip() for column in text.split(",")), "prefix": str,
-    "time_unit": _at_least(_TINY), "length_unit": _unit, "angle_unit": _unit, "tick": _at_least(0.0),
-    "wheel_base": _at_least(0.0), "tick_modulus": _at_least(0, int),
-}  # fmt: skip
+    return form
 
 
 def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str | None]:
@@ -176,3 +137,80 @@ class OdometryLineDriver(LineDriver):
         if math.isfinite(rate) and rate > 0:
             text += f", it runs {rate:.4g} times too fast: say time_unit={self._format.time_unit / rate:.1g}"
         return Note("error", "odometry-time-unit", text + "; until then lines are stamped with their arrival")
+
+
+MAX_STEP = 0.25
+"""s between two readings over which a rate is not integrated: what the robot did meanwhile is not known."""
+LEAP_RATE, LEAP_ACCELERATION = 1.0, 50.0
+"""rad/s by which two readings may differ by vibration, and rad/s^2 that no robot reaches: more is a damaged digit."""
+
+
+def gyro_format(columns: str, time_unit: float = 1.0, angle_unit: float = 1.0, prefix: str = "") -> LineFormat:
+    """Build the form of a gyro's lines.
+
+    Parameters
+    ----------
+    columns : names of ``t``, ``turn_rate``, ``theta``, ``-``, with one of turn_rate and theta.
+    time_unit : s per unit of t. angle_unit : rad per unit of theta, rad/s per unit of turn_rate; below 0 = clockwise.
+    prefix : what the lines begin with.
+
+    Raises
+    ------
+    ConfigError : other columns, or neither rate nor heading.
+    """
+    names = named_columns(columns, ("t", "turn_rate", "theta"), "gyro line")
+    if not {"turn_rate", "theta"} & set(names):
+        raise ConfigError(f"gyro line: columns {columns!r} must hold turn_rate or theta")
+    return LineFormat(names, time_unit, 1.0, angle_unit, prefix=prefix)
+
+
+class GyroLineDriver(LineDriver):
+    """A gyro that prints lines. Nothing is ever sent.
+
+    A heading that the gyro sends is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
+    the heading stays: the mapper sees the gap by the stamps.
+
+    Parameters
+    ----------
+    line_format : columns and units. baud : bit/s.
+    """
+
+    def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:
+        unit = line_format.time_unit
+        clock = DeviceClock(unit, proven=False)
+        super().__init__(LineProtocol(values_by(line_format)), "gyro that prints lines", baud, clock, unit)
+        self._angle_unit, self._heading = line_format.angle_unit, 0.0
+        self._last: tuple[float, float] | None = None
+
+    def begin(self) -> None:
+        """Discard half a line, and the motion of the gyro meanwhile."""
+        super().begin()
+        self._last = None
+
+    def time_of(self, content: dict[str, float]) -> float | None:
+        """Return the gyro's time in a line, its own unit; None = there is none."""
+        return content.get("t")
+
+    def follows(self, before: Line, after: Line) -> bool:
+        """Return whether a robot can have turned so meanwhile."""
+        step = {name: (after.content[name] - before.content[name]) * self._angle_unit for name in after.content}
+        seconds = max(after.stamp - before.stamp, 0.0)
+        rate, turn = step.get("turn_rate", 0.0), math.remainder(step.get("theta", 0.0), 2 * math.pi)
+        smooth = abs(rate) <= LEAP_RATE + LEAP_ACCELERATION * seconds and abs(turn) <= LEAP_TURN * max(seconds, LEAST_STEP)
+        return smooth and super().follows(before, after)
+
+    def measured(self, line: Line) -> list[Action]:
+        """Turn a line into a heading."""
+        self.ready, values = True, line.content
+        stamp, elapsed, actions = self.timed(line)
+        if elapsed == 0:
+            return [Corrupt(b"", "line sent twice")]
+        rate = values.get("turn_rate", 0.0) * self._angle_unit
+        if "theta" in values:
+            self._heading += math.remainder(values["theta"] * self._angle_unit - self._heading, 2 * math.pi)
+        elif self._last is not None:
+            step = stamp - self._last[0] if elapsed is None else elapsed
+            if 0.0 < step <= MAX_STEP:
+                self._heading += 0.5 * (rate + self._last[1]) * step
+        self._last = stamp, rate
+        return [*actions, GyroHeading(stamp, self._heading, rate)]

@@ -11,11 +11,8 @@ from collections.abc import Callable
 
 from ..errors import DeviceError
 from .events import Action, Corrupt, Lost, Measurement, Note, Param, Reopen, Send, SetBaud, SetDtr
-from .link import Link, Mounting
-from .link_summary import doubts, summary_lines
-from .log_file import LogFile
-from .log_text import LogText
-from .transport import Port, open_port
+from .link import Host, Link, Mounting, doubts, summary_lines
+from .log_file import LogFile, LogText
 
 HOUSEKEEPING = 0.25
 """s between looks at silent devices and the status line."""
@@ -36,29 +33,26 @@ class Recorder:
     ----------
     links : the devices.
     log : where to write.
-    monotonic : s, a clock that never leaps.
-    wall_offset : s to add to `monotonic` for the log's timestamps.
-    host : name of this computer, for the log.
+    host : the computer that records.
     mounting : sensors on the base.
     on_note : called with (seconds since start, Note) for each thing a person must know.
-    open_port : (url, baud) -> Port.
-    wall : s, the computer's clock, to report that it was set; stamps do not follow it.
     """
 
     def __init__(
-        self, links: list[Link], log: LogFile, *, monotonic: Callable[[], float], wall_offset: float, host: str,
-        mounting: Mounting | None = None, on_note: Callable[[float, Note], None] | None = None,
-        open_port: Callable[[str, int], Port] = open_port, wall: Callable[[], float] | None = None,
-    ) -> None:  # fmt: skip
-        self.links, self.log = links, log
-        self._now, self._offset = monotonic, wall_offset
-        self._on_note = on_note or (lambda _t, _n: None)
-        self._open_port, self._wall = open_port, wall
+        self,
+        links: list[Link],
+        log: LogFile,
+        host: Host,
+        mounting: Mounting | None = None,
+        on_note: Callable[[float, Note], None] | None = None,
+    ) -> None:
+        self.links, self.log, self._host = links, log, host
+        self._now, self._on_note = host.monotonic, on_note or (lambda _t, _n: None)
         self._set_by = 0.0
         """s, by how much the computer's clock was set since the start."""
         self._selector = selectors.DefaultSelector()
-        self.start = monotonic()
-        self._text = LogText(log, mounting or Mounting(), monotonic, self.start, wall_offset, host)
+        self.start = self._now()
+        self._text = LogText(log, mounting or Mounting(), host)
         self.end = self._damage_due = self.start
 
     # ---- running
@@ -199,7 +193,7 @@ class Recorder:
             self._report_damage()
 
     def _look_at_clock(self, now: float) -> None:
-        by = 0.0 if self._wall is None else self._wall() - now - self._offset - self._set_by
+        by = 0.0 if self._host.wall is None else self._host.wall() - now - self._host.wall_offset - self._set_by
         if abs(by) > CLOCK_SET:
             self._set_by += by
             text = f"this computer's clock was set by {by:+.1f} s, or it slept; the stamps of this log go on as before"
@@ -220,7 +214,7 @@ class Recorder:
             self._down(link, "silent")
 
     def _up(self, link: Link, now: float) -> None:
-        port = link.connect(now, self._open_port)
+        port = link.connect(now, self._host.open_port)
         if isinstance(port, DeviceError):
             self._note(link, Note("error", f"{link.name}-cannot-open", f"{link.name}: {port}; trying again"))
         elif port is not None:

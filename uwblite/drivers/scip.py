@@ -9,14 +9,14 @@ first, each plus 0x30; distances are a run of 2- or 3-character numbers cut into
 straddle lines. In the text lines of VV, PP and II the ``;`` before the sum is not summed, and some units print wrong
 sums there: those sums are never fatal. Sources: SCIP 2.0 specification C-42-03320B; captures of three units.
 
-Range values below DMIN (20 mm) are codes, not distances: see ``scip_codes``; requests are in ``scip_commands``.
+Range values below DMIN (20 mm) are codes, not distances: see ``scip_commands``, where the requests are too.
 """
 
 import re
 from dataclasses import dataclass
 
 from .events import Corrupt, corrupt
-from .line_reader import Line, LineReader
+from .framing import LineReader, RawLine
 
 TIME_MODULUS = 1 << 24
 """The time stamp is a counter of 24 bit, 1 ms each: it wraps every 4 h 39 min 37 s."""
@@ -54,7 +54,7 @@ class Distances:
     time: int
     """ms, device clock, 0 .. 2**24 - 1, at the first step."""
     values: tuple[int, ...]
-    """mm, one per step or cluster; below DMIN they are RANGE_CODES."""
+    """mm, one per step or cluster; below DMIN they are codes."""
     start: int
     end: int
     """First and last step."""
@@ -90,10 +90,6 @@ def decode_values(data: bytes, width: int) -> tuple[int, ...]:
     ----------
     data : characters 0x30..0x6F.
     width : 2 or 3 characters a value.
-
-    Returns
-    -------
-    tuple of int, mm.
     """
     if width == 2:
         return tuple([(a << 6) + b - 0xC30 for a, b in zip(data[0::2], data[1::2], strict=True)])
@@ -140,7 +136,7 @@ class ScipProtocol:
             events.append(line)
         return events
 
-    def _take_line(self, line: Line, events: list[Event]) -> None:
+    def _take_line(self, line: RawLine, events: list[Event]) -> None:
         data = line.data.rstrip(b"\r")
         if not data:
             self._close(events)

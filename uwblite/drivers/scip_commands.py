@@ -1,11 +1,10 @@
-"""What to send to a Hokuyo, its geometry, and its readings in metres."""
+"""What to send to a Hokuyo, its geometry, its readings in metres, and what its codes mean. From C-42-03320B and drivers."""
 
 import math
 from dataclasses import dataclass
 
 from ..errors import ProtocolError
 from .scip import Reply
-from .scip_codes import range_codes
 
 BAUD_RATES = (115200, 19200, 57600, 250000, 500000, 750000)
 """bit/s of the RS-232 port, in the order tried; on USB the rate means nothing."""
@@ -44,109 +43,53 @@ class Geometry:
         return 60.0 / self.speed
 
 
-def text_command(name: str) -> bytes:
-    """Build a request without parameters.
+@dataclass(frozen=True, slots=True)
+class ScanRequest:
+    """Which scans a unit is asked for."""
 
-    Parameters
-    ----------
-    name : one of VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0.
+    start: int | None = None
+    end: int | None = None
+    """First and last step; None = the unit's own limits."""
+    cluster: int = 1
+    """Steps merged into one value, 1..99."""
+    skip: int = 0
+    """Scans left out between two that are sent, 0..9."""
+    wide: bool = True
+    """Three characters a value (up to 5.6 m); False: two, up to 4.095 m, for slow RS-232."""
 
-    Returns
-    -------
-    bytes
+    def command(self, unit: Geometry) -> bytes:
+        """Return MD or MS, which streams until QT.
 
-    Raises
-    ------
-    ProtocolError : not one of these; other commands can hang a URG-04LX until its power is cycled.
-    """
-    if name not in {"VV", "PP", "II", "BM", "QT", "RS", "TM0", "TM1", "TM2", "SCIP2.0"}:
-        raise ProtocolError(f"{name!r} is not a command that every unit has; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
-    return name.encode() + b"\n"
-
-
-def rate_command(rate: int) -> bytes:
-    """Build SS, which sets the speed of the RS-232 port.
-
-    Parameters
-    ----------
-    rate : bit/s, of BAUD_RATES.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : not one of these.
-    """
-    if rate not in BAUD_RATES:
-        raise ProtocolError(f"{rate} bit/s is no speed of its RS-232; use {', '.join(map(str, sorted(BAUD_RATES)))}")
-    return f"SS{rate:06d}\n".encode()
-
-
-def scan_command(
-    start: int = 44, end: int = 725, *, cluster: int = 1, skip: int = 0, count: int | None = 0, wide: bool = True,
-    geometry: Geometry | None = None,
-) -> bytes:  # fmt: skip
-    """Build GD/GS (one scan) or MD/MS (a stream).
-
-    Parameters
-    ----------
-    start, end : first and last step.
-    cluster : steps merged into one value, 0..99 (0 means 1).
-    skip : scans left out between two that are sent, 0..9.
-    count : scans to send, 0 = until QT; None = GD/GS, one scan now.
-    wide : 3 characters a value (up to 5.6 m); False: 2 characters, up to 4.095 m.
-    geometry : limits of the unit; default: of the URG-04LX.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : a step, cluster, skip or count that the unit would refuse.
-    """
-    unit = geometry or Geometry()
-    if not unit.first <= start <= end <= unit.last:
-        raise ProtocolError(f"steps {start}..{end} are not inside {unit.first}..{unit.last} of the {unit.model}")
-    if not 0 <= cluster <= 99 or not 0 <= skip <= 9 or not 0 <= (count or 0) <= 99:
-        raise ProtocolError(f"cluster {cluster} (0..99), skip {skip} (0..9) or count {count} (0..99) is out of range")
-    letter = "D" if wide else "S"
-    if count is None:
-        return f"G{letter}{start:04d}{end:04d}{cluster:02d}\n".encode()
-    return f"M{letter}{start:04d}{end:04d}{cluster:02d}{skip:01d}{count:02d}\n".encode()
+        Raises
+        ------
+        ProtocolError : a step, cluster or skip that the unit would refuse.
+        """
+        start = unit.first if self.start is None else self.start
+        end = unit.last if self.end is None else self.end
+        if not unit.first <= start <= end <= unit.last:
+            raise ProtocolError(f"steps {start}..{end} are not inside {unit.first}..{unit.last} of the {unit.model}")
+        if not 1 <= self.cluster <= 99 or not 0 <= self.skip <= 9:
+            raise ProtocolError(f"cluster {self.cluster} (1..99) or skip {self.skip} (0..9) is out of range")
+        return f"M{'D' if self.wide else 'S'}{start:04d}{end:04d}{self.cluster:02d}{self.skip:01d}00\n".encode()
 
 
 def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = None) -> tuple[float, ...]:
-    """Convert raw values to metres with REP-117 codes.
+    """Return raw values in m; +inf = nothing seen, nan = invalid (REP-117).
 
     Parameters
     ----------
-    values : mm or range_codes of the model.
+    values : mm, below DMIN codes of the model.
     geometry : gives DMIN and DMAX.
     limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
-
-    Returns
-    -------
-    tuple of float, m; +inf = nothing seen, nan = invalid.
     """
     low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
-    known = range_codes(geometry.model)
-    codes = [known[v][0] if v in known else math.nan for v in range(low)]
+    nothing = NOTHING_SEEN.get(geometry.model[:3], ())
+    codes = [math.inf if v in nothing else math.nan for v in range(low)]
     return tuple([codes[v] if v < low else v / 1000 if v < high else math.inf for v in values])
 
 
 def parse_geometry(reply: Reply) -> Geometry:
     """Read the reply to PP.
-
-    Parameters
-    ----------
-    reply : of PP.
-
-    Returns
-    -------
-    Geometry
 
     Raises
     ------
@@ -157,11 +100,77 @@ def parse_geometry(reply: Reply) -> Geometry:
         numbers = {key: int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")}
     except (KeyError, ValueError) as error:
         raise ProtocolError(f"PP: field missing or not a number ({error})") from None
-    unit = Geometry(
-        fields.get("MODL", "unknown").partition("(")[0], numbers["DMIN"], numbers["DMAX"], numbers["ARES"],
-        numbers["AMIN"], numbers["AMAX"], numbers["AFRT"], numbers["SCAN"],
-    )  # fmt: skip
+    unit = Geometry(fields.get("MODL", "unknown").partition("(")[0], *numbers.values())
     sane = 0 <= unit.distance_min < unit.distance_max and unit.resolution > 0 and unit.speed > 0
     if not (sane and 0 <= unit.first < unit.last <= unit.resolution + unit.front):
         raise ProtocolError(f"PP: absurd geometry {unit}")
     return unit
+
+
+NOTHING_SEEN = {"URG": (0, 6), "UBG": (0, 6), "UHG": (0, 6), "UTM": (1,)}
+"""Values below DMIN that say that nothing reflects within range, by the first letters of the model: no echo; of a UTM no object
+(table 4 of the specification). All others are errors, as low intensity, readings that disagree, a strong reflector; of a model
+that is not known too, so that nothing is taken for free space."""
+
+_TIME_ADJUST = ("ok", "bad code", "in time-adjust mode already", "left time-adjust mode already", "not in time-adjust mode")
+_BIT_RATE = ("ok", "not a number", "no such bit rate", "that rate is set already", "rate not possible")
+STATUS_BY_COMMAND = {
+    "QT": {"00": "laser off, stream stopped"},
+    "TM": {f"{code:02d}": text for code, text in enumerate(_TIME_ADJUST)},
+    "SS": {f"{code:02d}": text for code, text in enumerate(_BIT_RATE)},
+}
+STATUS_OF_SCANS = {
+    "00": "ok",
+    "01": "start step is not a number",
+    "02": "end step is not a number",
+    "03": "cluster is not a number",
+    "04": "end step out of range",
+    "05": "end step is before the start step",
+    "06": "skip is not a number",
+    "07": "count is not a number",
+    "10": "laser is off",
+    "98": "resumed after a pause",
+    "99": "data follow",
+}
+STATUS_OF_ALL = {
+    "0A": "cannot create the transmission",
+    "0B": "buffer short, or the command was repeated in one batch",
+    "0C": "too few parameters",
+    "0D": "too few parameters",
+    "0E": "undefined command",
+    "0F": "undefined command",
+    "0G": "string too long",
+    "0H": "string has bad characters",
+    "0I": "in firmware-update mode",
+    "0L": "abnormal state",
+    "0M": "unstable",
+}
+
+
+def status_meaning(command: str, status: str) -> tuple[str, str]:
+    """Name a status code.
+
+    Parameters
+    ----------
+    command : the echo it came with.
+    status : two characters.
+
+    Returns
+    -------
+    kind : "ok", "paused", "resumed", "hardware-fault", "refused" or "scip1".
+    text : what it means.
+    """
+    if len(status) == 1:
+        return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit has SCIP 1.1; send SCIP2.0")
+    known = STATUS_BY_COMMAND.get(command[:2], STATUS_OF_SCANS if command[:1] in "GM" else {})
+    text = known.get(status) or STATUS_OF_ALL.get(status)
+    if command[:1] in "GM" and status.isdigit():
+        number = int(status)
+        if 21 <= number <= 49:
+            return "paused", f"status {status}: the unit paused to verify itself and comes back by itself"
+        if 50 <= number <= 97:
+            return "hardware-fault", f"status {status}: hardware fault (laser, motor or the like)"
+        if number == 98:
+            return "resumed", f"status {status}: {text}"
+    good = status in ("00", "99") or (command[:2], status) in {("TM", "02"), ("TM", "03"), ("SS", "03")}
+    return "ok" if good else "refused", f"status {status}: {text or 'not in the manual'}"

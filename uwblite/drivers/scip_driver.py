@@ -7,14 +7,15 @@ request and reply.
 """
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from ..clocks.device_clock import Reading
 from .continuity import Continuity, device_time
 from .events import Action, Corrupt, LaserScan, Lost, Note, Reopen, Send, SetBaud
 from .scip import TIME_MODULUS, Distances, Reply
-from .scip_codes import status_meaning
-from .scip_commands import BAUD_RATES, rate_command, scan_command, text_command, to_ranges
+from .scip_commands import BAUD_RATES, ScanRequest, status_meaning, to_ranges
 from .scip_unit import PATIENCE, SETTLE, TRUNCATION, ScipUnit
 from .session import Identity, Script, Wait
 
@@ -44,27 +45,21 @@ class ScipDriver(ScipUnit):
 
     Parameters
     ----------
-    start, end : first and last step; None = the unit's own limits.
-    cluster, skip : as in `scip_commands.scan_command`.
-    wide : three characters a value; False: two, for slow RS-232.
+    request : which scans; what does not fit the line is asked for less often.
     baud : bit/s to begin with; other rates are tried when nothing answers.
     stream : False: stop after VV, PP and II (for a look at what is plugged in).
     """
 
-    def __init__(
-        self, start: int | None = None, end: int | None = None, *, cluster: int = 1, skip: int = 0, wide: bool = True,
-        baud: int = BAUD_RATES[0], stream: bool = True,
-    ) -> None:  # fmt: skip
+    def __init__(self, request: ScanRequest | None = None, baud: int = BAUD_RATES[0], *, stream: bool = True) -> None:
         super().__init__(baud)
-        self._start, self._end, self._cluster, self._skip, self._wide = start, end, max(1, cluster), skip, wide
-        self._stream = stream
+        self._scans, self._stream = request or ScanRequest(), stream
         self._rates_tried: set[int] = set()
         self._rounds = 0
-        self._series = Continuity(_follows, summed=True)
+        self._series = Continuity(_follows, "scan whose time", summed=True)
 
     def stop(self) -> list[Action]:
         """Return what switches the laser off and ends the stream."""
-        return [*[Corrupt(b"", "scan whose time nothing confirmed")] * len(self._series.waiting), Send(text_command("QT"))]
+        return [*self._series.unconfirmed(), Send(b"QT\n")]
 
     def script(self) -> Script[None]:
         """Find the unit, learn who it is, and read scans; begin again when none come."""
@@ -73,7 +68,7 @@ class ScipDriver(ScipUnit):
             if not (yield from self._find()):
                 return
             yield from self._greet()
-            self._scan_request()  # steps that the unit does not have are the user's mistake: say so now
+            self._scans.command(self.geometry)  # steps that the unit does not have are the user's mistake: say so now
             self.ready = True
             if not self._stream:
                 return
@@ -90,13 +85,7 @@ class ScipDriver(ScipUnit):
     @property
     def period(self) -> float:
         """Time between scans that are sent, s."""
-        return self.geometry.period * (self._skip + 1)
-
-    def _scan_request(self) -> bytes:
-        unit = self.geometry
-        first = unit.first if self._start is None else self._start
-        last = unit.last if self._end is None else self._end
-        return scan_command(first, last, cluster=self._cluster, skip=self._skip, wide=self._wide, geometry=unit)
+        return self.geometry.period * (self._scans.skip + 1)
 
     def _read_scans(self) -> Script[str]:
         """Stream until something is wrong; return what, "" where it was reported already."""
@@ -114,7 +103,7 @@ class ScipDriver(ScipUnit):
                 good, why, self._rounds = self.now, "", 0
                 durations.append(self.now - event.stamp)
                 until = self.now + max(SCAN_PATIENCE, 10 * self.period, 3 * durations[-1])
-                yield from self._scan(event)
+                yield from self._series.confirmed(event, 1, self._timed)
                 if len(durations) == 2 and (yield from self._fit_line(min(durations))):
                     return ""
             elif isinstance(event, Reply) and event.command[0] == "M":
@@ -137,7 +126,7 @@ class ScipDriver(ScipUnit):
         def answers(event: Any) -> bool:
             return isinstance(event, Reply) and event.command[:1] == "M"
 
-        reply = yield from self.ask(self._scan_request(), answers, 2 * PATIENCE, 2)
+        reply = yield from self.ask(self._scans.command(self.geometry), answers, 2 * PATIENCE, 2)
         if reply is None:
             return "no answer to MD"
         kind, text = status_meaning(reply.command, reply.status)
@@ -152,12 +141,12 @@ class ScipDriver(ScipUnit):
         if (yield from self._raise_rate()):
             return True
         periods = seconds / FULL_LINE / self.geometry.period
-        if periods > MAX_SKIP + 1 and self._wide:
-            self._wide, periods = False, periods * 2 / 3
-        self._skip = min(MAX_SKIP, math.ceil(periods) - 1)
+        wide = self._scans.wide and periods <= MAX_SKIP + 1
+        periods *= 1.0 if wide == self._scans.wide else 2 / 3
+        self._scans = replace(self._scans, wide=wide, skip=min(MAX_SKIP, math.ceil(periods) - 1))
         text = (
             f"lidar: this line carries {carried:.1f} of {1 / self.geometry.period:.0f} scans a second; asking for one in"
-            f" {self._skip + 1}{'' if self._wide else ', up to 4.1 m'}. On RS-232 use USB or a faster port, or fewer `steps`"
+            f" {self._scans.skip + 1}{'' if wide else ', up to 4.1 m'}. On RS-232 use USB or a faster port, or fewer `steps`"
         )
         yield from self.say_once(Note("warning", "lidar-slow-line", text))
         return True
@@ -168,7 +157,7 @@ class ScipDriver(ScipUnit):
             if rate <= self.baud or rate in self._rates_tried:
                 continue
             self._rates_tried.add(rate)  # until it has proved itself
-            command = rate_command(rate)
+            command = f"SS{rate:06d}\n".encode()
             reply = yield from self.ask(command, lambda e: isinstance(e, Reply) and e.command[:2] == "SS", PATIENCE)
             if reply is None or status_meaning("SS", reply.status)[0] != "ok":
                 continue
@@ -184,15 +173,8 @@ class ScipDriver(ScipUnit):
             return True
         return False
 
-    def _scan(self, scan: Distances) -> Script[None]:
-        """Log scans. One whose time leaps, and the first, count only if the next one goes on from it."""
-        passed, dropped = self._series.take(scan, 1)
-        for _ in dropped:
-            yield Corrupt(b"", "scan whose time leaps away and back")
-        for taken in passed:
-            yield from self._timed(taken)
-
-    def _timed(self, scan: Distances) -> Script[None]:
+    def _timed(self, scan: Distances) -> Iterator[Action]:
+        """Log a scan. One whose time leaps, and the first, count only if the next one goes on from it."""
         reading = self._clock.read(scan.time + TRUNCATION, scan.stamp)
         if reading.reset:
             yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts again")
@@ -223,8 +205,8 @@ class ScipDriver(ScipUnit):
     def identity(self) -> Identity:
         """Say who answered."""
         unit, facts, findings = self.geometry, self.facts, []
-        details = [(name, facts[key]) for name, key in (
-            ("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT")) if key in facts]  # fmt: skip
+        fields = (("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT"))
+        details = [(name, facts[key]) for name, key in fields if key in facts]
         details.append(("range", f"{unit.distance_min / 1000:.2f} to {unit.distance_max / 1000:.2f} m"))
         details.append(("steps", f"{unit.first} to {unit.last}, {unit.speed} rev/min"))
         if facts.get("LASR") == "OFF":

@@ -11,8 +11,7 @@ from ..clocks.device_clock import DeviceClock
 from ..errors import ProtocolError
 from .events import Note, Param, Reopen, Send, SetBaud
 from .scip import TIME_MODULUS, WITH_LINES, Reply, ScipProtocol
-from .scip_codes import status_meaning
-from .scip_commands import BAUD_RATES, Geometry, parse_geometry, text_command
+from .scip_commands import BAUD_RATES, Geometry, parse_geometry, status_meaning
 from .session import Driver, Script
 
 DRAIN = 0.25
@@ -61,10 +60,12 @@ class ScipUnit(Driver):
     # ---- finding it
 
     def _request(self, command: str, tries: int = 2) -> Script[Reply | None]:
+        """Return the reply to a command without parameters."""
+
         def answers(event: Any) -> bool:
             return isinstance(event, Reply) and event.command == command
 
-        reply: Reply | None = yield from self.ask(text_command(command), answers, PATIENCE, tries)
+        reply: Reply | None = yield from self.ask(f"{command}\n".encode(), answers, PATIENCE, tries)
         return reply
 
     def _find(self) -> Script[bool]:

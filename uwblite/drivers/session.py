@@ -131,9 +131,7 @@ class Driver:
             events.append(event)
         return events
 
-    def ask(
-        self, request: bytes, answers: Callable[[Any], bool], patience: float, tries: int = 1
-    ) -> Script[Any]:  # fmt: skip
+    def ask(self, request: bytes, answers: Callable[[Any], bool], patience: float, tries: int = 1) -> Script[Any]:
         """Send a request, again if need be, and return the first event that answers it; None = none came."""
         for _ in range(tries):
             yield Send(request)

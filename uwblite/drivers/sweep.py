@@ -85,17 +85,7 @@ class SweepAssembler:
         self._before: tuple[float, float] | None = None
 
     def add(self, times: list[float], samples: Samples) -> list[LaserScan]:
-        """Take readings.
-
-        Parameters
-        ----------
-        times : s, host clock, of each reading.
-        samples : the readings.
-
-        Returns
-        -------
-        list of LaserScan : of the turns that ended.
-        """
+        """Take readings made at times, s, host clock; return the scans of the turns that ended."""
         scans = []
         for time, turned, bearing, reach in zip(times, samples.turned, samples.bearings, samples.ranges, strict=True):
             if self._last is not None and turned < self._last[1] - BACKLASH:
@@ -137,10 +127,8 @@ class SweepAssembler:
         if abs(duration - self._duration) > STEADY * duration:
             self._duration = duration
         middle = 0.5 * (begin + end) + ahead * duration
-        return LaserScan(
-            middle - 0.5 * self._duration, tuple(ranges), 0.0, -2.0 * math.pi * spacing, self._duration * spacing,
-            fan.range_max, fan.range_min,
-        )  # fmt: skip
+        stamp, increments = middle - 0.5 * self._duration, (-2.0 * math.pi * spacing, self._duration * spacing)
+        return LaserScan(stamp, tuple(ranges), 0.0, *increments, fan.range_max, fan.range_min)
 
 
 def _resample(samples: list[tuple[float, float]], rays: int, spacing: float) -> tuple[list[float], int]:

@@ -3,14 +3,15 @@
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
 from ..clocks.device_clock import DeviceClock
+from ..errors import ConfigError
 from .continuity import WITNESSES, Continuity, LinkHealth
 from .events import Action, Corrupt, Lost, corrupt
-from .line_reader import LineReader
+from .framing import LineReader
 from .session import ByteProtocol, Driver, Script, Wait
 
 EARLY = 0.02
@@ -48,6 +49,25 @@ def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, st
     if len(fields) != len(columns):
         return f"{len(fields)} columns instead of {len(columns)}"
     return {name: field for name, field in zip(columns, fields, strict=True) if name != "-"}
+
+
+def named_columns(text: str, known: Collection[str], what: str) -> tuple[str, ...]:
+    """Return the columns that a user names, parted by commas; ``-`` = skip.
+
+    Parameters
+    ----------
+    known : names that there are; one that ends in a colon stands for all that begin so. what : prints the lines.
+
+    Raises
+    ------
+    ConfigError : a name is unknown, or stands twice.
+    """
+    names = tuple(name.strip() for name in text.split(","))
+    wrong = [n for n in names if n != "-" and (names.count(n) > 1 or n[: n.find(":") + 1 or None] not in known)]
+    if wrong:
+        listed = ", ".join(name + "NAME" * name.endswith(":") for name in known)
+        raise ConfigError(f"{what}: column {wrong[0]!r}; known are {listed}, - to skip, each once")
+    return names
 
 
 def number_of(text: str) -> float | None:
@@ -119,7 +139,7 @@ class LineDriver(Driver, ABC):
         super().__init__(protocol, title)
         self.baud, self.clock, self.health = baud, clock, LinkHealth()
         self._unit = unit
-        self._series = Continuity(self.follows)
+        self._series = Continuity(self.follows, "line that")
 
     def spacing(self, event: Line | Corrupt) -> float | None:
         """Return that the time between two lines without a time of their own is learnt."""
@@ -138,9 +158,7 @@ class LineDriver(Driver, ABC):
 
     def take(self, event: Line) -> list[Action]:
         """Turn a line into what was measured. One that leaps counts only if the next one goes on from it."""
-        passed, dropped = self._series.take(event, WITNESSES[self.health.is_damaged(event.stamp)])
-        given_up: list[Action] = [Corrupt(b"", "line that leaps away and back")] * len(dropped)
-        return [*given_up, *(action for line in passed for action in self.measured(line))]
+        return self._series.confirmed(event, WITNESSES[self.health.is_damaged(event.stamp)], self.measured)
 
     @abstractmethod
     def measured(self, line: Line) -> list[Action]:
@@ -169,4 +187,4 @@ class LineDriver(Driver, ABC):
 
     def stop(self) -> list[Action]:
         """Return Corrupt for lines that nothing confirmed."""
-        return [Corrupt(b"", "line that nothing confirmed")] * len(self._series.waiting)
+        return self._series.unconfirmed()

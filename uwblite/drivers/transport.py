@@ -1,4 +1,4 @@
-"""Ports by URL: the only file that knows pyserial, which is imported when a serial port is first opened.
+"""Ports by URL, and those of this computer; pyserial, which only this file knows, is imported when a port is first opened.
 
 ``/dev/ttyACM0`` or a path in ``/dev/serial/by-id`` opens a port, ``socket://host:port`` a bridge (ser2net, an emulator),
 ``loop://`` a port that receives what it sends. Reads never block.
@@ -8,6 +8,7 @@ import contextlib
 import os
 import select
 import socket
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -99,10 +100,6 @@ def open_port(url: str, baud: int) -> Port:
     ----------
     url : a path, ``socket://host:port``, or what `serial.serial_for_url` takes.
     baud : bit/s.
-
-    Returns
-    -------
-    Port
 
     Raises
     ------
@@ -272,3 +269,42 @@ def _explain(url: str, error: Exception) -> str:
     if path.is_char_device() and "configure port" in text:
         return f"{url}: not a serial port"
     return f"{url}: cannot open ({text})"
+
+
+def stable_name(url: str) -> str | None:
+    """Return the by-id path of a port that was named by a number that changes with the order of plugging.
+
+    Parameters
+    ----------
+    url : as the user gave it.
+    """
+    if "://" in url or "/serial/by-" in url or not BY_ID.is_dir():
+        return None
+    target = os.path.realpath(url)
+    return next((str(entry) for entry in sorted(BY_ID.iterdir()) if os.path.realpath(entry) == target), None)
+
+
+@dataclass(frozen=True, slots=True)
+class PluggedIn:
+    """A serial port of this computer."""
+
+    path: str
+    """by-id path where there is one."""
+    description: str
+    usb_id: str
+    """"vvvv:pppp" in lower-case hexadecimal, or ""."""
+
+
+def plugged_in() -> list[PluggedIn]:
+    """List the USB serial ports of this computer, and the UART of a Raspberry Pi's header."""
+    pyserial()
+    from serial.tools.list_ports import comports
+
+    found = []
+    for port in sorted(comports()):
+        usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
+        if not usb and port.device not in ("/dev/ttyAMA0", "/dev/ttyS0", "/dev/serial0"):
+            continue
+        text = " ".join(str(part) for part in (port.manufacturer, port.product) if part) or str(port.description)
+        found.append(PluggedIn(stable_name(port.device) or port.device, text, usb))
+    return found

@@ -1,4 +1,4 @@
-"""UWB boards that print ranges as text lines: any of them by columns, some by name; `uwb_driver` reads them. Sans-I/O.
+"""UWB tags that only send: boards that print ranges as text lines, any by columns, some by name; and what reads them. Sans-I/O.
 
 Every line may hold several readings. Only two-way ranges from this tag to anchors are taken: positions, time differences
 and angles are not ranges, and the ranges that an anchor prints of many tags are not of this robot. Sources: examples of
@@ -7,12 +7,16 @@ Makerfabs (DW1000 library, AT firmware), users' programs for the BU01, Qorvo's C
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
-from .events import RangeReading
-from .text_lines import columns_of, number_of
+from .continuity import RangeGuard
+from .events import Action, Corrupt, Lost, Note, RangeEpoch, RangeReading
+from .session import ByteProtocol, Identity
+from .text_lines import Line, LineDriver, columns_of, named_columns, number_of
 
 MOST_RANGE = 1000.0
 """m; no UWB radio reaches further."""
@@ -98,9 +102,12 @@ def _at_range(line: str) -> Ranges | str | None:
 
 _SESSION_ROW = r'\[mac_address=0x([0-9A-Fa-f]{4}), status="[A-Z_]+"(?:, distance\[cm\]=(-?\d+))?(?:, [\w\[\]]+=-?[\d.]+)*\]'
 _session = _each(
-    rf"(?:SESSION_INFO_NTF: \{{[\w=, ]+)?(?:{_SESSION_ROW}[;}}\s]*)*", _SESSION_ROW,
-    "SESSION|session_|mac_addr|status=|distance", 0.01, r"block_index=(\d{1,9})\b",
-)  # fmt: skip
+    rf"(?:SESSION_INFO_NTF: \{{[\w=, ]+)?(?:{_SESSION_ROW}[;}}\s]*)*",
+    _SESSION_ROW,
+    "SESSION|session_|mac_addr|status=|distance",
+    0.01,
+    r"block_index=(\d{1,9})\b",
+)
 
 
 def _dwm3001(line: str) -> Ranges | Refused | str | None:
@@ -122,7 +129,8 @@ BOARDS: dict[str, Parse] = {
     # from: 1782\t Range: 3.21 m\t RX power: -65.10 dBm
     "makerfabs": _each(
         r"from:\s*[0-9A-Fa-f]{1,4}\s+Range:\s*-?\d+\.\d+\s*m(?:\s+RX power:\s*(?:-?\d+\.\d+|-?inf|nan|ovf)\s*dBm)?",
-        r"from:\s*([0-9A-Fa-f]{1,4})\s+Range:\s*(-?\d+\.\d+)", "from:|Range:|RX power|dBm",
+        r"from:\s*([0-9A-Fa-f]{1,4})\s+Range:\s*(-?\d+\.\d+)",
+        "from:|Range:|RX power|dBm",
     ),
     # AT+RANGE=tid:0,mask:0F,seq:182,range:(232,401,518,633,0,0,0,0),ancid:(0,1,2,3,-1,-1,-1,-1)
     "makerfabs-at": _at_range,
@@ -132,7 +140,7 @@ BOARDS: dict[str, Parse] = {
     # SESSION_INFO_NTF: {session_handle=1, sequence_number=39, block_index=39, n_measurements=2
     #  [mac_address=0x0001, status="SUCCESS", distance[cm]=245];      on lines of their own, or all on one
     "dwm3001": _dwm3001,
-}  # fmt: skip
+}
 
 
 def reading(anchor: str, metres: float, quality: float = 100.0) -> RangeReading:
@@ -174,13 +182,10 @@ def parse_columns(columns: str, unit: float, prefix: str) -> LineColumns:
     ------
     ConfigError : an unknown column, or no range.
     """
-    names = tuple(name.strip() for name in columns.split(","))
+    names = named_columns(columns, ("id", "range", "range:", "t", "quality", "tag"), "uwb line")
     fixed = [name for name in names if name.startswith("range:")]
-    unknown = [n for n in names if n not in ("id", "range", "t", "quality", "tag", "-") and n not in fixed]
-    twice = [name for name in names if name != "-" and names.count(name) > 1]
-    if unknown or twice or any(not NAME.fullmatch(name[6:]) for name in fixed):
-        bad = (unknown + twice + fixed)[0]
-        raise ConfigError(f"uwb line: column {bad!r}; known are id, range, range:NAME, t, quality, tag, - to skip, each once")
+    if bad := next((name for name in fixed if not NAME.fullmatch(name[6:])), ""):
+        raise ConfigError(f"uwb line: column {bad!r}: NAME in range:NAME is up to 32 letters, digits and _ . : -")
     if not fixed and not {"id", "range"} <= set(names):
         raise ConfigError("uwb line: columns must hold id,range, or one range:NAME for each anchor")
     return LineColumns(names, unit, prefix)
@@ -204,3 +209,89 @@ def by_columns(form: LineColumns) -> Parse:
         return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in found), numbers.get("t"), values.get("tag", ""))
 
     return parse
+
+
+MOST_LEAP, NEAR = 100_000, 3
+"""Rounds that may be lost together; rounds within which the next one must follow a leap, as a damaged digit leaps too."""
+OTHER_TAG = "line of a tag that was seen once"
+MUCH = 50
+"""Rounds in a row without a range after which it is reported."""
+
+
+class UwbDriver(LineDriver):
+    """A UWB tag that sends its ranges unasked. Nothing is ever sent.
+
+    Parameters
+    ----------
+    protocol : bytes to Line of Ranges or Refused.
+    title, baud, clock, unit : as for `LineDriver`.
+    tag : the tag whose ranges to take, where lines name several; "" = the first that is seen twice.
+    """
+
+    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = "") -> None:
+        super().__init__(protocol, title, baud, clock, unit)
+        self.first_is_whole = clock.proven
+        self._tag, self._leap, self._empty = tag, 0, 0
+        self._tags: Counter[str] = Counter()
+        self._first: Line | None = None
+        """The line of a tag that was seen once."""
+        self._round: int | None = None
+        self._guard = RangeGuard(self.health)
+
+    def time_of(self, content: Ranges | Refused) -> float | None:
+        """Return the board's time, its own unit; None = there is none."""
+        return content.time if isinstance(content, Ranges) else None
+
+    def members(self, event: Line | Corrupt) -> tuple[str, ...]:
+        """Return the anchors of a line: some boards print one line for each."""
+        content = event.content if isinstance(event, Line) else None
+        return tuple(f"{content.tag}/{r.anchor_id}" for r in content.readings) if isinstance(content, Ranges) else ()
+
+    def measured(self, line: Line) -> list[Action]:
+        """Turn a line into ranges."""
+        if isinstance(line.content, Refused):
+            text = f"uwb: it prints {line.content.what}, which are no ranges: set it to two-way ranging, and to print distances"
+            return self.say_once(Note("error", "uwb-no-ranges", text))
+        tag = line.content.tag
+        if not tag or tag == self._tag:
+            return self._ranges(line)
+        self._tags[tag] += 1
+        if self._tags[tag] == 1:  # its name may be damaged
+            dropped: list[Action] = [Corrupt(b"", OTHER_TAG)] if self._tag or self._first else []
+            self._first = self._first if self._tag else line
+            return dropped
+        if self._tag:
+            text = f"uwb: ranges of tag {tag} besides those of tag {self._tag} are left out; tag=ID chooses"
+            return self.say_once(Note("warning", "uwb-other-tag", text))
+        self._tag, first, self._first = tag, self._first, None
+        ours = [first] if first is not None and first.content.tag == tag else []
+        left: list[Action] = [Corrupt(b"", OTHER_TAG)] * (first is not None and not ours)
+        return left + [action for each in (*ours, line) for action in self._ranges(each)]
+
+    def _ranges(self, line: Line) -> list[Action]:
+        self.ready, content = True, line.content
+        actions: list[Action] = [Lost(line.stamp, count)] if (count := self._missed(content)) else []
+        stamp, _, lost = self.timed(line)
+        actions += lost
+        self._empty = 0 if content.readings else self._empty + 1
+        if self._empty == MUCH:
+            text = "uwb: rounds come, but without ranges: set tag and anchors to two-way ranging, not to time differences"
+            actions += self.say_once(Note("warning", "uwb-no-ranges", text))
+        return [*actions, *self._guard.take(RangeEpoch(stamp, content.readings), line.stamp)]
+
+    def _missed(self, line: Ranges) -> int:
+        """Return how many rounds were missed before the line before this one, by their numbers; 0 where the board restarted."""
+        if line.round is None:
+            return 0
+        step = 1 if self._round is None else line.round - self._round
+        step = step % line.modulus if line.modulus else step
+        leap, self._leap, self._round = self._leap, step - 1 if 1 < step <= MOST_LEAP else 0, line.round
+        return leap if 0 < step <= NEAR else 0
+
+    def stop(self) -> list[Action]:
+        """Return Corrupt for what nothing confirmed."""
+        return [*super().stop(), *[Corrupt(b"", OTHER_TAG)] * (self._first is not None), *self._guard.finish()]
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        return Identity(self.title, (("tag", self._tag),) if self._tag else ())

@@ -85,12 +85,8 @@ class YdLidarProtocol(PacketReader):
         turned = [(first + step * i) / TURN + _FAR for i in range(count)]
         bearings = [t - _FAR + _correction(q / 4) if q > 3 else t for t, q in zip(turned, quarters, strict=True)]
         whole = [math.floor(t) for t in turned]
-        return Samples(
-            stamp, None, self._period,
-            tuple([t - w for t, w in zip(turned, whole, strict=True)]),
-            tuple([b - w for b, w in zip(bearings, whole, strict=True)]),
-            tuple([q / 4000 if q > 3 else math.nan for q in quarters]),
-        )  # fmt: skip
+        motor, sight = (tuple([a - w for a, w in zip(angles, whole, strict=True)]) for angles in (turned, bearings))
+        return Samples(stamp, None, self._period, motor, sight, tuple([q / 4000 if q > 3 else math.nan for q in quarters]))
 
 
 def _correction(mm: float) -> float:

@@ -80,9 +80,12 @@ class Unknown:
 
 
 def unknowns(
-    config: CalibrationConfig, anchor_ids: tuple[str, ...], given_height: Bools, recording: int = 0,
+    config: CalibrationConfig,
+    anchor_ids: tuple[str, ...],
+    given_height: Bools,
+    recording: int = 0,
     rises: tuple[float, ...] = (0.0,),
-) -> tuple[Unknown, ...]:  # fmt: skip
+) -> tuple[Unknown, ...]:
     """List the scalar unknowns that a recording with these anchors adds to a graph.
 
     Odometry, tag and clocks, and the systematic errors of ranges to an anchor, are each recording's own: another robot,

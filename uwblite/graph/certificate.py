@@ -1,6 +1,6 @@
 """Whether the minimum that an optimisation found is the global one.
 
-The cost F of every edge is bounded from below by a Hermitian form that touches it at the estimate (tangent_forms.py). With
+The cost F of every edge is bounded from below by a Hermitian form that touches it at the estimate (TangentForm). With
 headings z of magnitude 1 their sum is x^H M x + const, and with Lambda_k = Re(conj(z_k) (M x)_k) at the estimate the matrix
 
     S = M - diag(Lambda on headings, 0 on places)
@@ -14,22 +14,191 @@ Without the tangents this is the Lagrangian dual of the chordal problem (D. Rose
 SE-Sync, IJRR 2019; complex: T. Fan, H. Wang, M. Rubenstein, T. Murphey, CPL-SLAM, T-RO 2020) and, with ranges, that of
 CORA (A. Papalia, A. Fishberg, B. O'Neill, J. How, D. Rosen, J. Leonard, T-RO 2024), its unit vectors eliminated. The
 tangents make it hold for the cost that the solver minimises: angles as angles, information of any shape.
+
+In a form, poses are complex numbers, t for the place and z = exp(i theta) for the heading; so are anchors. What touches with
+its gradient, and lies below everywhere:
+
+* of a range: (sqrt(q) - d)^2 is convex in the squared distance q, and so lies above its tangent, which weighs q with
+  1 - d / rho at the estimate rho: negative where the range was measured longer than the estimate has it;
+* of an angle: delta^2 is convex in 2 - 2 cos(delta), and so lies above the tangent with slope delta / sin(delta);
+* of a relative pose: terms of second order about the estimate are replaced by those of the largest information below it that
+  is diagonal, and equal in x and y; terms of first order stay.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
+from .distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from .elimination import PER_COMPLEX, work_of
-from .graph import Graph
+from .graph import Edges, Graph, PriorEdges
+from .point_edges import LandmarkEdges
+from .pose_edges import RelativePoseEdges
 from .problem_checks import floating_components
+from .range_edges import RangeEdges
 from .solver import SolverConfig, optimize
-from .tangent_forms import TangentForm, outside
 from .unknowns import free_unknowns
+
+Complexes = NDArray[np.complex128]
+_Parts = Sequence[tuple[Ints, Any]]
+"""A linear function of the numbers, one an edge: their indices (e,) and coefficients (e,)."""
+
+
+def outside(graph: Graph) -> str:
+    """Return why a graph's cost is not bounded by such forms, or an empty text."""
+    for edges in graph.edges:
+        if edges.kernel.name != "none":
+            return f"the robust kernel {edges.kernel.name} has no relaxation"
+        calibrated = isinstance(edges, RangeEdges) and bool(np.any(edges.calibration >= 0))
+        calibrated |= isinstance(edges, PriorEdges) and edges.block == "calibration"
+        if calibrated or not isinstance(edges, _BOUNDED):
+            return "calibration is unknown, and the relaxation has no terms for it"
+    return ""
+
+
+_BOUNDED = (RelativePoseEdges, RangeEdges, PointDistanceEdges, AnchorDistanceEdges, LandmarkEdges, PriorEdges)
+
+
+class TangentForm:
+    """The sum of the forms of a graph's edges, without its constant."""
+
+    def __init__(self, graph: Graph) -> None:
+        """Add the forms of all edges.
+
+        Raises
+        ------
+        SolverError : an angle is half a turn off, or tied to places by singular information.
+        """
+        n, a = len(graph.poses), len(graph.anchors)
+        # The origin is moved to the middle of the places, so that numbers are small for any map frame.
+        places = np.concatenate([graph.poses[:, :2], graph.anchors]) - graph.poses[:, :2].mean(axis=0)
+        self.x: Complexes = np.concatenate([_complex(places), np.exp(1j * graph.poses[:, 2]), [1.0]])
+        """(2 n + a + 1,) places of poses and anchors, headings of poses and of the map."""
+        self.places = n + a
+        """How many of them are places."""
+        self._anchor, self._map = n, 2 * n + a
+        self._entries: list[tuple[Ints, Ints, Complexes]] = []
+        for edges in graph.edges:
+            self._add_edges(graph, edges, edges.own_weights)
+
+    def matrix(self) -> sparse.csr_matrix:
+        """Return M with x^H M x + const = the sum."""
+        rows, columns, values = (np.concatenate(part) for part in zip(*self._entries, strict=True))
+        return sparse.csr_matrix((values, (rows, columns)), shape=(len(self.x), len(self.x)))
+
+    def _add_edges(self, graph: Graph, edges: Edges, weights: Floats) -> None:
+        if isinstance(edges, RangeEdges):
+            arm = edges.tag_positions(graph.poses) - graph.poses[edges.pose, :2]
+            parts: _Parts = ((edges.pose, 1.0), self._carried(edges.pose, arm), (self._anchor + edges.anchor, -1.0))
+            self._add_distance(weights / edges.sigma**2, edges.ranges, edges.distances(graph), parts)
+        elif isinstance(edges, PointDistanceEdges):
+            (i, p), (j, q) = (
+                (self.places + k, _complex(point)) for k, point in ((edges.i, edges.point_i), (edges.j, edges.point_j))
+            )
+            parts = ((edges.i, 1.0), (i, p), (edges.j, -1.0), (j, -q))
+            self._add_distance(weights / edges.sigma**2, edges.distance, edges.lengths(graph), parts)
+        elif isinstance(edges, AnchorDistanceEdges):
+            expected = edges.residuals(graph)[:, 0] * edges.sigma + edges.distance
+            parts = ((self._anchor + edges.i, 1.0), (self._anchor + edges.j, -1.0))
+            self._add_distance(weights / edges.sigma**2, edges.distance, expected, parts)
+        elif isinstance(edges, RelativePoseEdges):
+            L, r = _weighted(graph, edges, weights)
+            i, j = self.places + edges.i, self.places + edges.j
+            self._add_pose(L, r, edges.T_i_j[:, 2], i, ((edges.j, 1.0), (edges.i, -1.0)), j)
+        elif isinstance(edges, LandmarkEdges):
+            L, r = _weighted(graph, edges, weights)
+            ends = ((self._anchor + edges.anchor, 1.0), (edges.pose, -1.0))
+            self._add_pose(L, r, np.zeros(len(r)), self.places + edges.pose, ends)
+        elif isinstance(edges, PriorEdges):
+            L, r = _weighted(graph, edges, weights)
+            frame, no_turn = np.full(len(r), self._map), np.zeros(len(r))
+            if edges.block == "poses":
+                self._add_pose(L, r, no_turn, frame, ((edges.index, 1.0),), self.places + edges.index)
+            else:
+                self._add_pose(L, r, no_turn, frame, ((self._anchor + edges.index, 1.0),))
+
+    def _carried(self, pose: Ints, arm: Floats) -> tuple[Ints, Complexes]:
+        """Return the part of a point that is fixed to a pose, given by its offset from the pose in the map frame (e, 2)."""
+        heading = self.places + pose
+        return heading, _complex(arm) * np.conj(self.x[heading])
+
+    def _add(self, row: Ints, column: Ints, value: Complexes) -> None:
+        """Add 2 Re(conj(x_row) value x_column)."""
+        self._entries += [(row, column, value), (column, row, value.conj())]
+
+    def _add_square(self, weight: Floats, parts: _Parts) -> None:
+        """Add weight |sum of coefficient x|^2."""
+        for k, (row, c) in enumerate(parts):
+            self._add(row, row, 0.5 * weight * abs(c) ** 2 + 0j)
+            for column, d in parts[:k]:
+                self._add(row, column, weight * np.conj(c) * d + 0j)
+
+    def _add_distance(self, weight: Floats, measured: Floats, expected: Floats, parts: _Parts) -> None:
+        """Add the tangent of weight (distance - measured)^2 in the squared distance."""
+        self._add_square(weight * (1.0 - measured / expected), parts)
+
+    def _add_pose(
+        self, L: Floats, r: Floats, turned: Floats, frame: Ints, ends: _Parts, end_heading: Ints | None = None
+    ) -> None:
+        """Add the tangents of |r|^2, r = L (place in the frame, turned back (e,), then heading) whitened (e, d)."""
+        tau, kappa = _largest_below(L)
+        g = np.einsum("eji,ej->ei", L, r)
+        self._add_offset(tau, _complex(g) * np.exp(1j * turned), frame, ends)
+        if end_heading is not None:
+            self._add_turn(kappa, g[:, 2], frame, end_heading)
+
+    def _add_offset(self, tau: Floats, g: Complexes, frame: Ints, ends: _Parts) -> None:
+        """Add tau |u - u'|^2 + 2 Re(conj(g) u) for the sum u of the ends, as seen in the frame; u' is the estimate."""
+        self._add_square(tau, ends)
+        b = g - tau * np.conj(self.x[frame]) * sum(sign * self.x[end] for end, sign in ends)
+        for end, sign in ends:
+            self._add(frame, end, sign * b.conj())
+
+    def _add_turn(self, kappa: Floats, g: Floats, i: Ints, j: Ints) -> None:
+        """Add the tangent of kappa psi^2 + 2 g psi, psi = how far conj(x_i) x_j turned from the estimate.
+
+        That is kappa delta^2 + const with delta = psi + g / kappa.
+        """
+        delta = np.divide(g, kappa, out=np.zeros_like(g), where=kappa > 0)
+        if np.any(np.abs(delta) >= np.pi) or np.any((kappa <= 0) & (np.abs(g) > 0)):
+            raise SolverError("an angle is half a turn off, or tied to places by singular information")
+        slope = kappa / np.sinc(delta / np.pi)
+        self._add(i, j, -slope * np.exp(1j * delta) * self.x[i] * np.conj(self.x[j]))
+
+
+def _complex(vectors: Floats) -> Complexes:
+    return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
+
+
+def _weighted(graph: Graph, edges: RelativePoseEdges | LandmarkEdges | PriorEdges, weights: Floats) -> tuple[Floats, Floats]:
+    """Return L (e, d, d) and whitened residuals (e, d) with the weights of the edges in them."""
+    scale = np.sqrt(weights)
+    return edges.sqrt_information * scale[:, None, None], edges.residuals(graph) * scale[:, None]
+
+
+def _largest_below(L: Floats) -> tuple[Floats, Floats]:
+    """Return tau (e,), kappa (e,) with diag(tau, tau, kappa) below L^T L, its own ratio of places and headings kept."""
+    information = np.swapaxes(L, 1, 2) @ L
+    tau = np.maximum(np.linalg.eigvalsh(information[:, :2, :2])[:, 0], 0.0)
+    if L.shape[2] == 2:
+        return tau, np.zeros_like(tau)
+    kappa = information[:, 2, 2]
+    coupled = np.any(information[:, :2, 2] != 0.0, axis=1)
+    scale = 1.0 / np.sqrt(np.maximum(np.stack([tau, tau, kappa], axis=1), _LEAST))
+    share = np.clip(np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0], 0.0, 1.0)
+    share = np.where(coupled, share, 1.0)
+    return tau * share, kappa * share
+
+
+_LEAST = 1e-300
+
 
 _SHARE, _NOTHING = 1e-6, 1e-3
 """Share of chi2, and chi2 itself, by which a global minimum may be above its bound: rounding error."""

@@ -13,8 +13,8 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .elimination import PER_COMPLEX, work_of
-from .factorization import MOST_WORK, superlu
+from .elimination import MOST_WORK, PER_COMPLEX, work_of
+from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
 from .unknowns import free_unknowns

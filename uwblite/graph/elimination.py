@@ -1,18 +1,40 @@
 """Symbolic elimination of sparse, symmetric matrices: order, elimination tree and work, from the pattern alone.
 
+Poses measured against a few anchors are a sparse matrix with a border: anchors and calibration, which touch nearly every
+pose, are eliminated last by a Schur complement. Inside, a chain whose closures reach back a few poses is a narrow
+band: reverse Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and
+minimum degree with SuperLU in its symmetric mode needs fewer operations. Many anchors are no border any more, but the
+last rows of the sparse matrix. The order is found on the graph of poses, a third of the matrix's size, and used for
+every factorisation.
+
 The parent of a column in the elimination tree is the first row below its diagonal in the factor. The nonzeros of a computed
 factor do not show it reliably: an entry that cancels, or that underflows along a ring of a hundred poses, would cut
 the tree. So the tree is found from the pattern, and with it the number of entries of each column (J. Gilbert, E. Ng, B. Peyton,
 An efficient algorithm to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree, reverse_cuthill_mckee
 from scipy.sparse.linalg import spilu
 
-from ..arrays import Ints
+from ..arrays import WIDE, Ints
+from .schwarz_cg import expected_work
 
+_WIDEST_BAND = 16
+"""Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""
+_WIDEST_BORDER = 48
+"""Most scalars in a border; more of them stay in the sparse matrix."""
+_LONGEST_LINK = 16
+"""Longest reach of an edge in a chain, poses."""
+_MANY, _TIED = 500, 4
+"""From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
+are connected, in the rooms of a site or the streets of a town only those nearby."""
+MOST_WORK = 4e9
+"""Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
+any poses and any others, however few, fill the whole matrix."""
 PER_COMPLEX = 4
 """Multiplications in one of complex numbers."""
 
@@ -219,3 +241,72 @@ def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
     step = np.log2(np.maximum(other - one, 1)).astype(np.intp)
     table = np.stack(highest) if len(parent) else np.zeros((1, 0), dtype=np.intp)
     return np.asarray(np.maximum(table[step, one], table[step, other - (1 << step)]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ordering:
+    """Order of elimination of a graph's poses."""
+
+    order: Ints
+    """(m,) poses, first eliminated first."""
+    bordered: bool
+    """Everything else is a border."""
+    banded: bool
+    """The poses are a narrow band."""
+    iterative: bool = False
+    """A factor would fill up: see schwarz_cg.py."""
+    work: float = 0.0
+    """Multiplications of a factorisation, where they are many enough to be counted."""
+
+
+def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
+    """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
+
+    Parameters
+    ----------
+    pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
+    width : (n,) scalars of each node.
+    subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
+    last : poses that come after the others, in the sparse form.
+    """
+    if poses < 2:
+        return Ordering(np.arange(poses), False, False)
+    among = pairs[(pairs < poses).all(axis=1)]
+    if last is not None:
+        return Ordering(_before(among, poses, last), False, False)
+    if subtrees:
+        return Ordering(with_subtrees_contiguous(among, poses), False, False)
+    bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
+    tied = poses >= _MANY and len(among) - poses > _TIED * poses
+    if bordered or tied:
+        order, reach = narrow_order(among, poses)
+        if bordered and reach.max() <= _WIDEST_BAND:
+            return Ordering(order, True, True)
+        if tied and is_full(reach):
+            return Ordering(np.arange(poses), False, False, iterative=True)
+    order = with_subtrees_contiguous(among, poses)
+    every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
+    multiplications = work(among if bordered else pairs, every, width)
+    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
+    if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
+        return Ordering(np.arange(poses), False, False, iterative=True)
+    return Ordering(order, bordered, False, work=multiplications)
+
+
+def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
+    """Return the order in which some poses come last and the others fill little.
+
+    The remainder of a chain is a chain: it is halved repeatedly by blocks as long as its edges reach, so that each
+    elimination connects few of the last poses. (Minimum degree runs along the chain and connects all of them.)
+    """
+    late = np.zeros(poses, dtype=bool)
+    late[last[last >= 0]] = True
+    reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
+    if reach > _LONGEST_LINK:
+        order = minimum_degree(pairs, poses)
+    else:
+        block = np.arange(poses) // reach + 1
+        order = np.lexsort((np.arange(poses), block & -block))
+    order = np.concatenate([order[~late[order]], order[late[order]]])
+    walk = order[postorder(elimination_tree(pairs, order))]
+    return np.concatenate([walk[~late[walk]], order[late[order]]])

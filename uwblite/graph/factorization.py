@@ -1,14 +1,11 @@
-"""Orderings and factorisations of sparse, symmetric, positive definite matrices, chosen by structure.
+"""Factorisations of sparse, symmetric, positive definite matrices, and layouts of these.
 
-Poses measured against a few anchors are a sparse matrix with a border: anchors and calibration, which touch nearly every
-pose, are eliminated last by a Schur complement. Inside, a chain whose closures reach back a few poses is a narrow
-band: reverse Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and
-minimum degree with SuperLU in its symmetric mode needs fewer operations. Many anchors are no border any more, but the
-last rows of the sparse matrix. The order is found on the graph of poses, a third of the matrix's size, and used for
-every factorisation.
+A matrix is kept as blocks of its lower triangle. The places of the values in a layout are found once; each factorisation then
+gathers the values with one indexing operation.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Protocol
 
 import numpy as np
@@ -16,25 +13,11 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import WIDE, Floats, Ints
+from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
-from ..work import ENTRIES, FACTORISATIONS, Work
-from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
-from .schwarz_cg import expected_work
-
-_WIDEST_BAND = 16
-"""Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""
-_WIDEST_BORDER = 48
-"""Most scalars in a border; more of them stay in the sparse matrix."""
-_LONGEST_LINK = 16
-"""Longest reach of an edge in a chain, poses."""
-_MANY, _TIED = 500, 4
-"""From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
-are connected, in the rooms of a site or the streets of a town only those nearby."""
-MOST_WORK = 4e9
-"""Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
-any poses and any others, however few, fill the whole matrix."""
-
+from .elimination import Ordering
+from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
+from .work import ENTRIES, FACTORISATIONS, Work
 
 _LARGE, _PANEL = 400_000, 8
 """Entries from which on SuperLU updates so many columns together; one at a time below."""
@@ -56,75 +39,6 @@ def counted(factor: Factor, work: Work) -> Factor:
     work[FACTORISATIONS] += 1
     work[ENTRIES] += factor.nnz
     return factor
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ordering:
-    """Order of elimination of a graph's poses."""
-
-    order: Ints
-    """(m,) poses, first eliminated first."""
-    bordered: bool
-    """Everything else is a border."""
-    banded: bool
-    """The poses are a narrow band."""
-    iterative: bool = False
-    """A factor would fill up: see schwarz_cg.py."""
-    work: float = 0.0
-    """Multiplications of a factorisation, where they are many enough to be counted."""
-
-
-def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
-    """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
-
-    Parameters
-    ----------
-    pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
-    width : (n,) scalars of each node.
-    subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
-    last : poses that come after the others, in the sparse form.
-    """
-    if poses < 2:
-        return Ordering(np.arange(poses), False, False)
-    among = pairs[(pairs < poses).all(axis=1)]
-    if last is not None:
-        return Ordering(_before(among, poses, last), False, False)
-    if subtrees:
-        return Ordering(with_subtrees_contiguous(among, poses), False, False)
-    bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
-    tied = poses >= _MANY and len(among) - poses > _TIED * poses
-    if bordered or tied:
-        order, reach = narrow_order(among, poses)
-        if bordered and reach.max() <= _WIDEST_BAND:
-            return Ordering(order, True, True)
-        if tied and is_full(reach):
-            return Ordering(np.arange(poses), False, False, iterative=True)
-    order = with_subtrees_contiguous(among, poses)
-    every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
-    multiplications = work(among if bordered else pairs, every, width)
-    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
-    if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
-        return Ordering(np.arange(poses), False, False, iterative=True)
-    return Ordering(order, bordered, False, work=multiplications)
-
-
-def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
-    """Return the order in which some poses come last and the others fill little.
-
-    The remainder of a chain is a chain: it is halved repeatedly by blocks as long as its edges reach, so that each
-    elimination connects few of the last poses. (Minimum degree runs along the chain and connects all of them.)
-    """
-    late = np.zeros(poses, dtype=bool)
-    late[last[last >= 0]] = True
-    reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
-    if reach > _LONGEST_LINK:
-        order = minimum_degree(pairs, poses)
-    else:
-        block = np.arange(poses) // reach + 1
-        order = np.lexsort((np.arange(poses), block & -block))
-    order = np.concatenate([order[~late[order]], order[late[order]]])
-    walk = order[postorder(elimination_tree(pairs, order))]
-    return np.concatenate([walk[~late[walk]], order[late[order]]])
 
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
@@ -193,3 +107,159 @@ class BorderedFactor:
     def nnz(self) -> int:
         """Entries of the factor."""
         return self._inside.nnz + int(self._rows.size)
+
+
+class Layout(Protocol):
+    """Places of the values."""
+
+    def factor(self, values: Floats) -> Factor:
+        """Factorise the matrix with these values; raise SolverError where a factorisation meets a pivot it cannot use."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """The lower triangle of a symmetric matrix as one array of blocks, each row by row."""
+
+    row: Ints
+    """(b,) first row of each block; a block on the diagonal is square and only its lower triangle counts."""
+    column: Ints
+    """(b,) first column."""
+    height: Ints
+    """(b,) rows, at most 3."""
+    width: Ints
+    """(b,) columns, at most 3."""
+    start: Ints
+    """(b,) place of the first value."""
+    size: int
+    """Rows of the matrix."""
+
+    @property
+    def places(self) -> int:
+        """Length of the array."""
+        return int(np.max(self.start + self.height * self.width, initial=0))
+
+    def inside(self, size: int) -> "Blocks":
+        """Return the blocks within the first rows and columns; no block crosses this limit."""
+        keep = self.row < size
+        row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
+        return Blocks(row, column, height, width, start, size)
+
+    def entries(self) -> tuple[Ints, Ints, Ints]:
+        """Return row, column and place of every value in the lower triangle."""
+        found = []
+        for i, j in np.ndindex(3, 3):
+            has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
+            found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
+        rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        return rows, columns, places
+
+
+_SHAPES = tuple(product((3, 2, 1), repeat=2))
+"""Shapes of blocks between poses, anchors and calibration values."""
+
+
+def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
+    """Return row, column, height, width, start and step down and across of the blocks of both triangles, by column."""
+    apart = blocks.row != blocks.column
+    one, start = np.ones_like(blocks.row), blocks.start
+    lower = (blocks.row, blocks.column, blocks.height, blocks.width, start, blocks.width, one)
+    upper = (blocks.column, blocks.row, blocks.width, blocks.height, start, one, blocks.width)
+    both = [np.concatenate([a, b[apart]]) for a, b in zip(lower, upper, strict=True)]
+    order = np.argsort(both[1] * blocks.size + both[0])
+    return tuple(a[order] for a in both)
+
+
+class SparseLayout:
+    """Both triangles in compressed columns."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        """Find for every entry of the compressed columns its place among the values."""
+        n = blocks.size
+        row, column, height, width, start, down, across = _both_triangles(blocks)
+        own = row == column
+        above = np.cumsum(height) - height
+        above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
+        in_blocks = np.bincount(column, height, n).astype(np.intp)
+        tall = np.empty(n, dtype=np.intp)
+        for k in range(3):
+            has = own & (k < width)
+            tall[column[has] + k] = in_blocks[column[has]]
+        indptr = np.concatenate([[0], np.cumsum(tall)])
+        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int32)
+        for h, w in _SHAPES:
+            some = np.nonzero((height == h) & (width == w))[0]
+            r, own_some, at_column = row[some], own[some], column[some]
+            for i, j in np.ndindex(h, w):
+                at = indptr[at_column + j] + (above[some] + i)
+                indices[at] = r + i
+                place = start[some] + (i * down[some] + j * across[some])
+                if i < j:
+                    place = np.where(own_some, start[some] + (j * down[some] + i * across[some]), place)
+                source[at] = place
+        self._source = source
+        self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
+
+    def factor(self, values: Floats) -> SuperLU:
+        """Factorise the matrix with these values; the next call overwrites it."""
+        return superlu(self.matrix(values), "NATURAL")
+
+    def matrix(self, values: Floats) -> sparse.csc_matrix:
+        """Return the matrix with these values; the next call overwrites it."""
+        np.take(values, self._source, out=self._matrix.data)
+        return self._matrix
+
+
+class IterativeLayout:
+    """Both triangles in compressed columns, and the places of their pieces."""
+
+    def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
+        """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
+        self._sparse, self._pieces = SparseLayout(blocks), pieces
+        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.places)), pieces)
+
+    def factor(self, values: Floats) -> TwoLevelFactor:
+        """Prepare to solve with these values, up to the next call."""
+        return TwoLevelFactor(self._sparse.matrix(values), self._pieces, self._local)
+
+
+class BandedLayout:
+    """LAPACK's lower band."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        """Find where in the band each value goes."""
+        rows, columns, self._from = blocks.entries()
+        self._half = int(np.max(rows - columns, initial=0)) + 1
+        self._to = (rows - columns) + columns * self._half
+        self._size = blocks.size
+
+    def factor(self, values: Floats) -> BandedFactor:
+        """Factorise the matrix with these values."""
+        band = np.zeros(self._size * self._half)
+        band[self._to] = values[self._from]
+        return BandedFactor(band.reshape(self._size, self._half))
+
+
+class BorderedLayout:
+    """A large inner matrix, and a border of few full rows."""
+
+    def __init__(self, inside: Layout, blocks: Blocks, size: int) -> None:
+        """Find where in the border each value goes; the first `size` rows are inside."""
+        rows, columns, places = blocks.entries()
+        below = rows >= size
+        self._inside, self._shape = inside, (blocks.size - size, blocks.size)
+        self._from, self._to = places[below], columns[below] + (rows[below] - size) * blocks.size
+
+    def factor(self, values: Floats) -> BorderedFactor:
+        """Factorise the matrix with these values."""
+        border = np.zeros(self._shape)
+        border.ravel()[self._to] = values[self._from]
+        return BorderedFactor(self._inside.factor(values), border)
+
+
+def make_layout(blocks: Blocks, ordering: Ordering, poses: int) -> Layout:
+    """Return the layout that an ordering asks for; the first `poses` rows are those of poses."""
+    if not ordering.bordered:
+        return SparseLayout(blocks)
+    inside = blocks.inside(poses)
+    layout: Layout = BandedLayout(inside) if ordering.banded else SparseLayout(inside)
+    return layout if poses == blocks.size else BorderedLayout(layout, blocks, poses)

@@ -12,15 +12,15 @@ Two differences from the source: the search starts from the residuals of the giv
 edges as inliers, and one or two Gauss-Newton steps per mu are enough, since mu changes little.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats
-from .graph import Graph, Linearization, PriorEdges, linearize
-from .loop_edges import closing
+from ..arrays import Bools, Floats
+from .graph import Edges, Graph, Linearization, PriorEdges, linearize
 from .normal_equations import NormalEquations
+from .pose_edges import RelativePoseEdges
 from .problem_checks import check
 from .robust import SQUARED, Kernel
 from .solver import Optimizer, Progress, SolverConfig, SolverSummary, minimise
@@ -57,9 +57,12 @@ def truncated_weight(squared: Floats, mu: float) -> Floats:
 
 
 def optimize_gnc(
-    graph: Graph, thresholds: Mapping[int, float], solver: SolverConfig = SolverConfig(), progress: Progress | None = None,
+    graph: Graph,
+    thresholds: Mapping[int, float],
+    solver: SolverConfig = SolverConfig(),
+    progress: Progress | None = None,
     allowed: float = np.inf,
-) -> tuple[Graph, SolverSummary, dict[int, Floats]]:  # fmt: skip
+) -> tuple[Graph, SolverSummary, dict[int, Floats]]:
     """Optimise a graph and find the outliers among chosen kinds of edges.
 
     Parameters
@@ -136,3 +139,65 @@ def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tu
     )
     graph = replace(current, edges=edges)
     return graph, linearize(graph)
+
+
+def closing(graph: Graph) -> list[Bools | None]:
+    """Return for each kind of edges which of them (e,) close loops; None for kinds that are no relative poses."""
+    seen = np.zeros(len(graph.poses), dtype=bool)
+    found: list[Bools | None] = []
+    for e in graph.edges:
+        if not isinstance(e, RelativePoseEdges):
+            found.append(None)
+            continue
+        lower, step = np.minimum(e.i, e.j), np.abs(e.j - e.i) == 1
+        first = np.zeros(len(e), dtype=bool)
+        first[np.unique(np.where(step, lower, -1), return_index=True)[1]] = True
+        found.append(~(first & step & ~seen[lower]))
+        seen[lower[step]] = True
+    return found
+
+
+def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
+    """Return the graph with a robust kernel on every edge except relative poses that close no loop."""
+
+    def parts() -> Iterator[Edges]:
+        for e, loop in zip(graph.edges, closing(graph), strict=True):
+            if loop is None:
+                yield replace(e, kernel=kernel)  # type: ignore[type-var]
+                continue
+            for chosen, used in ((~loop, e.kernel), (loop, kernel)):
+                if chosen.any():
+                    yield replace(e.rows(chosen), kernel=used)  # type: ignore[type-var]
+
+    return replace(graph, edges=tuple(parts()))
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """How far loop closures are off in an optimised graph."""
+
+    closures: int
+    off: int
+    """How many of them are off by more than _OFF standard deviations."""
+    worst: tuple[int, int]
+    """The poses of the closure with the largest error; -1 where there is none."""
+
+    @property
+    def most(self) -> bool:
+        """Most closures are off: they contradict each other, or their stated precision is too high."""
+        return 2 * self.off > self.closures
+
+
+_OFF = 4.0
+"""Whitened norm, standard deviations; one good closure in a thousand is farther off."""
+
+
+def misfit(graph: Graph) -> Misfit:
+    """Return how far the loop closures of a graph are off."""
+    loops = [e.rows(loop) for e, loop in zip(graph.edges, closing(graph), strict=True) if loop is not None and loop.any()]
+    if not loops:
+        return Misfit(0, 0, (-1, -1))
+    i, j = (np.concatenate([getattr(e, end) for e in loops]) for end in ("i", "j"))
+    norms = np.concatenate([np.linalg.norm(e.residuals(graph), axis=1) for e in loops])
+    worst = int(np.argmax(norms))
+    return Misfit(len(norms), int(np.count_nonzero(norms > _OFF)), (int(i[worst]), int(j[worst])))

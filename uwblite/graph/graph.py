@@ -23,8 +23,8 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Shape, array_fields, require_index, require_type, settle
 from ..config import documented
 from ..errors import DataError
-from ..work import Work
 from .robust import SQUARED, Kernel
+from .work import Work
 
 Block = tuple[str, Ints, Floats]
 """(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
@@ -189,7 +189,7 @@ class Graph:
     fixed_calibration: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """(c,) True = fixed; made without any, all are free."""
     work: Work = field(default_factory=Work, repr=False)
-    """To which the operations on this graph, and on all that are made from it, are added; see work.py."""
+    """To which the operations on this graph, and on all that are made from it, are added; see graph/work.py."""
 
     def __post_init__(self) -> None:
         settle(self, "Graph", {"poses": ("n", 3), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)})
@@ -244,9 +244,9 @@ def edge_cost(edges: Edges, residuals: Floats) -> float:
     return float(np.sum(rho * edges.own_weights))
 
 
-def edge_costs(graph: Graph, linearized: Sequence[Linearization]) -> list[float]:
-    """Return the same of each kind of a graph's edges, linearised at its estimates."""
-    return [edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True)]
+def linearized_cost(graph: Graph, linearized: Sequence[Linearization]) -> float:
+    """Return the same of all edges of a graph, linearised at its estimates."""
+    return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
 
 
 def kernel_weights(edges: Edges, residuals: Floats) -> Floats:

@@ -9,11 +9,12 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
+from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
 from .factorization import Factor
 from .graph import Graph
-from .marginals import factor_of, relative_covariances
+from .marginals import factor_of
 from .normal_equations import filled
 
 _PAIRS_AT_ONCE = 1 << 14
@@ -39,8 +40,10 @@ class JointCovariance:
         for first in range(0, len(i), _PAIRS_AT_ONCE):
             part = slice(first, first + _PAIRS_AT_ONCE)
             a, b = i[part], j[part]
-            own = self._among(a, a), self._among(b, b)
-            found[part] = relative_covariances(self._graph, a, b, *own, self._among(a, b))
+            by_a, by_b = se2.between_jacobians(self._graph.poses[a], self._graph.poses[b])
+            mixed = by_a @ self._among(a, b) @ by_b.transpose(0, 2, 1)
+            own = by_a @ self._among(a, a) @ by_a.transpose(0, 2, 1) + by_b @ self._among(b, b) @ by_b.transpose(0, 2, 1)
+            found[part] = own + mixed + mixed.transpose(0, 2, 1)
         return found
 
     def _among(self, a: Ints, b: Ints) -> Floats:

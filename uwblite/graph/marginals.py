@@ -1,4 +1,7 @@
-"""Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
+"""Covariances of the unknowns of an optimised graph, from the sparse factor of its normal equations.
+
+With the same factor a further unknown that the model does not have is estimated without solving the graph again (score test).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,10 +13,8 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
-from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from .covariances import Covariances
 from .eliminated import Blocks, WithBlocks
 from .factorization import counted
 from .graph import Edges, Graph, edge_weights
@@ -22,10 +23,65 @@ from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
 from .variance_components import variances_of_kinds
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariances:
+    """Marginal covariances of all unknowns, and the joint one of some poses.
+
+    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it.
+    """
+
+    poses: Floats
+    """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+    anchors: Floats
+    """(a, 2, 2) m^2, map frame."""
+    calibration: Floats
+    """(c,) standard deviations, unit by name."""
+    chosen: Ints
+    """(k,) poses whose joint covariance is known."""
+    among: Floats
+    """(3 k, 3 k) of the k chosen poses with each other, x, y, theta of each in turn."""
+
+
+def about_best_fit(poses: Floats, covariance: Floats) -> Floats:
+    """Return the covariances (k, 3, 3) of poses in the frame that fits all of them best, not that of the first pose.
+
+    The fit is the rigid motion ``xi = A^+ e`` of least squares that the errors e of the places have in common; what is left at
+    each pose is ``e_i - G_i xi``.
+
+    Parameters
+    ----------
+    poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
+    """
+    count = len(poses)
+    x, y = (poses[:, :2] - poses[:, :2].mean(axis=0)).T
+    moves = np.tile(np.eye(3), (count, 1, 1))
+    moves[:, 0, 2], moves[:, 1, 2] = -y, x
+    fit = np.zeros((3, count, 3))
+    fit[:, :, :2] = np.linalg.pinv(moves[:, :2].reshape(-1, 3)).reshape(3, count, 2)
+    left = np.eye(3 * count) - moves.reshape(-1, 3) @ fit.reshape(3, -1)
+    whole = (left @ covariance @ left.T).reshape(count, 3, count, 3)
+    return np.asarray(whole[np.arange(count), :, np.arange(count), :])
+
+
+def shape_error(poses: Floats, covariance: Floats) -> float:
+    """Return the rms error of places (m) that is expected after alignment by a similarity.
+
+    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans translation, rotation and scale of the whole.
+
+    Parameters
+    ----------
+    poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
+    """
+    places = poses[:, :2] - poses[:, :2].mean(axis=0)
+    own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)
+    turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
+    return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
+
+
 _MET_AT_ONCE = 1 << 14
 """Rows of a table of common errors in memory at once."""
-_AT_ONCE = 300
-"""Right-hand sides solved together; bounds the memory."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
 
@@ -52,9 +108,7 @@ class Marginals:
     curvature.
     """
 
-    def __init__(
-        self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None
-    ) -> None:
+    def __init__(self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal, further)
         self._unseen = np.append(normal.diagonal <= 0, False)
@@ -67,9 +121,7 @@ class Marginals:
         chosen = self.unknowns.number["poses"][self._among].ravel()
         parts = [chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(chosen), 1), _COLUMNS_AT_ONCE)]
         among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
-        return Covariances(
-            blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among
-        )
+        return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among)
 
     def estimated(self, common: CommonErrors) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
@@ -143,26 +195,6 @@ class Marginals:
         # In undetermined directions the covariance is rounding error.
         return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
 
-    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
-        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
-        return relative_covariances(self._graph, i, j, self.covariances.poses[i], self.covariances.poses[j], self._cross(i, j))
-
-    def _cross(self, i: Ints, j: Ints) -> Floats:
-        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the smaller set."""
-        if len(np.unique(i)) < len(np.unique(j)):
-            return self._cross(j, i).transpose(0, 2, 1)
-        number = self.unknowns.number["poses"]
-        cross = np.zeros((len(i), 3, 3))
-        sources = np.unique(j)
-        for first in range(0, len(sources), _AT_ONCE // 3):
-            part = sources[first : first + _AT_ONCE // 3]
-            here = np.nonzero((j >= part[0]) & (j <= part[-1]))[0]
-            columns = self.columns(number[part].ravel())
-            at = 3 * np.searchsorted(part, j[here])[:, None, None] + np.arange(3)
-            cross[here] = columns[number[i[here]][:, :, None], at]
-        return cross
-
     def solve(self, right: Floats) -> Floats:
         """Return H^-1 times right (size, m)."""
         return np.asarray(self._factor.solve(right))
@@ -174,14 +206,6 @@ class Marginals:
         right[-1] = 0.0
         right[:-1] = self._factor.solve(right[:-1])
         return right
-
-
-def relative_covariances(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
-    """Return the covariances (m, 3, 3) of between(X_i, X_j) by the poses' own and mutual ones."""
-    by_i, by_j = se2.between_jacobians(graph.poses[i], graph.poses[j])
-    mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
-    own = by_i @ of_i @ by_i.transpose(0, 2, 1) + by_j @ of_j @ by_j.transpose(0, 2, 1)
-    return own + mixed + mixed.transpose(0, 2, 1)
 
 
 def factor_of(normal: NormalEquations, further: Blocks | None = None) -> SuperLU | WithBlocks:
@@ -207,9 +231,7 @@ def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) ->
     return found
 
 
-def marginals(
-    graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None
-) -> Marginals:
+def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
     Parameters
@@ -222,3 +244,47 @@ def marginals(
 
 _COLUMNS_AT_ONCE = 16
 """Columns of an inverse solved for at once; a bound on the memory, since each has the length of all unknowns."""
+
+
+def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats]:
+    """Return values and standard deviations of further unknowns; see added_unknown_and_moves."""
+    return added_unknown_and_moves(graph, edges, shifts)[:2]
+
+
+def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats, Floats]:
+    """Estimate, each alone, further unknowns of some edges of an optimised graph, to first order.
+
+    With J, r and W of the whole graph and s the change of the residuals by one unit of the unknown: its value is -b / a and its
+    standard deviation a^-1/2, with a = s^T W s - s^T W J H^-1 J^T W s and b = s^T W r - s^T W J H^-1 J^T W r (C. R. Rao, Large
+    sample tests of statistical hypotheses, 1948). The part that the graph explains by its own unknowns is subtracted.
+
+    Parameters
+    ----------
+    edges : of the graph. shifts : (k, e, d) changes of their whitened residuals by one unit of each unknown.
+
+    Returns
+    -------
+    (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly. And
+    (k, p, 2) the changes of the poses' places with each value, m.
+    """
+    normal = filled(graph, subtrees=True)
+    lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
+    right = np.zeros((normal.unknowns.size, len(shifts)))
+    for name, index, jacobian in lin.blocks:
+        number = normal.unknowns.number[name][index]
+        free = number >= 0
+        for k, shift in enumerate(weighted):
+            np.add.at(right[:, k], number[free], np.einsum("edk,ed->ek", jacobian, shift)[free])
+    solved = factor_of(normal).solve(right)
+    total = np.einsum("ked,ked->k", shifts, weighted)
+    left = total - np.einsum("nk,nk->k", right, solved)
+    score = np.einsum("ked,ed->k", weighted, lin.residuals) - solved.T @ normal.gradient
+    seen = left > _ROUNDING * total
+    divisor = np.where(seen, left, 1.0)
+    values = np.where(seen, -score / divisor, 0.0)
+    places = np.append(solved, np.zeros((1, len(shifts))), axis=0)[normal.unknowns.number["poses"][:, :2]]
+    return values, np.where(seen, 1.0 / np.sqrt(divisor), np.inf), -values[:, None, None] * np.moveaxis(places, 2, 0)
+
+
+_ROUNDING = 1e-9
+"""Share of the shifts below which the remainder is rounding error."""

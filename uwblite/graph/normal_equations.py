@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..arrays import WIDE, Floats, Ints
-from ..work import PRODUCTS
-from .factorization import Factor, choose_ordering, counted
+from .elimination import choose_ordering
+from .factorization import Blocks, Factor, IterativeLayout, Layout, SparseLayout, counted, make_layout
 from .graph import Graph, Linearization, kernel_weights, linearize
-from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
 from .schwarz_cg import chains, cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
+from .work import PRODUCTS
 
 _AT_ONCE = 1 << 15
 """Edges whose products are in memory at once; a bound on the memory."""

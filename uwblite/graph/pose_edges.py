@@ -117,6 +117,8 @@ class OdometryEdges(EdgeTable):
     unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+    slips: Floats | None = None
+    """(e,) probability that the wheels slip over each step, by what is no scan; not yet in the information. None = none."""
 
     def corrected(self, graph: Graph) -> Floats:
         """Return the motion (e, 3) with the present calibration applied."""
@@ -217,8 +219,12 @@ class ScanEdges(EdgeTable):
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
     ROWS: ClassVar[Mapping[str, Shape]] = {
-        "T_i_j": (3,), "sqrt_information": (3, 3), "twist_i": (3,), "twist_j": (3,), "calibration": (4,),
-    }  # fmt: skip
+        "T_i_j": (3,),
+        "sqrt_information": (3, 3),
+        "twist_i": (3,),
+        "twist_j": (3,),
+        "calibration": (4,),
+    }
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
     i: Ints

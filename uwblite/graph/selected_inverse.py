@@ -158,9 +158,7 @@ def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
     return cuts[::-1]
 
 
-def _front_inverse(
-    front: _Front, panel: Floats, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]
-) -> Floats:
+def _front_inverse(front: _Front, panel: Floats, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]) -> Floats:
     """Return Z over the rows of a front."""
     w = front.width
     unit = lapack.dtrtri(panel[:w], lower=1, unitdiag=1)[0]

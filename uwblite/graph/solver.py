@@ -24,9 +24,6 @@ link along the trajectory, and the one with the lower cost is taken: an error of
 metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
 iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
-Where a step is rejected only because of the cost of the anchors' edges, anchors are solved for at its poses and the step is
-tried with these (anchor_subproblem.py).
-
 Near the minimum H hardly changes: a step after one of little effect uses the factor of that one.
 
 The search ends, and reports the reason, when the remaining decrease is a negligible fraction of F, when every component of
@@ -46,14 +43,13 @@ import numpy as np
 from ..arrays import Floats
 from ..config import documented, setting
 from ..errors import ConfigError, SolverError
-from ..work import ENTRIES
-from .anchor_subproblem import with_anchors_solved
 from .factorization import Factor
-from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
+from .graph import Edges, Graph, Linearization, kernel_weights, linearize, linearized_cost
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .schwarz_cg import iterated
 from .unknowns import cheaper_move, linked_poses
+from .work import ENTRIES
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
@@ -140,9 +136,13 @@ def optimize(
 
 
 def minimise(
-    graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig,
-    progress: Progress | None = None, allowed: float = np.inf,
-) -> tuple[Graph, SolverSummary]:  # fmt: skip
+    graph: Graph,
+    linearized: list[Linearization],
+    normal: NormalEquations,
+    config: SolverConfig,
+    progress: Progress | None = None,
+    allowed: float = np.inf,
+) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
     descent = _Descent(graph, linearized, normal, config, allowed)
     del linearized
@@ -165,8 +165,7 @@ class _Descent:
     ) -> None:
         self.graph, self.linearized, self.normal, self.config = graph, linearized, normal, config
         self.work, self.allowed = 0.0, allowed
-        self.costs = edge_costs(graph, linearized)
-        self.chi2 = sum(self.costs)
+        self.chi2 = linearized_cost(graph, linearized)
         if not np.isfinite(self.chi2):
             raise SolverError(what_is_not_finite(graph, linearized))
         self.history: list[float] = []
@@ -206,16 +205,12 @@ class _Descent:
         self.work += steps if reused else steps + self.normal.work
         trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
-        costs = edge_costs(trial, linearized)
-        if promised > 0 and sum(costs) > self.chi2:
-            trial, linearized = with_anchors_solved(self.graph, self.costs, trial, linearized, lambda g: optimize(g, _QUICK)[0])
-            costs = edge_costs(trial, linearized)
-        chi2 = sum(costs)
+        chi2 = linearized_cost(trial, linearized)
         self.history.append(chi2)
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING
         self.moved = promised > 0 and chi2 <= self.chi2
         if self.moved:
-            over = self._take(trial, linearized, costs, promised, negligible, reused)
+            over = self._take(trial, linearized, chi2, promised, negligible, reused)
         else:
             over = self._refuse(promised, negligible, reused)
         if not over and self.damping > _MOST_DAMPING:
@@ -225,17 +220,22 @@ class _Descent:
         return NO_DECREASE if over else ""
 
     def _take(
-        self, trial: Graph, linearized: list[Linearization], costs: list[float], promised: float, negligible: float,
+        self,
+        trial: Graph,
+        linearized: list[Linearization],
+        chi2: float,
+        promised: float,
+        negligible: float,
         reused: bool,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
-        decrease = self.chi2 - sum(costs)
+        decrease = self.chi2 - chi2
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
         self.decreases = [*self.decreases[1 - _PATIENCE :], decrease]
         over = over or (len(self.decreases) == _PATIENCE and sum(self.decreases) <= negligible)
         near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
         self.factor = self.factor if near else None
-        self.graph, self.linearized, self.last_decrease, self.costs, self.chi2 = trial, linearized, decrease, costs, sum(costs)
+        self.graph, self.linearized, self.last_decrease, self.chi2 = trial, linearized, decrease, chi2
         self.damping, self.raised_by = max(self.damping * relaxed(decrease / promised), _LEAST_DAMPING), 2.0
         return over
 
@@ -256,8 +256,6 @@ STUCK = "no step decreases chi2"
 USED_UP = "iterations used up"
 ALL_WORK_DONE = "the work allowed is done"
 
-_QUICK = SolverConfig(max_iterations=12, relative_decrease=1e-3)
-"""Search for anchors at given poses: the next step corrects the remaining error."""
 _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
 _LITTLE = 1e-4

@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
-from .carmen_laser import LaserMessages
-from .carmen_readings import Block
+from .carmen_laser import Block, LaserMessages
 from .carmen_stamps import LineClock, judged, time_order
 from .carmen_words import BrokenLine, Params, is_message_name, numbers, stamp_of, why_broken
 from .carmen_writer import write_log
@@ -104,7 +103,7 @@ class LogReader:
     def feed(self, block: bytes) -> None:
         """Take a block of whole lines."""
         found = Block.of(block)
-        gaps = found.gaps
+        block, gaps = found.text, found.gaps
         ends = gaps[found.array[gaps] == 10]
         starts = np.concatenate([[0], ends[:-1] + 1])
         line_numbers, count = self.lines + 1 + np.arange(len(starts)), len(starts)

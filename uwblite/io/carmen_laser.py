@@ -1,6 +1,7 @@
-"""The laser messages of a CARMEN log: found line by line, decoded in bulk."""
+"""The laser messages of a CARMEN log: found line by line, their readings decoded for a whole block of lines at a time."""
 
 import math
+import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
-from .carmen_readings import Block, Pending
 from .carmen_stamps import LineClock, time_order
 from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
+from .interlacing import beams_lie_between
 from .readings import DEFAULT_REACH, ScanGeometry, clean, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
@@ -24,6 +25,94 @@ POSE_TOLERANCE = 0.01
 _LAYOUTS_KEPT = 1000
 _URG_PERIOD = 0.1
 """s; time of one turn of a URG-04LX."""
+
+
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(slots=True, eq=False)
+class Pending:
+    """One message of the block at hand, parsed but for its readings."""
+
+    number: int
+    first: int
+    """Index into the gaps of the gap behind the first reading."""
+    stamp: float
+
+
+@dataclass(slots=True, eq=False)
+class Block:
+    """Some whole lines of a log."""
+
+    text: bytes
+    """The lines, each with its line end."""
+    array: Bytes
+    """The same."""
+    gaps: Ints
+    """Index of every blank, tab or line end in the text."""
+
+    @staticmethod
+    def of(text: bytes) -> "Block":
+        """Return the block of a text, its words parted by single blanks."""
+        if b"  " in text or b"\t" in text:
+            text = re.sub(rb"(?<=[^\n])[ \t]+", b" ", text)
+        array = np.frombuffer(text, dtype=np.uint8)
+        return Block(text, array, np.flatnonzero(array <= 32))
+
+    def decode_rows(self, beams: int, pending: list[Pending]) -> tuple[NDArray[np.float32], list[ValueError | None]]:
+        """Return the readings (k, beams) of messages, and by message what is wrong with it."""
+        errors: list[ValueError | None] = [None] * len(pending)
+        first = np.array([p.first for p in pending], dtype=np.intp)
+        begins, ends = self.gaps[np.maximum(first - 1, 0)] + 1, self.gaps[first + beams - 1]
+        values = np.empty((len(pending), beams), dtype=np.float32)
+        word = self.text[begins[0] : self.gaps[first[0]]]
+        width, decimals = len(word), len(word) - 1 - word.find(b".")
+        quick = (ends - begins == beams * (width + 1) - 1) & (1 <= decimals <= 6) & (decimals + 2 <= width <= 9)
+        if quick.any():
+            values[quick], quick[quick] = decode_equal_widths(self.array, begins[quick], beams, width, decimals)
+        for row in np.flatnonzero(~quick):
+            try:
+                readings = np.array(self.text[begins[row] : ends[row]].split(), dtype=np.float64)
+                if len(readings) != beams:
+                    raise BrokenLine("readings are parted unevenly")
+                values[row] = np.clip(readings, -1.0, 1e30)
+            except ValueError as error:
+                errors[row] = error
+        return values, errors
+
+
+def decode_equal_widths(
+    text: Bytes, begins: Ints, count: int, width: int, decimals: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Decode rows of numbers that all have the same width, ``0.123 4.567 8.900``, by columns of digits: five times as fast.
+
+    Parameters
+    ----------
+    begins : (k,) index of each row's first character.
+    count : numbers in a row.
+    width : characters of each number; one blank stands between numbers and behind the last.
+    decimals : digits behind the dot, 1..6.
+
+    Returns
+    -------
+    values : (k, count) the numbers, in the unit of the text.
+    plain : (k,) whether every number of the row has that form; the values of other rows mean nothing.
+    """
+    span = count * (width + 1)
+    characters = np.empty((len(begins), count, width + 1), dtype=np.uint8)
+    for row, begin in zip(characters, begins.tolist(), strict=True):
+        row.reshape(-1)[:] = text[begin : begin + span]
+    characters ^= ord("0")
+    dot = width - decimals - 1
+    plain = (characters[:, :, dot] == ord(".") ^ ord("0")).all(axis=1)
+    plain &= (characters[:, :, width] ^ ord("0") <= ord(" ")).all(axis=1)
+    total = np.zeros(characters.shape[:2], dtype=np.uint32)
+    for column in (c for c in range(width) if c != dot):
+        digit = characters[:, :, column]
+        plain &= digit.max(axis=1) <= 9
+        total *= 10
+        total += digit
+    return (total / 10.0**decimals).astype(np.float32), plain
 
 
 @dataclass(slots=True, eq=False)
@@ -52,8 +141,8 @@ class LaserMessages:
         self._counts = dict.fromkeys(RANK, 0)
         self._layouts: dict[bytes, Layout] = {}
         self._scans: dict[Layout, _Scans] = {}
-        self._counted = set[Layout]()
-        """All layouts of the scans."""
+        self._between = set[Layout]()
+        """Layouts whose beams lie between those of another one."""
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
         self._pose_lines = array("q")
@@ -70,34 +159,15 @@ class LaserMessages:
                 return
             self._kind = name
             self._scans, self._poses, self._pose_lines, self._layouts = {}, array("d"), array("q"), {}
-        try:
-            self._take_evenly_spaced(name, number, start, end, gap)
-        except ValueError:
-            self._take_any(name, number, self._block.text[start:end].split())
-
-    def _take_evenly_spaced(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
-        """Take a line whose words are parted by single blanks, leaving the readings undecoded."""
-        gaps, head = self._block.gaps, gap + HEAD[name] - 1
-        if head >= len(gaps) or gaps[head] >= end:
-            raise BrokenLine("too short")
-        layout = self._layout(name, self._block.text[start : gaps[head]])
+        text, gaps, what, head = self._block.text, self._block.gaps, name.decode(), gap + HEAD[name] - 1
+        if head >= len(gaps) or gaps[head] > end:
+            raise BrokenLine(f"{what} has {len(text[start:end].split())} fields, far too few")
+        layout = self._layout(name, text[start : gaps[head]])
         last = head + layout.beams
         if last >= len(gaps) or gaps[last] >= end:
-            raise BrokenLine("too short")
-        stamp = self._tail(name, number, self._block.text[gaps[last] + 1 : end].split())
-        self._queue(layout, Pending(number, head + 1, None, stamp))
-
-    def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
-        """Take a line the general way."""
-        what, head = name.decode(), HEAD[name]
-        if len(tokens) < head:
-            raise BrokenLine(f"{what} has {len(tokens)} fields, far too few")
-        layout = self._layout(name, b" ".join(tokens[:head]))
-        if len(tokens) <= head + layout.beams:
             raise BrokenLine(f"{what} announces {layout.beams} readings but the line is too short for them")
-        readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
-        stamp = self._tail(name, number, tokens[head + layout.beams :])
-        self._queue(layout, Pending(number, 0, readings, stamp))
+        stamp = self._tail(name, number, text[gaps[last] + 1 : end].split())
+        self._queue(layout, Pending(number, head + 1, stamp))
 
     def _queue(self, layout: Layout, pending: Pending) -> None:
         scans = self._scans.get(layout) or self._scans.setdefault(layout, _Scans())
@@ -148,10 +218,10 @@ class LaserMessages:
         for name, count in self._counts.items():
             if count and name != self._kind:
                 skipped[name.decode()] = count
-        self._counted = set(self._scans)
         kept = max(self._scans, key=lambda layout: self._scans[layout].seen, default=None)
         if kept is None or not len(self._scans[kept].stamps):
             return None, None
+        self._between = {layout for layout in self._scans if self._lies_between(layout, params)}
         what, geometry = self._kind.decode(), self._geometry(kept, params)
         range_min = params.get("laser_range_min")
         range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
@@ -171,15 +241,25 @@ class LaserMessages:
         return laser, self._mounting(what, warnings)
 
     def _geometry(self, layout: Layout, params: Params) -> ScanGeometry:
-        """Return where the beams of messages of a layout point.
-
-        A SICK that interlaces sends scans of one beam fewer, too, and their beams lie between those of the others.
-        """
+        """Return where the beams of messages of a layout point."""
         if self._kind != b"FLASER":
             return ScanGeometry(layout.angle_min, layout.angle_increment, layout.beams)
         first, step = params.guess_scanner(layout.beams)
-        interlaced = Layout(layout.beams + 1) in self._counted
-        return ScanGeometry(first + (0.5 * step if interlaced else 0.0), step, layout.beams)
+        return ScanGeometry(first + (0.5 * step if layout in self._between else 0.0), step, layout.beams)
+
+    def _lies_between(self, layout: Layout, params: Params) -> bool:
+        """Return whether the beams of a layout lie between those of another one, as of a SICK that interlaces."""
+        longer = Layout(layout.beams + 1)
+        if self._kind != b"FLASER" or longer not in self._scans:
+            return False
+        reach = self._reach(layout, params)
+        seen, lines = [], []
+        for each in (longer, layout):
+            readings = np.array(self._scans[each].ranges).reshape(-1, each.beams)
+            with np.errstate(invalid="ignore"):
+                seen.append(np.where((readings > 0.0) & (readings < reach), readings, np.nan))
+            lines.append(np.array(self._scans[each].numbers, dtype=np.intp))
+        return beams_lie_between(seen[0], seen[1], (lines[0], lines[1]))
 
     def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""

@@ -11,7 +11,7 @@ from ..config import from_dict, parse_toml
 from ..constraints import Constraints, GivenAnchor
 from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
-from ..sensor_log.anchor_names import last_places
+from ..sensor_log.sensors import last_places
 from .csv_table import read_csv
 
 _TABLES: Mapping[str, tuple[type, str, tuple[str, ...]]] = {

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Floats
-from ..config import from_dict, parse_toml, setting
+from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
 from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
@@ -26,7 +26,6 @@ from .csv_table import csv_rows
 from .files import replacing, write_text
 from .folders import refuse_foreign, replacing_folder, unmarked
 from .readings import ranges_of, reach_of
-from .settings_toml import to_toml
 from .source import finite, open_source
 
 

@@ -28,8 +28,20 @@ from ..arrays import WIDE, Ints, Wides
 from ..errors import FormatError
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, check_lines, check_planar, given_places, measurements, rows_of
-from .plain_edges import ENDS, Measured, measured, plain_edges, upper_triangle
+from .graph_file import (
+    ENDS,
+    GraphFile,
+    Measured,
+    assembled,
+    check_lines,
+    check_planar,
+    given_places,
+    measured,
+    measurements,
+    plain_edges,
+    rows_of,
+    upper_triangle,
+)
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -47,9 +59,13 @@ _LAYOUTS = {
     "EDGE2": Layout(2, 9, places=3),
 }
 _TAGS = {
-    "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY", "pose_prior": "EDGE_PRIOR_SE2", "landmark_prior": "EDGE_PRIOR_XY",
-    "range": "EDGE_RANGE_SE2_XY", "pose_range": "EDGE_RANGE_SE2",
-}  # fmt: skip
+    "relative": "EDGE_SE2",
+    "observation": "EDGE_SE2_XY",
+    "pose_prior": "EDGE_PRIOR_SE2",
+    "landmark_prior": "EDGE_PRIOR_XY",
+    "range": "EDGE_RANGE_SE2_XY",
+    "pose_range": "EDGE_RANGE_SE2",
+}
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
 

@@ -24,8 +24,19 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, check_lines, check_planar, given_places, measurements, rows_of
-from .plain_edges import ENDS, Measured, plain_edges, upper_triangle
+from .graph_file import (
+    ENDS,
+    GraphFile,
+    Measured,
+    assembled,
+    check_lines,
+    check_planar,
+    given_places,
+    measurements,
+    plain_edges,
+    rows_of,
+    upper_triangle,
+)
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -39,9 +50,14 @@ _LAYOUTS = {
     "EDGE_RANGE": Layout(2, 2, stamped=True, places=1),
 }
 _TAGS = {
-    "pose_prior": "VERTEX_SE2:PRIOR", "landmark_prior": "VERTEX_XY:PRIOR", "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY",
-    "range": "EDGE_RANGE", "pose_range": "EDGE_RANGE", "landmark_range": "EDGE_RANGE",
-}  # fmt: skip
+    "pose_prior": "VERTEX_SE2:PRIOR",
+    "landmark_prior": "VERTEX_XY:PRIOR",
+    "relative": "EDGE_SE2",
+    "observation": "EDGE_SE2_XY",
+    "range": "EDGE_RANGE",
+    "pose_range": "EDGE_RANGE",
+    "landmark_range": "EDGE_RANGE",
+}
 """In the order of the file."""
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 

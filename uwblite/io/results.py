@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigError
 from ..map_result import MapResult
-from ..report.html import render
-from ..report.picture import PictureAnchor, draw_map
+from ..report.html import Heading, render
+from ..report.picture import Overlay, PictureAnchor, draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
 from .files import sha256_of, write_text
 from .folders import check_free, mend, refuse_foreign, replacing_folder
 from .g2o import write_g2o
+from .graph_file import plain_edges
 from .map_server import trinary_image, write_map
-from .plain_edges import plain_edges
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
 from .result_text import (
@@ -130,15 +130,8 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
         write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
         write_text(waiting / "graph_stamps.csv", stamps_csv(result))
         write_text(waiting / "config.toml", record.config)
-        page = render(
-            result,
-            title=_title(logs),
-            command=record.command,
-            lead=_lead(logs, result),
-            facts=_facts(logs, result, record),
-            grid_png=grid_png,
-            timings=record.timings_in_report,
-        )
+        heading = Heading(_title(logs), record.command, _lead(logs, result), _facts(logs, result, record))
+        page = render(result, heading, grid_png, timings=record.timings_in_report)
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
         write_text(waiting / "report.json", json_lines(summary(logs, result, record, hashes)))
@@ -169,7 +162,7 @@ def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     places = result.graph.poses[:, :2]
     closures = np.array([(*places[c.i], *places[c.j]) for c in result.closures if c.accepted]).reshape(-1, 4)
     anchors, doubted = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors], result.doubted_paths()
-    return draw_map(result.grid, np.vstack(parts), anchors=anchors, closures=closures, doubted=doubted, caption=caption)
+    return draw_map(result.grid, np.vstack(parts), Overlay(anchors, closures, doubted), caption=caption)
 
 
 def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import WIDE, Floats, Ints
-from ..work import LOOK_UPS, Work
+from ..graph.work import LOOK_UPS, Work
 from .clouds import Clouds
 
 _CLOUDS_AT_ONCE = 64

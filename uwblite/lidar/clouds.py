@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated
 from ..config import setting
+from ..graph.work import Work
 from ..odometry.attached import ScanPoints
-from ..work import Work
 from . import beam_gaps
 from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_by_key
 
@@ -61,7 +61,7 @@ class Clouds:
     normal_variance: NDArray[np.floating]
     """(p,) rad^2, variance of the normal's angle by scatter about its line."""
     work: Work = field(default_factory=Work, repr=False)
-    """To which the operations on these clouds, and on all that are made from them, are added; see work.py."""
+    """To which the operations on these clouds, and on all that are made from them, are added; see graph/work.py."""
 
     def __len__(self) -> int:
         return len(self.offsets) - 1

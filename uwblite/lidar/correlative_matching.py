@@ -19,7 +19,7 @@ from scipy import fft
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
-from ..work import SCORES
+from ..graph.work import SCORES
 from .cloud_rasters import rasterize, surface_field
 from .clouds import Clouds
 

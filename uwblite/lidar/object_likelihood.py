@@ -37,7 +37,9 @@ class ObjectPolicy:
     gap: ClassVar[float] = 0.4
     """Distance between neighbouring points that ends an object, m."""
     moves: ClassVar[float] = 0.03
-    """Probability that an object moves by itself."""
+    """Probability that an object moves by itself, before any was seen: one in a room of thirty things."""
+    sure: ClassVar[float] = 0.99
+    """Probability of standing still from which on an object counts as one that does."""
     long: ClassVar[float] = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
     fits: ClassVar[float] = 5.0 / 6.0
@@ -65,8 +67,21 @@ class ObjectLikelihood:
         """Take clouds and their rasters; for the others see Registration."""
         self._clouds, self._raster, self._sigma, self._chance = clouds, raster, sigma, chance
         self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        self._object, length = objects(clouds, ObjectPolicy.gap)
-        self._most = -np.log(ObjectPolicy.moves) * np.maximum(length / ObjectPolicy.long, 1.0)
+        self._object, self._length = objects(clouds, ObjectPolicy.gap)
+        self.moves = ObjectPolicy.moves
+
+    def learn_moves(self, i: Ints, points: PairPoints, pose: Floats) -> None:
+        """Estimate the probability that an object moves by the objects of pairs where matching ended, at poses (e, 3).
+
+        An empty hall has few things that move and a museum many: what contradicts the place of a cloud counts accordingly.
+        """
+        moved, known, exact = 1.0, 1.0 / ObjectPolicy.moves, np.zeros((len(i), 3, 3))
+        for found in correspondences(self._clouds, self._raster, i, pose, points, ObjectPolicy.gate):
+            some = found.pairs
+            static = self._judge(found, i[some], pose[some], exact[some]).static
+            moved += float(np.sum(static < _UNLIKELY))
+            known += float(np.sum((static < _UNLIKELY) | (static > ObjectPolicy.sure)))
+        self.moves = moved / known
 
     def match(
         self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats
@@ -120,8 +135,9 @@ class ObjectLikelihood:
             np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / c.correlation
             for v in (cost, found.good.astype(np.float64), usable.astype(np.float64))
         )
-        most = np.full((len(i), many), -np.log(c.moves))
-        most.reshape(-1)[key] = self._most[found.row[usable]]
+        # An object longer than any that moves by itself would be several that move together.
+        most = np.full((len(i), many), -np.log(self.moves))
+        most.reshape(-1)[key] *= np.maximum(self._length[found.row[usable]] / c.long, 1.0)
         gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self._sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
         return Judged(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..work import SCORES
+from ..graph.work import SCORES
 from .cloud_rasters import CloudRasters, surface_field
 from .clouds import Clouds
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from .columns import to_circle
 from .ray_noise import RayNoise, learnt_noise
-from .round_columns import to_circle
 from .surface_rays import ROUGHNESS, MeasuredSurfaces, SurfaceRays, Surfaces, in_map
 
 _LEAST = 0.05
@@ -58,9 +58,14 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
     by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
     turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
-    by_surface = np.column_stack([
-        np.where(curved, -normal[:, 0], turn), np.where(curved, -normal[:, 1], -1.0), -incidence, np.where(curved, -1.0, 0.0),
-    ])  # fmt: skip
+    by_surface = np.column_stack(
+        [
+            np.where(curved, -normal[:, 0], turn),
+            np.where(curved, -normal[:, 1], -1.0),
+            -incidence,
+            np.where(curved, -1.0, 0.0),
+        ]
+    )
     return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
 
 
@@ -109,13 +114,10 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
     )
 
 
-def _products(
-    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
-) -> Floats:
+def _products(rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> Floats:
     """Return for each group the sums (g, 8, 8) of products of derivatives by the pose (3), by the surface (4), and residual."""
     curved = bool(found.surfaces.round[rays.surface[0]])
-    noise = found.noise.relative(_reach(rays))
-    share, narrow = 1.0 / (noise**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * noise) ** 2
+    share, narrow = 1.0 / (found.noise.ratio**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * found.noise.ratio) ** 2
     sums = _sums_on_columns if curved else _sums_on_walls
     return sums(rays, first, found.surfaces, sensors, poses, share, narrow)
 
@@ -127,14 +129,8 @@ def _groups(rays: SurfaceRays) -> Ints:
     return np.flatnonzero(new)
 
 
-def _reach(rays: SurfaceRays) -> Floats:
-    """Return the distances from their keyframes at which rays (m,) end, m."""
-    x, y = rays.points.T
-    return np.asarray(np.sqrt(x * x + y * y))
-
-
 def _sums_on_columns(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: Floats, narrow: Floats
+    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
 ) -> Floats:
     lines = linearized(rays, surfaces, sensors, poses)
     rows = np.column_stack([lines.by_pose, lines.by_surface, lines.residual])
@@ -186,7 +182,7 @@ def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Float
 
 
 def _sums_on_walls(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: Floats, narrow: Floats
+    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
 ) -> Floats:
     on = _at_walls(rays, first, surfaces, sensors)
     weight = share * on.information / (1.0 + on.residual**2 * on.information * narrow) ** 2
@@ -210,7 +206,7 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
     """Learn the noise of rays from their residuals; for the parameters see linearized."""
     shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts(surfaces)]
     residual, place = (np.concatenate(part) for part in zip(*shown, strict=True))
-    return learnt_noise(residual, _reach(rays), place, rays.surface, surfaces.round)
+    return learnt_noise(residual, place, rays.surface, surfaces.round)
 
 
 def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
@@ -219,7 +215,7 @@ def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
     many = len(found.surfaces.facing)
     count, squares = np.zeros(many), np.zeros(many)
     for rays in found.rays.in_parts(found.surfaces):
-        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.relative(_reach(rays))
+        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.ratio
         count += np.bincount(rays.surface, minlength=many)
         squares += np.bincount(rays.surface, np.minimum(residual**2, _CLIP**2), many)
     return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))

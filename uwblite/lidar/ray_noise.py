@@ -1,23 +1,21 @@
 """Noise of single rays: from data sheets, and learnt from their residuals on known surfaces.
 
-Residuals show two things. The first is the size of the noise by distance: that of most scanners grows less than a data sheet
-allows. The second is the correlation of residuals in one place, since walls are not straight, columns not round, and errors of
-neighbouring rays are correlated: the variance of the sum of n residuals is then n times a factor, the design effect (L. Kish,
-Survey sampling, 1965), and n rays have the information of n divided by that factor.
+Residuals show two things. The first is the size of the noise. The second is the correlation of residuals in one place, since
+walls are not straight, columns not round, and errors of neighbouring rays are correlated: the variance of the sum of n
+residuals is then n times a factor, the design effect (L. Kish, Survey sampling, 1965), and n rays have the information of n
+divided by that factor.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import MAD_TO_SIGMA, Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, spread
 
 _NEAR, _SHARE = 0.01, 0.01
 """Standard deviation of a range by data sheets: 10 mm up to 1 m, and 1 % beyond (URG-04LX; other scanners are better)."""
-_CLASSES = np.array([1.5, 3.0, 6.0, 12.0, 24.0])
-"""Bounds of the classes of distance whose noise is learnt apart, m."""
 _FEWEST = 200
-"""Least number of rays from which the noise of a class is learnt."""
+"""Least number of rays from which their noise is learnt."""
 _LEAST = 0.1
 """Least noise, as a share of that by data sheets."""
 _CLIP = 3.0
@@ -39,40 +37,26 @@ def range_sigma(reach: Floats) -> Floats:
 class RayNoise:
     """Noise of rays as learnt from their residuals."""
 
-    by_distance: Floats
-    """(c,) ratio of the noise to that of data sheets, by class of distance."""
+    ratio: float
+    """Of the noise to that of data sheets."""
     alike: Floats
     """(2,) design effect of rays on walls and on columns, 1 or more."""
 
-    def relative(self, reach: Floats) -> Floats:
-        """Return the ratio (m,) of the noise of rays to that of data sheets."""
-        return np.asarray(self.by_distance[_class(reach)])
+
+UNLEARNT = RayNoise(1.0, np.full(2, ALIKE))
 
 
-UNLEARNT = RayNoise(np.ones(len(_CLASSES) + 1), np.full(2, ALIKE))
-
-
-def learnt_noise(residual: Floats, reach: Floats, place: Ints, surface: Ints, curved: Bools) -> RayNoise:
+def learnt_noise(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> RayNoise:
     """Learn the noise of rays from their residuals.
 
     Parameters
     ----------
-    residual : (m,) in standard deviations by data sheets. reach : (m,) m. place : (m,) number of the place of each ray on
-        its surface. surface : (m,). curved : (s,) whether a surface is a column.
+    residual : (m,) in standard deviations by data sheets. place : (m,) number of the place of each ray on its surface.
+    surface : (m,). curved : (s,) whether a surface is a column.
     """
-    number = _class(reach)
-    by_distance = np.ones(len(_CLASSES) + 1)
-    for k in range(len(by_distance)):
-        own = np.abs(residual[number == k])
-        if len(own) >= _FEWEST:
-            by_distance[k] = max(MAD_TO_SIGMA * float(np.median(own)), _LEAST)
-    clipped = residual / by_distance[number]
-    clipped = np.where(np.abs(clipped) < _CLIP, clipped, 0.0)
-    return RayNoise(by_distance, _design_effects(clipped, place, surface, curved))
-
-
-def _class(reach: Floats) -> Ints:
-    return np.searchsorted(_CLASSES, reach, "right")
+    ratio = max(spread(residual), _LEAST) if len(residual) >= _FEWEST else 1.0
+    clipped = np.where(np.abs(residual) < _CLIP * ratio, residual / ratio, 0.0)
+    return RayNoise(ratio, _design_effects(clipped, place, surface, curved))
 
 
 def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> Floats:

@@ -6,7 +6,7 @@ with the possibility that the wheels slipped. A slip lasts: the evidence of all 
 wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood, matched_by_chance
 from .pair_alignment import align_pairs
 from .registration import Placed, Prior, Registration, RegistrationConfig, of_fallible
-from .scan_matching import match, measured, pair_points
+from .scan_matching import PairPoints, match, measured, pair_points
 from .step_search import StepSearch
 from .visibility import nearest_by_bearing
 
@@ -114,30 +114,36 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
     return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
+def descended_edges(clouds: Clouds, raster: CloudRasters, steps: Steps, config: TrackingConfig) -> RelativePoseEdges:
+    """Return the steps that descent measured, without a search, as edges."""
+    shown = steps.enough & (steps.share >= _LEAST_SHARE)
+    return _edges(clouds, raster, steps.i[shown], steps.pose[shown], config.gate, config)[0]
+
+
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
-    config: TrackingConfig, by_ranges: Floats | None = None,
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, config: TrackingConfig
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
     Parameters
     ----------
     clouds, raster : see clouds.build and cloud_rasters.rasterize.
-    wheels : edges between neighbouring keyframes. graph : holds their calibration.
-    steps : the same steps after descent, see descend. gate : reach of the raster, m.
-    by_ranges : (e,) probability of a slip over each step by what is no scan; it weighs as much as one pair of clouds.
+    wheels : edges between neighbouring keyframes; what is no scan and shows slips weighs as much as one pair of clouds.
+    graph : holds their calibration. steps : the same steps after descent, see descend.
     """
-    i, tight = wheels.i, min(config.gate, gate)
+    i, tight = wheels.i, config.gate
     good = steps.enough & (steps.share >= config.good_share)
     certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], tight, config)
-    noise = reestimate_wheel_noise(wheels, certain, graph)
+    noise = replace(reestimate_wheel_noise(wheels, certain, graph), slips=None)
     points, mean = pair_points(clouds, i + 1, config.points), noise.corrected(graph)
     chance = matched_by_chance(clouds, raster, i, points, mean)
     registration = Registration(clouds, raster, nearest_by_bearing(clouds), sigma, chance)
-    sound = covariance_of(noise, graph)
-    prior = Prior(mean, sound, sound + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
+    registration.objects.learn_moves(i[steps.enough], PairPoints(points.row[steps.enough]), steps.pose[steps.enough])
+    usual = covariance_of(noise, graph)
+    prior = Prior(mean, usual, usual + slip_sigma(noise)[:, :, None] ** 2 * np.eye(3))
     found = registration.register(i, i + 1, points, prior, steps.pose)
-    prior_odds = 0.0 if by_ranges is None else of_fallible(logit(by_ranges), RegistrationConfig.useless)
+    # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
+    prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
     slips = posterior(found.log_odds + prior_odds, wheels.duration)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)

@@ -19,8 +19,8 @@ from .. import se2
 from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
+from .columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
 from .ray_noise import RayNoise, range_sigma
-from .round_columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
 
 ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
@@ -160,9 +160,7 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
-def on_columns(
-    rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS
-) -> SurfaceRays:
+def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
     if not len(columns):
         return rays.rows(np.zeros(0, dtype=np.intp))

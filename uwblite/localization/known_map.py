@@ -11,7 +11,7 @@ from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult
 from ..radio.range_errors import RangeErrors, range_errors
-from ..sensor_log.anchor_names import last_places
+from ..sensor_log.sensors import last_places
 from .hypotheses import BIAS_SIGMA, SLOW_LEFT, SLOW_SIGMA
 from .walls import Walls, walls_of
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated, renumbered
+from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
@@ -20,7 +21,6 @@ from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import match, pair_points
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import violates_free_space
-from ..work import Work
 from .candidates import Candidates
 from .closures import LoopClosureConfig
 from .parallel import in_order

@@ -97,4 +97,9 @@ def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2
     slips = 1.0 / (slip_sigma(wheels) ** 2 + 1.0 / sound)
     diagonal = np.sqrt((1.0 - probability[:, None]) * sound + probability[:, None] * slips)
-    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3))
+    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3), slips=None)
+
+
+def expected(wheels: OdometryEdges) -> OdometryEdges:
+    """Return the odometry with the slips that it is known to have in its information."""
+    return wheels if wheels.slips is None else with_slips(wheels, wheels.slips)

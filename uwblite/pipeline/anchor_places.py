@@ -17,7 +17,7 @@ from ..graph.solver import Optimizer
 from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain
-from ..sensor_log.anchor_names import place_name
+from ..sensor_log.sensors import place_name
 from .broken_steps import BreakPolicy, without_moves_of_path
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..arrays import Ints
-from ..sensor_log.anchor_names import radio_name
+from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
 
 

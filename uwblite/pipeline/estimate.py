@@ -16,6 +16,7 @@ from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
 from ..lidar.surface_rays import MeasuredSurfaces
 from ..loop_closure.closures import Closures, no_closures
+from ..odometry.slips import expected
 from ..problem.solution import solve
 from ..radio.bootstrap_attempt import BootstrapResult
 from .mapping_config import MappingConfig
@@ -85,8 +86,6 @@ class Estimate:
     """None without lidar, and again after the final optimisation."""
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
-    sound: OdometryEdges | None = None
-    """The odometry as if wheels did not slip where ranges show it; None where they show none, and once clouds have judged."""
     rejected: Bools | None = None
     """(k,) keyframes whose step to the next the clouds measure falsely, see ScanOdometry; None = none."""
     closures: Closures = field(default_factory=no_closures)
@@ -116,7 +115,8 @@ class Estimate:
     @property
     def odometry_and_ranges(self) -> tuple[Edges, ...]:
         """The edges of the first optimisation."""
-        return (self.odometry,) if self.ranges is None else (self.odometry, self.ranges)
+        wheels = expected(self.odometry)
+        return (wheels,) if self.ranges is None else (wheels, self.ranges)
 
     @property
     def steps_and_closures(self) -> tuple[Edges, ...]:

@@ -7,12 +7,12 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..graph.calibration import HEIGHT, with_free
-from ..graph.covariances import Covariances
 from ..graph.graph import Graph
-from ..graph.marginals import Marginals, marginals
+from ..graph.marginals import Covariances, Marginals, marginals
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns
+from ..graph.work import RAYS
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
 from ..grid.tracing import Sweeps, from_sweeps
@@ -24,7 +24,6 @@ from ..problem.solution import at_given_poses
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.prior_selection import with_alike_heights
 from ..radio.range_noise import RangeNoiseConfig
-from ..work import RAYS
 from .estimate import Estimate, Task
 from .map_frame import cropped
 from .progress import Stage

@@ -8,16 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
-from ..graph.calibration import LASER, TURNING, with_free
+from ..arrays import Bools
+from ..graph.calibration import LASER, TURNING, scan_indices, with_free
 from ..graph.graph import Graph
+from ..graph.pose_edges import ScanEdges
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
-from ..odometry.slips import slipped
+from ..odometry.wheels import reestimate_wheel_noise
 from ..problem.solution import rough
-from . import clock_offset, scan_clouds, turn_checks
+from . import calibration_checks, scan_clouds
 from .estimate import Estimate, Task
 from .keyframe_changes import with_keyframes
 from .lidar_stages import pairs, refine
@@ -40,42 +41,61 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     inaccurate where the robot turns fast. The clouds are made here, and not in an earlier stage, so that no reference keeps
     the replaced ones in memory.
     """
-    estimate, steps = _descended(make_clouds(estimate, task), task)
+    estimate, steps = _with_clock_found(make_clouds(estimate, task), task)
+    task = task.following(estimate)
     # With ranges, which judge the path, slips are told later; a step that the clouds contradict is else cut at once.
     doubtful = steps.contradicted(task.config.scan_to_scan) & (estimate.ranges is None)
     cut = _with_keyframes_where(estimate, doubtful, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    if estimate.sound is None:
-        track = _followed(estimate, steps, task)
+    track, shown = _followed(estimate, steps, task), estimate.odometry.slips
+    if shown is None:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
-        # Ranges that are wrong show slips as well; where clouds measure a step, they tell.
-        by_ranges = slipped(estimate.sound, estimate.graph)
-        track = _followed(replace(estimate, odometry=estimate.sound), steps, task, by_ranges)
-        estimate = replace(estimate, odometry=track.slipped, sound=None)
-        estimate = _match_neighbours(estimate, replace(track, steps=track.with_slips), task)
+        estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
+    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
+        return estimate
+    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=shown)), track, task.following(estimate))
+
+
+def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
+    """Return the estimate with keyframes and clouds at the lidar's clock, and the steps that the clouds measure there.
+
+    The steps to which matching descends from the odometry show an offset of the clock; none needs to be searched for.
+    """
+    estimate, steps = _descended(estimate, task)
     corrected = np.inf
     for _ in range(_RETIMINGS):
-        late = clock_offset.late(estimate, task)
-        if late == 0.0:
-            break
+        shown = _solved_with(steps, estimate, task)
+        late = calibration_checks.late(shown, task)
+        settled = late == 0.0
+        if settled and estimate.lidar.delay == 0.0:
+            return estimate, steps
         if abs(late) > corrected:
-            estimate, track = _without_offset(replace(estimate, scans=None), estimate.lidar.delay, task)
+            # With a clock that is off by a constant, each correction leaves a part of the error before it.
+            task.stages.note("clock-offset", offset=estimate.lidar.delay)
+            settled, late = True, -estimate.lidar.delay
+        elif settled:
+            late = shown.graph.calibration.get("laser_delay") - estimate.lidar.delay
+        corrected, delay = abs(late), estimate.lidar.delay + late
+        estimate = _at_delay(estimate.with_estimates_of(shown.graph), late, delay, task)
+        task = task.following(estimate)
+        estimate, steps = _descended(_with_clock_at(estimate, delay) if settled else estimate, task)
+        if settled:
             break
-        corrected, delay, estimate = abs(late), estimate.lidar.delay + late, replace(estimate, scans=None)
-        estimate = _at_delay(estimate, late, delay, task)
-        now = task.following(estimate)
-        if abs(late) < _SAME_STEPS:
-            estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
-        else:
-            estimate, steps = _descended(estimate, now)
-            track = _followed(estimate, steps, now)
-            estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, now)
-    if estimate.lidar.delay != 0.0:
-        estimate = _with_clock_at(estimate, estimate.lidar.delay)
-    return _with_slips(estimate, track, task.following(estimate))
+    return estimate, steps
+
+
+def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
+    """Return the optimum of odometry, weakly weighted ranges and the steps that descent from the odometry measured."""
+    scans, twist, config = estimate.lidar, task.recordings.twist, task.config.scan_to_scan
+    found = scan_to_scan.descended_edges(scans.clouds, scans.raster, steps, config)
+    names = scan_indices(estimate.graph.calibration)
+    i, j, kernel = found.i, found.j, estimate.odometry.kernel
+    edges = ScanEdges(i, j, found.T_i_j, found.sqrt_information, twist[i], twist[j], names, scans.delay, kernel)
+    wheels = reestimate_wheel_noise(estimate.odometry, found, estimate.graph)
+    return _with_inflated_ranges(replace(estimate, odometry=wheels, steps=edges)).solved(rough(task.config.solver))[0]
 
 
 def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
@@ -83,11 +103,13 @@ def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
     Without ranges nothing judges them afterwards, and the steps as measured stay.
+
+    Parameters
+    ----------
+    estimate : its odometry has the noise of sound wheels, and the slips that ranges show.
     """
-    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
-        return estimate
     track = _followed(estimate, _steps(estimate, task), task)
-    cut = _with_keyframes_where(replace(estimate, odometry=track.slipped), track.slips > _LIKELY, task)
+    cut = _with_keyframes_where(estimate, track.slips > _LIKELY, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task), task)
@@ -107,24 +129,12 @@ def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
     return replace(estimate, graph=replace(graph, fixed_calibration=graph.fixed_calibration | fixed))
 
 
-def _without_offset(estimate: Estimate, delay: float, task: Task) -> tuple[Estimate, ScanOdometry]:
-    """Return the estimate with the clock of the lidar as that of the odometry, where a correction made its offset larger.
-
-    With a clock that is off by a constant, each correction leaves a part of the error before it.
-    """
-    estimate = _at_delay(_with_clock_at(estimate, 0.0), -delay, 0.0, task)
-    now = task.following(estimate)
-    task.stages.note("clock-offset", offset=delay)
-    estimate, steps = _descended(estimate, now)
-    track = _followed(estimate, steps, now)
-    return _match_neighbours(replace(estimate, odometry=track.wheels), track, now), track
-
-
 def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
     """Return the estimate with keyframes later by `late` s and clouds made for a lidar whose clock is late by `delay` s."""
     before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
     task = task.following(estimate)
+    estimate = replace(estimate, scans=None)
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
     return estimate
@@ -148,18 +158,10 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
 
 
-def _followed(estimate: Estimate, steps: Steps, task: Task, by_ranges: Floats | None = None) -> ScanOdometry:
-    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped.
-
-    Parameters
-    ----------
-    by_ranges : (e,) probability of a slip over each step, as the ranges show it.
-    """
-    scans, config = estimate.lidar, task.config
-    return scan_to_scan.follow(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config.refinement.first_gate, config.scan_to_scan,
-        by_ranges,
-    )
+def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+    """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
+    scans, config = estimate.lidar, task.config.scan_to_scan
+    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
@@ -170,7 +172,7 @@ def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Es
     """
     before = task.recordings
     steps = estimate.odometry.i[doubtful]
-    after = denser(before, steps, _CUTS)
+    after = denser(before, steps, _CUTS, estimate.lidar.delay)
     if len(after.stamps) == len(before.stamps):
         return None
     scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
@@ -184,9 +186,7 @@ _LIKELY = 0.5
 
 _CUTS = 4
 """Keyframes added within a doubtful step, at most."""
-_SAME_STEPS = 0.015
-"""Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
-_RETIMINGS = 4
+_RETIMINGS = 5
 """Most times that clouds are made again; a quarter of the error remains each time."""
 
 
@@ -228,7 +228,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
     )  # fmt: skip
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
-    return turn_checks.with_constant_turn_scales(estimate, task)
+    return calibration_checks.with_constant_turn_scales(estimate, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from ..errors import Cancelled
 from ..findings import DOUBT, WARNING, Fact, Finding, of_severity
 from ..graph.solver import SolverSummary
+from ..graph.work import KINDS, Work
 from ..map_result import StageSummary
-from ..work import KINDS, Work
 
 
 class Stage(str):

@@ -15,17 +15,17 @@ from ..graph.calibration import BIAS, ODOMETRY, OMNI, RADIO, RANGE_SCALE, with_f
 from ..graph.graph import Graph, edge_cost
 from ..graph.robust import SQUARED
 from ..graph.solver import Optimizer, SolverSummary
+from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import slipped, with_slips
-from ..odometry.wheels import sideways_priors, wheel_edges
+from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
-from ..radio.range_noise import short_term_sigma
-from ..work import Work
+from ..radio.range_noise import assumed, short_term_sigma
 from . import anchor_heights, joining, line_sides, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -102,7 +102,9 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     path = recordings.path[recordings.each[number].rows]
     used = ranges.alive
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
-    settings = replace(config.bootstrap, range_sigma=max(1.5 * sigma, config.bootstrap.least_sigma))
+    # Differences of neighbours do not show the part of the errors that lasts.
+    sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
+    settings = replace(config.bootstrap, range_sigma=sigma)
     found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
@@ -122,20 +124,28 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    wheels, slips = estimate.odometry, estimate.bootstrap.slips
+    assumed_noise = wheels = estimate.odometry
+    slips, factors = np.zeros(len(wheels)), np.ones(3)
+    # Recordings that were joined have their slips in their odometry.
+    if len(estimate.bootstrap.slips) and not estimate.alone:
+        slips = estimate.bootstrap.slips
     optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
         estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
         laps = range(0) if have_scans else laps[-1:]
     for lap in laps:
+        # Clouds show the noise of the wheels better; each recording that was joined has its own already.
+        if lap and task.config.ranges.learn and not (have_scans or estimate.alone):
+            factors = variance_factors(estimate.problem, estimate.odometry, 1.0 - slips, factors)
+            wheels = replace(assumed_noise, sqrt_information=assumed_noise.sqrt_information / np.sqrt(factors))
         # Noise learnt with wheels bent over a slip would keep them bent.
-        if slips.any():
-            estimate = replace(estimate, odometry=with_slips(wheels, slips))
+        estimate = replace(estimate, odometry=with_slips(wheels, slips) if slips.any() else wheels)
         estimate, result = _lap(estimate, lap, task, optimizer)
         slips = slipped(wheels, estimate.graph) if slips.any() else slips
     if slips.any():
-        estimate = replace(estimate, sound=wheels)
+        # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
+        estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
@@ -156,7 +166,7 @@ def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tupl
     return replace(estimate, odometry=odometry), result
 
 
-_NOISE_ROUNDS = 3
+_NOISE_ROUNDS = 4
 """Number of laps: each estimates noise and optimises the graph; in the last one the radio's calibration is free too."""
 
 
@@ -183,7 +193,16 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     values, shares = zip(*(_evidence_and_shares(estimate, config) for estimate in (one, other)), strict=True)
     common = 0.5 * (shares[0] + shares[1]) * ((shares[0] > 0.0) & (shares[1] > 0.0))
     gain = sum(sign * (rest + float(common @ density)) for sign, (rest, density) in zip((1.0, -1.0), values, strict=True))
-    return float(gain)
+    return float(gain) + _for_tighter_wheels(one, other)
+
+
+def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
+    """Return by how much the logarithm of the density of wheels of less noise is greater, of steps that others measure."""
+    tighter = np.einsum("eii->ei", one.odometry.sqrt_information) / np.einsum("eii->ei", other.odometry.sqrt_information)
+    if np.all(tighter == 1.0):
+        return 0.0
+    shown = [redundancy(each.problem, each.odometry, np.ones(len(each.odometry))) for each in (one, other)]
+    return float(np.mean(shown, axis=0) @ np.log(tighter).mean(axis=0))
 
 
 def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tuple[float, Floats], Floats]:

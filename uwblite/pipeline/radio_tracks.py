@@ -8,7 +8,7 @@ from ..arrays import Ints
 from ..radio.place_evidence import MovePolicy, PlaceModel, Track
 from ..radio.place_intervals import explain
 from ..radio.range_noise import short_term_sigma
-from ..sensor_log.anchor_names import radio_name
+from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
 
 

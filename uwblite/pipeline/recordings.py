@@ -6,12 +6,13 @@ from itertools import combinations
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
-from ..constraints import Clock
+from ..arrays import Bools, Floats, Ints, require_type
+from ..constraints import Clock, Constraints
 from ..errors import DataError
 from ..odometry import keyframes
 from ..odometry.keyframes import KeyframeConfig, Keyframes
 from ..sensor_log import SensorLog
+from .mapping_config import MappingConfig
 
 _APART = 1000.0
 """Travelled distance assumed between the end of a recording and the start of the next, m: they are different visits."""
@@ -105,15 +106,21 @@ class Recordings:
 
 
 def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
-    """Choose the keyframes of all recordings and number them through.
-
-    Raises
-    ------
-    DataError : there is no recording.
-    """
-    if not logs:
-        raise DataError("no recording to map; give one or more")
+    """Choose the keyframes of one or more recordings and number them through."""
     return _joined(logs, [keyframes.of(log, config) for log in logs])
+
+
+def require_types(logs: object, config: object, constraints: object) -> None:
+    """Raise DataError where what is to be mapped, or how, is of another type, or there is no recording."""
+    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else None
+    for k, log in enumerate([logs] if several is None else several):
+        require_type(log, "logs" if several is None else f"logs[{k}]", SensorLog)
+    if several is not None and not several:
+        raise DataError("there is no recording to map: logs is empty")
+    if config is not None:
+        require_type(config, "config", MappingConfig)
+    if constraints is not None:
+        require_type(constraints, "constraints", Constraints)
 
 
 def check_distinct(logs: Sequence[SensorLog]) -> None:
@@ -151,20 +158,22 @@ def later(recordings: Recordings, shift: float) -> Recordings:
     return _joined([s.log for s in recordings.each], frames)
 
 
-def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
+def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -> Recordings:
     """Return the recordings with the scans inside some steps as keyframes, too; clouds there are of single scans.
 
     Parameters
     ----------
-    steps : (s,) keyframes at which the steps begin. most : keyframes added to one step.
+    steps : (s,) keyframes at which the steps begin. most : keyframes added to one step. delay : of the lidar's clock, s.
     """
     frames = []
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
         own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
-        added = [np.zeros(0)] if log.scans is None else [
-            _spread(log.scans.middles, stamps[k], stamps[k + 1], most) for k in own.tolist()
-        ]
+        added = (
+            [np.zeros(0)]
+            if log.scans is None
+            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+        )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
         alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))
@@ -173,8 +182,13 @@ def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
 
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
-    within = stamps[np.searchsorted(stamps, begin, "right") : np.searchsorted(stamps, end, "left")]
+    first, last = np.searchsorted(stamps, (begin + _SAME_MOMENT, end - _SAME_MOMENT))
+    within = stamps[first:last]
     return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
+
+
+_SAME_MOMENT = 1e-6
+"""Difference of stamps, s, up to which it is rounding."""
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Bools, Ints
+from ..graph.work import POINTS, Work
 from ..lidar import cloud_rasters, clouds
 from ..lidar.clouds import Clouds
 from ..odometry.attached import choose_scans, scan_points
-from ..work import POINTS, Work
 from .estimate import ScanClouds
 from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..grid.occupancy_grid import GridConfig
-from ..grid.scan_rays import moved_scans
+from ..grid.tracing import moved_scans
 from ..odometry import keyframes
 from ..odometry.attached import choose_scans
 from ..odometry.keyframes import KeyframeConfig

@@ -13,27 +13,119 @@ the weight of a few, and pairs keep their weight. On columns they get hardly any
 it, to the side from which it is seen, so that pairs err along the path by what the robot passes of them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Floats, Ints, rms_length
+from ..arrays import Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, entries, factor, side_by_side
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
+from ..graph.work import RAYS
+from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
-from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
-from ..lidar.ray_noise import RayNoise
-from ..lidar.surface_rays import MeasuredSurfaces, Surfaces, points_on
+from ..lidar.ray_equations import RaySums, misfit, noise_of, weighted_sums
+from ..lidar.ray_noise import UNLEARNT, RayNoise
+from ..lidar.surface_rays import (
+    NEAR,
+    MeasuredSurfaces,
+    SurfaceRays,
+    Surfaces,
+    around_columns,
+    as_rays,
+    fitted_columns,
+    on_columns,
+    points_on,
+    surfaces_of,
+)
+from ..lidar.walls import Pieces, find_walls, straight_pieces
 from ..odometry import floor as floors
-from ..work import RAYS
+from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
-from .surface_search import find_surfaces, with_round_columns
+from .recordings import Recording
+
+_AT_ONCE = 128
+"""Keyframes whose rays are in memory at once."""
+
+
+def with_round_columns(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> MeasuredSurfaces:
+    """Return the surfaces without columns that are not round; for the parameters see ray_equations.linearized."""
+    none = found.surfaces.round & (misfit(found, sensors, poses) > _MISFIT)
+    return replace(found, rays=found.rays.rows(~none[found.rays.surface])).shown()
+
+
+_MISFIT = 1.3
+"""Rms residual of the rays of a column, relative to their noise, beyond which it is not round; that of a circle is 1."""
+
+
+_ON_RIM = 0.06
+"""Distance from a column's rim up to which the middle of a straight piece is on it, m."""
+
+
+def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfaces:
+    """Return the surfaces of the map with clouds at poses (k, 3)."""
+    circles, pieces, on = _shapes(scans, task, len(poses))
+    columns = join_circles(circles, poses)
+    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, _ON_RIM)
+    walls = find_walls(pieces, poses, ~near.on_rim(se2.transform_each(poses, pieces.keyframe, pieces.centre), _ON_RIM))
+    columns, on = fitted_columns(around, poses, columns), on.renumbered(walls.of_piece)
+    surfaces = surfaces_of(walls.centre, walls.normal, columns)
+    rays = concatenated([on, on_columns(around, poses, columns, len(walls.centre)).packed()])
+    return MeasuredSurfaces(surfaces, rays.by_keyframe(surfaces), UNLEARNT)
+
+
+def _shapes(scans: ScanClouds, task: Task, keyframes: int) -> tuple[Circles, Pieces, SurfaceRays]:
+    """Return circles and straight pieces of all scans, and the rays on pieces."""
+    circles, pieces, on, many = [], [], [], 0
+    for rays in _rays(scans, task, np.ones(keyframes, dtype=bool)):
+        circles.append(fitted_circles(rays))
+        found, some = straight_pieces(rays)
+        pieces.append(found)
+        on.append(replace(some, surface=some.surface + many).packed())
+        many += len(found.length)
+    return concatenated(circles), concatenated(pieces), concatenated(on)
+
+
+def _around(columns: Floats, poses: Floats, none: SurfaceRays, scans: ScanClouds, task: Task) -> SurfaceRays:
+    """Return the rays around columns (c, 3) of the keyframes at poses (k, 3) from which the lidar reaches one."""
+    if not len(columns):
+        return none
+    reach = max(r.log.scans.range_max for r in task.recordings.each if r.log.scans is not None)
+    reach = min(task.config.clouds.range_max, reach)
+    within = cKDTree(columns[:, :2]).query(poses[:, :2])[0] < reach + _AHEAD
+    near = surroundings(columns, NEAR)
+    return concatenated([none, *(around_columns(as_rays(r), poses, near).packed() for r in _rays(scans, task, within))])
+
+
+_AHEAD = 2.0
+"""Farthest that a lidar is from its keyframe, m: its mounting, and the way to the scan."""
+
+
+def _rays(scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
+    """Yield the rays of the wanted keyframes (k,), some keyframes at a time."""
+    for recording in task.recordings.each:
+        if recording.has_scans:
+            yield from _rays_of(recording, scans, task, wanted[recording.rows])
+
+
+def _rays_of(recording: Recording, scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
+    log = recording.log.with_later_scans(scans.delay)
+    assert log.scans is not None
+    owner, chosen = choose_scans(log.scans, recording.frames, task.config.keyframes)
+    for first in range(0, len(recording.frames), _AT_ONCE):
+        if not wanted[first : first + _AT_ONCE].any():
+            continue
+        own = (owner >= first) & (owner < first + _AT_ONCE) & wanted[owner]
+        rays = scan_points(log, recording.frames, owner[own], chosen[own], task.config.clouds.range_max)
+        yield replace(rays, keyframe=rays.keyframe + recording.first)
+
 
 _ROUNDS, _STILL = 6, 1e-3
 """Most Gauss-Newton steps; the next change of the poses, rms, m, that ends them once noise and pairs have settled."""
@@ -66,9 +158,13 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
-        "surfaces", walls=walls, columns=columns, rays=len(found.rays.keyframe), shift=round(estimate.moved_since(before), 5),
+        "surfaces",
+        walls=walls,
+        columns=columns,
+        rays=len(found.rays.keyframe),
+        shift=round(estimate.moved_since(before), 5),
         alike=found.noise.alike.round(1).tolist(),
-    )  # fmt: skip
+    )
     found = replace(found, surfaces=found.surfaces.seen_from(graph.poses[0]))
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 

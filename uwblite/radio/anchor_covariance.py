@@ -29,9 +29,8 @@ import numpy as np
 from scipy import sparse
 
 from ..arrays import Bools, Floats, spread, spread_about_median
-from ..graph.covariances import Covariances
 from ..graph.graph import Graph, edge_weights
-from ..graph.marginals import CommonErrors, Marginals, marginals
+from ..graph.marginals import CommonErrors, Covariances, Marginals, marginals
 from ..graph.range_edges import RangeEdges
 from .range_noise import RangeNoiseConfig, distance_sums, steady_sums
 

@@ -41,8 +41,6 @@ class BootstrapConfig:
     """All poses so far are solved again when their number has increased by this factor."""
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
-    least_sigma: ClassVar[float] = 0.05
-    """Least standard deviation of ranges meanwhile, m."""
     drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
     heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)

@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import Canvas, rgb
-from .picture import PictureAnchor, draw_map, shaded
-from .picture_frame import FLOOR, INK
+from .picture import FLOOR, INK, Overlay, PictureAnchor, draw_map, shaded
 
 _STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
 """m; bounds of the colours."""
@@ -36,7 +35,7 @@ def draw_errors(
     rows, cols = np.nonzero(grid.states() == FREE)
     nearest = cKDTree(points).query(grid.geometry.centre_of(rows, cols))[1]
     colours[rows, cols] = _COLOURS[np.searchsorted(_STEPS, errors[nearest])]
-    image = draw_map(grid, np.zeros((0, 2)), anchors=anchors, size=size, colours=colours)
+    image = draw_map(grid, np.zeros((0, 2)), Overlay(anchors), size=size, colours=colours)
     return np.concatenate([_strip(image.shape[1], title), image, _legend(image.shape[1])], axis=0)
 
 

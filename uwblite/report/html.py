@@ -7,6 +7,7 @@ from elsewhere, and its script reads only the page itself.
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape as escape_markup
 
 import numpy as np
@@ -28,30 +29,31 @@ def escape(text: str) -> str:
     return escape_markup(printable(text))
 
 
-def render(
-    result: MapResult,
-    *,
-    title: str,
-    command: str,
-    lead: str = "",
-    facts: tuple[tuple[str, str], ...] = (),
-    grid_png: bytes | None = None,
-    timings: bool = False,
-) -> str:
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """What a page says of how its map was made."""
+
+    title: str
+    command: str
+    """Command line that makes the same map again."""
+    lead: str = ""
+    """The result in a line, under the verdict."""
+    facts: tuple[tuple[str, str], ...] = ()
+    """(name, value): input hash, version, settings."""
+
+
+def render(result: MapResult, heading: Heading, grid_png: bytes | None = None, *, timings: bool = False) -> str:
     """Return the page.
 
     Parameters
     ----------
-    command : command line that makes the same map again.
-    lead : the result in a line, under the verdict.
-    facts : (name, value) pairs about how it was made: input hash, version, settings.
     grid_png : picture of the bare grid, one pixel a cell, highest y first.
     timings : whether to show the seconds of each stage; the page then differs from run to run.
     """
-    again = f"<p>{escape(_WHERE.format(title))}</p><pre>{escape(command)}</pre>"
-    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
+    again = f"<p>{escape(_WHERE.format(heading.title))}</p><pre>{escape(heading.command)}</pre>"
+    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in heading.facts)
     sections = (
-        _banner(result, lead),
+        _banner(result, heading.lead),
         _section("Map", draw(result, grid_png)),
         _section("Anchors", _anchor_table(result.anchors)),
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
@@ -60,8 +62,8 @@ def render(
         _section("Stages", _stage_table(result, timings)),
         _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
-    body = f"<h1>{escape(title)}</h1>" + "".join(sections)
-    return PAGE.format(title=escape(title), style=STYLE, script=SCRIPT, body=body)
+    body = f"<h1>{escape(heading.title)}</h1>" + "".join(sections)
+    return PAGE.format(title=escape(heading.title), style=STYLE, script=SCRIPT, body=body)
 
 
 _WHERE = "The command that makes this map again, byte for byte, in the folder of {}:"

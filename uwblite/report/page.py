@@ -52,7 +52,10 @@ image.grid{image-rendering:pixelated}
 .end{fill:#fff;stroke:@path@;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*3px)}
 .start{fill:@start@;stroke:#fff;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*1px)}
 .anchor path{fill:@anchor@;stroke:#fff;stroke-width:1px;transform:scale(var(--s))}
-.anchor text{transform:translateX(calc(var(--s)*10px))}
+.anchor text{text-anchor:middle;transform:translateY(calc(var(--s)*19px))}
+.anchor .above{transform:translateY(calc(var(--s)*-15px))}
+.anchor .right{text-anchor:start;transform:translateX(calc(var(--s)*10px))}
+.anchor .left{text-anchor:end;transform:translateX(calc(var(--s)*-10px))}
 .anchor.doubt path{fill:#ef6c00}
 .anchor ellipse{fill:@anchor@33;stroke:@anchor@;stroke-width:calc(var(--s)*1px)}
 .anchor .mirror{fill:none;stroke:#ef6c00;r:calc(var(--s)*8px);stroke-width:calc(var(--s)*2px);

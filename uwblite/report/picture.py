@@ -1,9 +1,9 @@
-"""The map as a picture: grid, trajectory, anchors and loop closures on one RGB array."""
+"""The map as a picture: grid, trajectory, anchors and loop closures on one RGB array, with axes, scale bar and legend."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,132 @@ from ..arrays import Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import ACCEPTED, ANCHOR, DOUBTED, PATHS, PROPOSED, START, Canvas, Colour, rgb
-from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
+
+FLOOR: Colour = rgb("ffffff")
+PAPER: Colour = rgb("e2e5e9")
+INK: Colour = rgb("343a44")
+
+_ROW = 44
+"""Pixels of the row with scale bar and caption."""
+_LEGEND_ROW = 26
+_WIDE = 12
+"""Pixels of a character of the larger writing."""
+_TICK_EVERY = 130.0
+"""Pixels between ticks, about."""
+
+
+class Key(NamedTuple):
+    """An entry of the legend."""
+
+    text: str
+    colour: Colour
+    mark: str
+    """'line', 'disc', 'ring' or 'triangle'."""
+
+
+def foot_height(width: int, keys: Sequence[Key]) -> int:
+    """Return the pixels that the strip below the map takes."""
+    return _ROW + _LEGEND_ROW * len(_rows(width, keys))
+
+
+def draw_axes(image: NDArray[np.uint8], low: Floats, scale: float) -> None:
+    """Draw ticks with metres along the left and lower edge, and the origin with its axes where it is on the picture.
+
+    Parameters
+    ----------
+    image : (height, width, 3); drawn on in place.
+    low : (2,) m, map frame, of the lower left corner.
+    scale : pixels per metre.
+    """
+    canvas = Canvas(image)
+    height, width = image.shape[:2]
+    step = round_length(_TICK_EVERY / scale)
+    for axis, length in enumerate((width, height)):
+        for value in np.arange(math.ceil(low[axis] / step), math.floor((low[axis] + length / scale) / step) + 1) * step:
+            at, label = (value - low[axis]) * scale, f"{value + 0.0:g}"
+            if axis == 0:
+                canvas.lines(np.array([[at, height - 7.0, at, height]]), 1.5, INK)
+                place, shown = (at - 3 * len(label), height - 18.0), 20 < at < width - 30
+            else:
+                canvas.lines(np.array([[0.0, height - at, 7.0, height - at]]), 1.5, INK)
+                place, shown = (11.0, height - at - 4), 10 < height - at < height - 30
+            if shown:
+                canvas.text(*place, label, INK, 1, PAPER)
+    _draw_origin(canvas, np.array([-low[0] * scale, height + low[1] * scale]))
+
+
+def _draw_origin(canvas: Canvas, at: Floats) -> None:
+    height, width = canvas.image.shape[:2]
+    if not (0 <= at[0] < width and 0 <= at[1] < height):
+        return
+    for name, step in (("x", np.array([34.0, 0.0])), ("y", np.array([0.0, -34.0]))):
+        canvas.lines(np.concatenate([at, at + step])[None], 2.0, INK)
+        side = np.array([-step[1], step[0]]) / 34.0
+        canvas.polygon(np.array([at + step + step * 8 / 34, at + step + 4 * side, at + step - 4 * side]), INK)
+        x, y = (at + step * 1.25 + np.array([3.0, -10.0])).tolist()
+        canvas.text(x, y, name, INK, 1, FLOOR)
+    canvas.discs(at[None], 3.5, INK)
+
+
+def draw_foot(image: NDArray[np.uint8], top: int, scale: float, caption: str, keys: Sequence[Key]) -> None:
+    """Draw the strip below the map: a scale bar of a round length, the caption, and the legend."""
+    image[top:] = FLOOR
+    image[top : top + 1] = PAPER
+    canvas = Canvas(image)
+    width = image.shape[1]
+    length = round_length(min(220.0, width / 4.0) / scale)
+    bar, y = length * scale, top + 24.0
+    canvas.polygon(np.array([[16, y - 2.5], [16 + bar, y - 2.5], [16 + bar, y + 2.5], [16, y + 2.5]]), INK)
+    for x in (16.0, 16.0 + bar):
+        canvas.polygon(np.array([[x - 1, y - 7], [x + 1, y - 7], [x + 1, y + 7], [x - 1, y + 7]]), INK)
+    canvas.text(16 + bar + 12, y - 7, f"{length:g} m", INK)
+    left = 16 + bar + 12 + _WIDE * len(f"{length:g} m") + 36
+    large = width - left - 16 >= _WIDE * len(caption)
+    each = _WIDE if large else _WIDE // 2
+    if 0 < each * len(caption) <= width - left - 16:
+        canvas.text(width - 16 - each * len(caption), y - (7 if large else 4), caption, INK, 2 if large else 1)
+    for number, row in enumerate(_rows(width, keys)):
+        x = 16.0
+        for key in row:
+            _draw_key(canvas, x, top + _ROW + _LEGEND_ROW * number + 8.0, key)
+            x += _wide(key)
+
+
+def _draw_key(canvas: Canvas, x: float, y: float, key: Key) -> None:
+    middle = np.array([[x + 10.0, y]])
+    if key.mark == "line":
+        canvas.lines(np.array([[x, y, x + 20.0, y]]), 3.0, key.colour)
+    elif key.mark == "triangle":
+        canvas.polygon(middle + 8.0 * np.array([[0.0, -1.1], [0.95, 0.6], [-0.95, 0.6]]), key.colour)
+    else:
+        canvas.discs(middle, 6.0, key.colour)
+        if key.mark == "ring":
+            canvas.discs(middle, 3.0, FLOOR)
+    canvas.text(x + 28.0, y - 7.0, key.text, INK)
+
+
+def _rows(width: int, keys: Sequence[Key]) -> list[list[Key]]:
+    """Return the legend's entries row by row."""
+    rows: list[list[Key]] = []
+    room = 0
+    for key in keys:
+        if not rows or _wide(key) > room:
+            rows.append([])
+            room = width - 32
+        rows[-1].append(key)
+        room -= _wide(key)
+    return rows
+
+
+def _wide(key: Key) -> int:
+    return 28 + _WIDE * len(key.text) + 22
+
+
+def round_length(longest: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not longer, m."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return float(max(f * power for f in (1.0, 2.0, 5.0) if f * power <= longest))
+
 
 Image = NDArray[np.uint8]
 
@@ -41,36 +166,39 @@ class PictureAnchor:
     """It does not stand there yet."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """What is drawn on a map besides the path."""
+
+    anchors: Sequence[PictureAnchor] = ()
+    """Positions that are not finite are left out."""
+    closures: Floats | None = None
+    """(c, 4) x, y, x, y of the two poses of each accepted loop closure, m."""
+    doubted: Sequence[Floats] = ()
+    """(n, 2) x, y along each stretch of the path that is not to be trusted, m."""
+
+
 def draw_map(
     grid: OccupancyGrid | None,
     trajectory: Floats,
+    overlay: Overlay = Overlay(),
     *,
-    anchors: Sequence[PictureAnchor] = (),
-    closures: Floats | None = None,
-    doubted: Sequence[Floats] = (),
     caption: str = "",
     size: int = 1400,
     colours: Image | None = None,
 ) -> Image:
-    """Draw a map.
+    """Draw a map; return it as (height, width, 3) red, green, blue, row 0 and largest y on top.
 
     Parameters
     ----------
     grid : cells; None = none were mapped.
     trajectory : (n, 2 or more) x, y of the base, m, map frame; a row of nan parts recordings,
         which have colours of their own.
-    anchors : those to draw; positions that are not finite are left out.
-    closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
-    doubted : (n, 2) x, y along each stretch of the path that is not to be trusted, m.
     size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
     colours : (rows, cols, 3) of the cells; None = `shaded`.
-
-    Returns
-    -------
-    (height, width, 3) red, green, blue; row 0 on top, largest y on top.
     """
     path, size = trajectory[:, :2], max(size, _SMALLEST)
-    placed = [a for a in anchors if np.isfinite(a.position).all()]
+    placed, closures = [a for a in overlay.anchors if np.isfinite(a.position).all()], overlay.closures
     low, high = _extent(grid, path, placed)
     resolution = grid.geometry.resolution if grid is not None else max(float((high - low).max()) / size, 1e-3)
     scale = _pixels_per_metre(float((high - low).max()), resolution, size)
@@ -78,7 +206,7 @@ def draw_map(
     width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
     tracks = _recordings(path)
     keys = _legend(len(tracks), placed, closures)
-    keys += [Key("not to be trusted", DOUBTED, "line")] if doubted else []
+    keys += [Key("not to be trusted", DOUBTED, "line")] if overlay.doubted else []
     image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
@@ -94,7 +222,7 @@ def draw_map(
         canvas.lines(ends, 1.3, ACCEPTED, 0.75)
     for number, track in enumerate(map(pixel, tracks)):
         _draw_track(canvas, track, PATHS[number % len(PATHS)])
-    for stretch in doubted:
+    for stretch in overlay.doubted:
         canvas.polyline(pixel(stretch), 6.0, DOUBTED, 0.6)
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)

@@ -1,19 +1,27 @@
 """The zoomable map of the HTML report: an SVG with path, anchors and closures over the picture of the grid."""
 
 import base64
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-from .picture_frame import round_length
+from .picture import round_length
 from .printable import sigma_text
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
 _NAME = 0.12
 """Room to the right of an anchor for its name, as a share of the map's size on a phone."""
+_HEIGHTS = 14.0 / 360.0, 14.0 / 900.0
+"""Height of a name on a phone and on a desk, as a share of the map's longer side."""
+_LETTER = 0.7
+"""Width of a letter, in heights of a line, as the next ones."""
+_SIDES = {"right": (0.75, 0.3), "left": (-0.75, 0.3), "below": (0.0, 1.6), "above": (0.0, -0.85)}
+"""Where a name stands beside its anchor, in this order, and the foot of its line, y downwards."""
 MOST_CLOSURES = 1500
 """Rejected closures drawn and listed at most; accepted ones all are."""
 
@@ -56,6 +64,9 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     """Return the map with its switches and buttons as HTML."""
     x, y, width, height = _extent(result)
     size = max(width, height)
+    frame = np.array([[x, -y - height], [x + width, -y]])
+    sides = free_sides([(a.id, a.position) for a in result.anchors], result.grid, frame, _HEIGHTS)
+    marks = [_anchor_mark(a, size, side) for a, side in zip(result.anchors, sides, strict=True)]
     parts = []
     if grid_png is not None and result.grid is not None:
         geometry = result.grid.geometry
@@ -71,7 +82,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     paths += [("doubted", path) for path in result.doubted_paths()]
     lines = [f'<polyline class="{kind}" points="{_coordinates(p[thin(len(p), MOST_POINTS)])}"/>' for kind, p in paths]
     parts += ['<g class="trajectory">', *lines, *(_end_marks(result, recording, size) for recording in recordings), "</g>"]
-    parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
+    parts.append(f'<g class="anchors">{"".join(marks)}</g>')
     bar = round_length(size / 5.0)
     svg = (
         f'<svg id="map-view" viewBox="{x:.3f} {y:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map"'
@@ -107,7 +118,36 @@ def _switch(name: str, text: str, on: bool) -> str:
     return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
 
 
-def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
+def free_sides(
+    names: Sequence[tuple[str, Floats]], grid: OccupancyGrid | None, frame: Floats, heights: Sequence[float]
+) -> list[str]:
+    """Return on which side of its mark each name covers the fewest walls, within the map where that is possible.
+
+    Parameters
+    ----------
+    names : each with the place (2,) that it belongs to, m.
+    frame : lower and upper corner of the map (2, 2), m.
+    heights : of a line of text, as shares of the map's longer side; more than one where it is shown in several sizes.
+
+    Returns
+    -------
+    "right", "left", "below" or "above", the first of those that are equally good.
+    """
+    walls, size = np.zeros((0, 2)) if grid is None else grid.occupied_points(), float(np.ptp(frame, axis=0).max())
+
+    def cost(side: str, letters: int, place: Floats) -> tuple[int, int]:
+        x, foot = _SIDES[side]
+        left = {"right": x, "left": x - _LETTER * letters}.get(side, -0.5 * _LETTER * letters)
+        box = np.array([[left, -foot], [left + _LETTER * letters, 1.0 - foot]])
+        boxes = [place + box * size * height for height in heights]
+        outside = sum(bool((b[0] < frame[0]).any() or (b[1] > frame[1]).any()) for b in boxes)
+        return outside, sum(int(((walls >= b[0]) & (walls <= b[1])).all(axis=1).sum()) for b in boxes)
+
+    costs = [{side: cost(side, len(name), place) for side in _SIDES} for name, place in names]
+    return [min(each, key=each.__getitem__) for each in costs]
+
+
+def _anchor_mark(anchor: AnchorEstimate, size: float, side: str) -> str:
     if not np.isfinite(anchor.position).all():
         return ""
     cx, cy = float(anchor.position[0]), -float(anchor.position[1])
@@ -119,7 +159,8 @@ def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
     state = "ok" if anchor.status == "ok" else "doubt"
     mark = (
         f'<g class="anchor {state}"><title>{escape(label.strip())}</title>{_ellipse(anchor, cx, cy)}'
-        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/><text>{escape(anchor.id)}</text></g>'
+        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/>'
+        f'<text class="{side}">{escape(anchor.id)}</text></g>'
     )
     if anchor.alternative is not None and np.isfinite(anchor.alternative).all():
         mark += f'<circle class="mirror" cx="{anchor.alternative[0]:.3f}" cy="{-anchor.alternative[1]:.3f}" r="{r:.3f}"/>'

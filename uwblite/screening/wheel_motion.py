@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median, spread_about_median
+from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, SensorLog
@@ -251,7 +251,6 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
         bad[bad] = by_wheels > _WORSE_BY_WHEELS * by_lidar
     smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
     runs = [(own.start[a], own.end[b - 1]) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
-    runs = runs or _other_scale(own, start)
     stretches = [(float(a), float(b)) for a, b in runs]
     return [Fact.of("wheels-against-lidar", start=start, stretches=stretches)] if runs else []
 
@@ -286,33 +285,7 @@ def turn_ratio(pairs: Pairs) -> tuple[float, float]:
     return ratio, sigma_of_median(each) if len(each) else float("nan")
 
 
-def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
-    """Return the longest stretch in which distances or turns have another ratio than elsewhere."""
-    for columns, clear in ((slice(0, 2), _CLEAR_WAY), (slice(2, 3), _CLEAR_TURN)):
-        rows, ratio = ratios(own.wheels[:, columns], own.lidar[:, columns], clear)
-        if len(rows) < 3 * _CHUNK:
-            continue
-        parts = np.array_split(np.arange(len(rows)), len(rows) // _CHUNK)
-        middle = np.array([np.median(ratio[p]) for p in parts])
-        sigma = np.array([sigma_of_median(ratio[p]) for p in parts])
-        usual = float(np.median(middle))
-        scatter = np.hypot(sigma, spread_about_median(middle))
-        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * scatter)
-        # Half of the recording may be the other half's exception: then the parts scatter, each sharply.
-        halves = [np.median(middle[h]) for h in np.array_split(np.arange(len(middle)), 2)]
-        if abs(halves[0] - halves[1]) > max(_OTHER_RATIO * usual, _RATIO_SIGMAS * float(np.median(sigma))):
-            off = np.abs(middle - halves[0]) > np.abs(middle - halves[1])
-        if off.sum() >= 2:
-            inside = np.concatenate([rows[p] for p, o in zip(parts, off.tolist(), strict=True) if o])
-            return [(float(own.start[inside[0]]), float(own.end[inside[-1]]))]
-    return []
-
-
 _CLEAR_MOTION = 0.03
 """Way, m, or turn, rad, of most pairs of a robot that drives or turns."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.1
 """Distances, m, and turns, rad, that are large enough for a ratio."""
-_CHUNK = 12
-"""Pairs whose median ratio is taken."""
-_OTHER_RATIO, _RATIO_SIGMAS = 0.15, 5.0
-"""Relative difference of ratios, and in their standard deviations, from which they are not the same."""

@@ -3,8 +3,17 @@
 Every array is time-ordered. Times are seconds of one clock (the log's ipc_timestamp); lengths metres; angles radians.
 """
 
-from .notes import LogNotes, OdometryBreaks, Screening
-from .recording import MOST_ANCHORS, MOST_METRES, MOST_SECONDS, SensorLog, fault_of_id, one_word
+from .recording import (
+    MOST_ANCHORS,
+    MOST_METRES,
+    MOST_SECONDS,
+    LogNotes,
+    OdometryBreaks,
+    Screening,
+    SensorLog,
+    fault_of_id,
+    one_word,
+)
 from .sensors import LONGEST_RANGE, SHORTEST_RANGE, Gyro, LaserScans, Odometry, SensorMounting, UwbRanges, plausible
 from .stamps import in_bursts, odometry_in_bursts, stand_still
 

@@ -53,11 +53,13 @@ function shape(name, attrs, text = "") {
 }
 const key = (name, text, form = "") => el("span", {}, el("i", {class: "key " + form, style: "color:var(--" + name + ")"}),
   " " + text);
-function anchorMark(id, place, size) {
+const beside = {right: [1.2, .5, "start"], left: [-1.2, .5, "end"], below: [0, 2.2, "middle"], above: [0, -1.7, "middle"]};
+function anchorMark(id, place, side, size) {
+  const [x, y, anchor] = beside[side];
   const node = shape("g", {transform: "translate(" + place[0] + " " + -place[1] + ") scale(" + size / 60 + ")",
     class: "anchor"});
   node.append(shape("title", {}, "anchor " + id), shape("path", {d: "M0-1L.9.6H-.9z"}),
-    shape("text", {x: 1.2, y: .5, "font-size": 1.6}, id));
+    shape("text", {x, y, "text-anchor": anchor, "font-size": 1.6}, id));
   return node;
 }
 function drawMap(svg, points, anchors, image, href, margin) {  // with room for the names to the right of anchors
@@ -84,7 +86,9 @@ function scaleBar(x, y, size) {
   return node;
 }
 """
-"""The y of places is upwards, as in a map; `size` is the larger edge of what is drawn, m."""
+"""The y of places is upwards, as in a map; `size` is the larger edge of what is drawn, m, and `side` where a name stands."""
+NAME_HEIGHT = 1.6 / 60.0
+"""Of an anchor's name, as a share of that edge."""
 
 
 def document(title: str, style: str, header: str, main: str, script: str, token: str = "") -> str:

@@ -38,7 +38,7 @@ function show() {
   }
   shown = drawMap(svg, points, placed, map.image, "/grid.png?" + map.version, 1);
   svg.append(...drawn(map.paths));
-  for (const a of placed) svg.append(...(a.covariance ? [ellipse(a)] : []), anchorMark(a.id, a.place, shown.size));
+  for (const a of placed) svg.append(...(a.covariance ? [ellipse(a)] : []), anchorMark(a.id, a.place, a.side, shown.size));
   svg.append(shown.bar, shape("g", {id: "robot"}));
   at("legend").replaceChildren(...(map.paths.length ? [key("path", "path")] : []), key("start", "robot", "arrow"),
     ...(placed.length ? [key("anchor", "anchor, 2σ", "anchors")] : []));

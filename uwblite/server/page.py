@@ -98,7 +98,7 @@ function picture(result, number, detail) {
     if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
   });
   for (const a of placed) {
-    const node = anchorMark(a.id, a.place, size);
+    const node = anchorMark(a.id, a.place, a.side, size);
     node.classList.toggle("pinned", Boolean(a.pinned));
     node.dataset.anchor = a.id;
     node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, result, number, a.id), null));

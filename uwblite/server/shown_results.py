@@ -11,11 +11,15 @@ from ..io.map_server import trinary_image
 from ..io.png import encode_png
 from ..io.result_text import settings_line
 from ..io.stored_result import StoredResult
+from ..report.svg_map import free_sides
 from .advice import text_of
+from .drawing import NAME_HEIGHT
 from .edits import wish_for
 
 _MOST_POINTS = 3000
 """Of a path."""
+_MARGIN = 0.5
+"""m around a map."""
 _MOST_CLOSURES = 3000
 """Accepted ones come first."""
 
@@ -28,12 +32,19 @@ class ShownResult:
     result: StoredResult
     grid_png: bytes | None
     """The map as a grey picture, largest y on top."""
+    sides: tuple[str, ...]
+    """Of its anchors: where their names cover no walls."""
 
 
 def shown_result(result: StoredResult) -> ShownResult:
     """Return a result as the page needs it."""
     grid = None if result.grid is None else encode_png(trinary_image(result.grid))
-    return ShownResult(os.path.basename(os.path.abspath(result.folder)), result, grid)
+    places = [a.position for a in result.anchors if np.isfinite(a.position).all()]
+    corners = [] if result.grid is None else [result.grid.geometry.origin, result.grid.geometry.corner]
+    points = np.array([*places, *corners, *([] if places or corners else [np.zeros(2)])])
+    frame = np.stack([points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN])
+    sides = free_sides([(a.id, a.position) for a in result.anchors], result.grid, frame, (NAME_HEIGHT,))
+    return ShownResult(os.path.basename(os.path.abspath(result.folder)), result, grid, tuple(sides))
 
 
 def described(shown: ShownResult, edits: Constraints) -> dict[str, Any]:
@@ -57,10 +68,11 @@ def described(shown: ShownResult, edits: Constraints) -> dict[str, Any]:
                 "id": a.id,
                 "place": [float(v) for v in a.position] if np.isfinite(a.position).all() else None,
                 "sigma": [float(v) for v in np.sqrt(np.diag(a.covariance))] if np.isfinite(a.covariance).all() else None,
+                "side": side,
                 "status": a.status,
                 "pinned": list(pinned[a.id].position) if a.id in pinned else None,
             }
-            for a in result.anchors
+            for a, side in zip(result.anchors, shown.sides, strict=True)
         ],
         "closures": [
             {

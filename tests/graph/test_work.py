@@ -10,9 +10,8 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.io.carmen import read_log
+from uwblite.graph.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 from uwblite.mapping import build_map
-from uwblite.work import ENTRIES, FACTORISATIONS, KINDS, POINTS, PRODUCTS
 
 USUAL = {
     "all sensors": {
@@ -32,9 +31,9 @@ here, in the commit that changes it."""
 
 
 @pytest.fixture(scope="module", params=["all sensors", "no lidar", "no ranges"])
-def mapped(request, room_log):
-    without = {"no lidar": {"lidar": True}, "no ranges": {"uwb": True}}.get(request.param, {})
-    return request.param, build_map(read_log(room_log).without(**without))
+def mapped(request, log, room_result):
+    without = {"no lidar": {"lidar": True}, "no ranges": {"uwb": True}}.get(request.param)
+    return request.param, build_map(log.without(**without)) if without else room_result
 
 
 def total(result):
@@ -59,8 +58,8 @@ def test_scans_are_gone_through_at_most_thirteen_times_in_ten(mapped):
     assert result.stages[-1].figures["passes"] <= 1.3
 
 
-def test_workers_count_as_one_process_does(room_log):
-    log = read_log(room_log)
+def test_workers_count_as_one_process_does(log):
+    log = log.crop(0.0, 60.0)
     with ThreadPoolExecutor(2) as executor:
         assert total(build_map(log, executor=executor)) == total(build_map(log))
 

@@ -19,7 +19,7 @@ from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
 from uwblite.mapping import MappingConfig
-from uwblite.pipeline.landmark_ties import _column_in, observations, outcome, ties
+from uwblite.pipeline.constraint_edges import _column_in, observations, outcome, ties
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import Odometry
 

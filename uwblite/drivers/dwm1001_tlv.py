@@ -1,6 +1,13 @@
-"""Blocks in the answers of a DWM1001 with PANS R2: type, length, value; little-endian.
+"""DWM1001 with PANS R2: the binary interface (TLV) of the UART. Sans-I/O.
 
-A block is accepted only with a known type, a length that fits it and values that a module can send.
+Type, length, value; little-endian. Every answer begins ``40 01 error``; blocks follow when the error is 0::
+
+    -> 32 00           <- 40 01 00 | 5A 02 status            is there a new fix? (cleared by reading)
+    -> 0C 00           <- 40 01 00 | 41 0D position | 49 L n  n x (address 2, distance 4 mm, quality 1, position 13)
+
+There is no checksum: blocks are accepted only behind a header, with a known type, a length that fits it and values
+that a module can send. The head of an answer inside a block means that the block broke off. The firmware closes a
+request after 0.76 ms without a byte, so a request must be written in one write.
 Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 """
 
@@ -8,16 +15,21 @@ import struct
 from dataclasses import dataclass
 
 from .events import Corrupt, RangeReading, corrupt
+from .framing import HeadedFrames
+
+BAUD = 115200
+
+LOC_GET, STATUS_GET = b"\x0c\x00", b"\x32\x00"
+VER_GET, NODEID_GET, PANID_GET, CFG_GET, UPD_RATE_GET = b"\x15\x00", b"\x30\x00", b"\x2f\x00", b"\x08\x00", b"\x04\x00"
+"""What a module is asked once; nothing is ever set."""
+
 
 MAX_RANGE_MM = 200_000
 """mm; the radio reaches 60 m, anything above this is a damaged frame."""
 MAX_PLACE_MM = 10_000_000
 """mm; largest plausible distance of an anchor from the origin."""
 
-ERRORS = {
-    0: "ok", 1: "unknown command or broken request", 2: "internal error", 3: "invalid parameter", 4: "busy",
-    5: "not permitted",
-}  # fmt: skip
+ERRORS = ("ok", "unknown command or broken request", "internal error", "invalid parameter", "busy", "not permitted")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,20 +39,14 @@ class Answer:
     stamp: float
     """s, arrival of its first byte."""
     error: int
-    """Key of ERRORS."""
+    """Index into ERRORS."""
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """The module's own estimate of a position; uwblite does not use it."""
+    """The module's own estimate of a position, of which uwblite uses nothing."""
 
     stamp: float
-    x: float
-    y: float
-    z: float
-    """m."""
-    quality: int
-    """0..100."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +112,12 @@ class Value:
 Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Corrupt
 
 _VALUES = {
-    0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"),
-}  # fmt: skip
+    0x4D: (2, "pan_id"),
+    0x4E: (8, "node_id"),
+    0x50: (4, "firmware"),
+    0x51: (4, "configuration"),
+    0x52: (4, "hardware"),
+}
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
 _HEAD_AS_STATUS = 0x0140
 """``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""
@@ -147,7 +157,7 @@ def decode(piece: bytes, stamp: float) -> Event:
         x, y, z, quality = _POSITION.unpack(value)
         if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
             return corrupt(piece, "position or quality out of range")
-        return Position(stamp, x / 1000, y / 1000, z / 1000, quality)
+        return Position(stamp)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
         return UpdateRate(stamp, normal / 10, stationary / 10)
@@ -181,3 +191,59 @@ def _decode_distances(piece: bytes, stamp: float) -> Event:
     if len({address for address, _, _ in readings}) < len(readings):
         return corrupt(piece, "one anchor twice in a fix")
     return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]))
+
+
+class TlvProtocol(HeadedFrames):
+    """Bytes of the module in, blocks and Corrupt out. Holds at most one block (257 bytes)."""
+
+    lead, head_size, noise = 0x40, 5, "no TLV answer"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._inside = False
+
+    def reset(self) -> None:
+        """Forget what is half received: a request was given up, its answer must not run into the next one."""
+        super().reset()
+        self._inside = False
+
+    def frame_size(self, head: bytes) -> int:
+        """Recognise the head of an answer by the type and length of the block behind it."""
+        return 3 if _may_begin(head) else -1
+
+    def measure(self, at: int) -> int:
+        """Return the size of the head or block at `at`; 0 = wait for more bytes; -n = the first n bytes are noise."""
+        buffer = self.pending.data
+        if buffer[at] == self.lead:
+            # Bytes that were taken already are accepted as a head only together with the block that follows.
+            want = 5 if at < self.taken else 3
+            head = bytes(buffer[at : at + want])
+            return (3 if len(head) == want else 0) if _may_begin(head) else self._noise(-1)
+        if not self._inside or at < self.taken:
+            following = buffer.find(self.lead, at + 1)
+            return self._noise(at - (following if following >= 0 else len(buffer)))
+        length = block_length(bytes(buffer[at : at + 3]))
+        if length < 0:
+            return self._noise(-1)
+        end = at + 2 + length if length else len(buffer) + 1
+        broken = self.head_inside(at + 1, min(end, len(buffer)))
+        if broken:
+            return self._noise(at - broken)
+        return 0 if end > len(buffer) else end - at
+
+    def decode(self, frame: bytes, stamp: float) -> Event:
+        """Decode a head or a block."""
+        event = decode(frame, stamp)
+        self._inside = not isinstance(event, Corrupt) and not (isinstance(event, Answer) and event.error)
+        return event
+
+    def _noise(self, size: int) -> int:
+        self._inside = False
+        return size
+
+
+def _may_begin(data: bytes) -> bool:
+    """Return whether bytes can be ``40 01 error type length``, or the beginning of it."""
+    if data[:2] != b"\x40\x01"[: len(data[:2])] or (len(data) > 2 and data[2] > 5):
+        return False
+    return len(data) < 4 or (data[2] == 0 and block_length(data[3:5]) >= 0)

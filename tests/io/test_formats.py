@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from helpers.results import small_log
 
-from uwblite.cli.formats import format_of, read_graph, read_recording
 from uwblite.errors import FormatError
 from uwblite.io.carmen import write_log
 from uwblite.io.carmen_writer import scan_lines
-from uwblite.io.contents import format_of_content
+from uwblite.io.formats import format_of, format_of_content, read_graph, read_recording
 from uwblite.io.librsf import read_librsf
 
 SQUARE = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 1.57\nEDGE_SE2 0 1 1 0 1.57 10 0 0 10 0 25\n"

@@ -6,8 +6,7 @@ from helpers.example_settings import Inner, Outer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.config import field_docs, from_dict, override, parse_toml
-from uwblite.io.settings_toml import differences, to_toml, toml_value
+from uwblite.config import differences, field_docs, from_dict, override, parse_toml, to_toml, toml_value
 from uwblite.pipeline.mapping_config import MappingConfig
 
 

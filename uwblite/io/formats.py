@@ -1,17 +1,99 @@
-"""Which file is of which format, by its name and content, and who reads and writes it."""
+"""Which format a file is of, by its content first: names of files of others tell little; and who reads and writes it."""
 
+import gzip
 import os
+import re
+import zlib
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..errors import ConfigError, FormatError
+from .carmen_words import is_message_name
 
 if TYPE_CHECKING:
-    from ..io.bag_topics import BagTopics
-    from ..io.graph_file import GraphFile
-    from ..io.uwb_mapping import UwbMapping
     from ..sensor_log import SensorLog
+    from .bag_topics import BagTopics
+    from .graph_file import GraphFile
+    from .uwb_mapping import UwbMapping
 
     BagChoices = tuple[BagTopics, tuple[UwbMapping, ...]]
+
+_BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
+_RAWLOGS = (b"CObservation", b"CSensoryFrame", b"CActionCollection")
+"""Names of the classes that a binary rawlog of MRPT begins with."""
+_GZIP = b"\x1f\x8b"
+_BYTES = 1 << 16
+"""At the beginning, by which a text is told; scans before the first word of another kind are shorter."""
+_GRAPH = re.compile(rb"(VERTEX|EDGE)(2|3|_[A-Z0-9_:]+)$|EDGE_RANGE$|FIX$")
+_ISAM = {b"ODOMETRY", b"LANDMARK"}
+_LIBRSF = {b"range2", b"odom2diff", b"odom2", b"point2", b"gt2", b"range3", b"odom3"}
+_CARMEN = {b"ODOM", b"FLASER", b"PARAM", b"ROBOTLASER1", b"RAWLASER1", b"RLASER", b"UWB", b"SYNC"}
+_NAME_OF_PYFG = re.compile(rb"[A-Za-z]\d+$")
+_COLUMNS_OF_TUM = 8
+_FOREIGN_WORDS = {b"LASER_READING": "gfs", b"LaserOdometryLog": "aria", b"@SENS": "rhino", b"LASER-RANGE": "rhino"}
+"""First words of lines that only a log of another program has."""
+_PLAYER = b"## Player version"
+_LINES = 20
+"""By which a table of numbers is told."""
+
+
+def format_of_content(path: str) -> str:
+    """Return the format of a file: 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'numbers' (a table without names), or
+    'rawlog', 'player', 'gfs', 'aria', 'rhino', which are not read.
+
+    '' of what is none of them, or cannot be read. TORO files are 'g2o', whose reader takes them.
+    """
+    start = _beginning(path)
+    if start.startswith(_BAGS):
+        return "bag"
+    if any(name in start[:200] for name in _RAWLOGS):
+        return "rawlog"
+    if start.startswith(_PLAYER):
+        return "player"
+    lines = [line.split() for line in start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[:-1]]
+    lines = [words for words in lines if words and not words[0].startswith(b"#")]
+    names = {words[0] for words in lines}
+    if any(_GRAPH.match(name) for name in names):
+        named = (words for words in lines if _GRAPH.match(words[0]))
+        return "pyfg" if any(_NAME_OF_PYFG.match(word) for words in named for word in words[1:4]) else "g2o"
+    if foreign := names & set(_FOREIGN_WORDS):
+        return _FOREIGN_WORDS[min(foreign)]
+    if names & _CARMEN:
+        return "log"
+    if names & _ISAM:
+        return "isam"
+    if names & _LIBRSF:
+        return "librsf"
+    if lines and all(_is_number(word) for words in lines[:_LINES] for word in words):
+        return "tum" if all(len(words) == _COLUMNS_OF_TUM for words in lines) else "numbers"
+    return "log" if names and all(is_message_name(name) for name in names) else ""
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _beginning(path: str) -> bytes:
+    """Return the first bytes of a file, unpacked; b'' where it cannot be read. Pipes are not touched."""
+    if not os.path.isfile(path):
+        return b""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(_BYTES)
+            if not start.startswith(_GZIP):
+                return start
+            stream.seek(0)
+            with gzip.open(stream) as unpacked:
+                return unpacked.read(_BYTES)
+    except (OSError, EOFError, zlib.error):
+        return b""
+
 
 GRAPHS = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".pyfg": "pyfg"}
 """TORO files differ from g2o by their tags."""
@@ -24,8 +106,6 @@ def format_of(path: str) -> str:
 
     A name tells where it ends like one of the format; what it does not tell, and whether it is a bag, the content does.
     """
-    from ..io.contents import format_of_content
-
     if os.path.isdir(path):
         if os.path.exists(os.path.join(path, "trajectory.tum")):
             return "map"
@@ -67,32 +147,31 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     kind = format_of(path)
     scan_message = bag[0].scan if bag is not None and kind not in ("bag", "csv") else ""
     if bag is not None and kind != "bag" and (bag[1] or bag[0] != type(bag[0])(scan=scan_message)):
-        raise ConfigError(f"{path} is no ROS bag: --uwb-mapping and the topics are for bags")
+        raise ConfigError(f"{path} is no ROS bag: `mappings` and the topics are for bags")
     if kind == "csv":
-        from ..io.csv_folder import read_csv_folder
+        from .csv_folder import read_csv_folder
 
         return _with_every_nth(read_csv_folder(path), every_nth_scan)
     if kind == "bag":
-        from ..io.rosbag import read_bag
+        from .rosbag import read_bag
 
         return _with_every_nth(read_bag(path, *(bag or ())), every_nth_scan)
     if os.path.isdir(path):
         what = "holds a map, and a recording is wanted" if kind == "map" else "holds no odometry.csv and no ROS 2 bag"
         raise FormatError(f"this folder {what}", path)
     if kind == "librsf":
-        from ..io.librsf import read_librsf
+        from .librsf import read_librsf
 
         return read_librsf(path)
-    if kind in _OTHERS:
-        raise FormatError(_OTHERS[kind], path)
-    from ..io.carmen import read_log
-    from ..io.contents import format_of_content
+    if kind in _NO_RECORDING:
+        raise FormatError(_NO_RECORDING[kind], path)
+    from .carmen import read_log
 
     try:
         return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
     except FormatError as error:
         content = format_of_content(path)
-        what = _GRAPH_ALONE if kind in ("g2o", "pyfg") else _OTHERS.get(content, "")
+        what = _GRAPH_ALONE if kind in ("g2o", "pyfg") else _NO_RECORDING.get(content, "")
         raise FormatError(what, path) if what else error from None
 
 
@@ -101,9 +180,9 @@ _TABLES = (
     "a folder of tables is read, with odometry.csv (stamp,x,y,theta; m, rad; poses, not steps), scans.csv and ranges.csv"
     " (docs/formats.md)"
 )
-_OTHERS = {
+_NO_RECORDING = {
     "isam": "is a pose graph of iSAM, no recording: uwblite optimize says how to write it",
-    "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ --to csv), to which"
+    "tum": "is a trajectory, no recording: uwblite convert makes a folder of it (FILE.tum FOLDER/ `to=csv`), to which"
     " ranges.csv (stamp,anchor,range,quality) and scans.csv may be added; uwblite evaluate compares with it",
     "kitti": "is a trajectory without times, no recording",
     "rawlog": f"is a binary rawlog of MRPT, which is not read: rawlog-edit exports odometry and scans as text; {_TABLES}",
@@ -117,11 +196,7 @@ _OTHERS = {
 
 
 def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":
-    from dataclasses import replace
-
-    if log.scans is None or n == 1:
-        return log
-    return replace(log, scans=replace(log.scans, stamps=log.scans.stamps[::n], ranges=log.scans.ranges[::n].copy()))
+    return log if log.scans is None or n == 1 else replace(log, scans=log.scans.rows(np.arange(0, len(log.scans.stamps), n)))
 
 
 def graph_format(path: str) -> str:
@@ -139,8 +214,8 @@ def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
     ------
     FormatError : it is none.
     """
-    from ..io.g2o import read_g2o
-    from ..io.pyfg import read_pyfg
+    from .g2o import read_g2o
+    from .pyfg import read_pyfg
 
     kind = "g2o" if path == "-" else format_of(path)
     if kind == "pyfg":
@@ -154,8 +229,8 @@ def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
 
 def write_graph(path: str, file: "GraphFile") -> None:
     """Write a pose graph in the format of its name; g2o files get their ranges too."""
-    from ..io.g2o import write_g2o
-    from ..io.pyfg import write_pyfg
+    from .g2o import write_g2o
+    from .pyfg import write_pyfg
 
     if graph_format(path) == "pyfg":
         write_pyfg(path, file.graph, file.anchor_ids, file.stamps, pose_ids=file.pose_ids)
@@ -167,4 +242,4 @@ def refuse_existing(force: bool, *paths: str | None) -> None:
     """Refuse to replace what is there, unless forced."""
     for path in paths:
         if path and os.path.exists(path) and not force and os.path.isfile(path):
-            raise ConfigError(f"{path} exists; use --force to replace it, or another name")
+            raise ConfigError(f"{path} exists; use `force` to replace it, or another name")

@@ -1,0 +1,190 @@
+"""Checks of calibration values against what is known of them otherwise.
+
+The scale of turns, which must be one constant that no single wrong turn changes; the point about which the robot turns; the
+unit of the odometry, of which ranges, times of flight, may show another one; and the offset of the lidar's clock, which must be
+the same in all parts of a recording.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import SolverError
+from ..graph.calibration import TURNING, with_free
+from ..graph.marginals import marginals
+from ..graph.solver import Optimizer, optimize
+from ..odometry.wheels import turn_scales
+from ..problem.alternatives import EvidencePolicy
+from ..problem.evidence import log_odds_of_constant, prior_sigma, with_prior_sigma, without_prior
+from ..problem.solution import rough, stretch
+from ..sensor_log import SensorLog
+from .estimate import Estimate, Task
+from .mapping_config import MappingConfig
+from .recordings import Recording
+
+
+def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
+    """Fix each scale of turns at the lidar's from step to step, where the scale of the whole estimate contradicts it.
+
+    A turn that the wheels missed, or a heading lost in a fast turn, then stays a local error. Where the scale of the steps is
+    the larger correction, the estimate keeps its own, and the map is checked at the end: the lidar may be wrong.
+    """
+    graph = estimate.graph
+    if estimate.steps is None:
+        return estimate
+    values, fixed = graph.calibration.values.copy(), graph.fixed_calibration.copy()
+    for index, found in turn_scales(estimate.odometry, estimate.steps, graph).items():
+        if fixed[index]:
+            values[index] = found.value
+        elif found.contradicts(used := float(values[index])) and abs(found.value) < abs(used):
+            label = graph.calibration.keys[index].label
+            task.stages.note("turn-scale", name=label, by_steps=found.value, sigma=found.sigma, by_all=used)
+            values[index], fixed[index] = found.value, True
+    return replace(estimate, graph=replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed))
+
+
+def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
+    """Let the robot turn about another point than the base's origin, where the lidar seems to be mounted off its place.
+
+    Wheels that slip in turns (skid steering) have exactly the same residuals as a lidar mounted elsewhere: a base whose origin
+    is shifted has the same scans and the same wheels. So the offset h that the lidar has without slip is split by the prior
+    probabilities: p that the robot slips, 1 - p that the lidar's given mounting is wrong. Priors N(0, p h^2) of the slip
+    and N(0, (1 - p) h^2) of the mounting give mean p h and variance p (1 - p) h^2, those of the two alternatives. Where no
+    mounting is given, the base's origin is the point about which it turns.
+    """
+    graph, config = estimate.graph, task.config.calibration
+    at, slips = graph.calibration.index("laser_x"), graph.calibration.of_kinds(TURNING)
+    offset = graph.calibration.get("laser_x")
+    given = all(np.any(r.log.mounting.T_base_laser != 0.0) for r in task.recordings.each if r.has_scans)
+    if not given or not slips.any() or abs(offset) < _SMALL or graph.fixed_calibration[at]:
+        return estimate
+    if abs(offset) < _SIGNIFICANT * marginals(estimate.problem).covariances.calibration[at]:
+        return estimate
+    widths = (config.sideways_per_turn, min(_BY_TAPE, config.laser_offset), config.laser_offset)
+    slip, right, other = (np.exp(-0.5 * (offset / width) ** 2) / width for width in widths)
+    share = float(_SLIPS * slip / max(_SLIPS * slip + (1.0 - _WRONG_FRAME) * right + _WRONG_FRAME * other, _NEVER))
+    sigma = prior_sigma(graph)
+    sigma[slips] = max(abs(offset) * np.sqrt(share), _SMALL)
+    sigma[at] = max(abs(offset) * np.sqrt(1.0 - share), _SMALL)
+    estimate = replace(estimate, graph=with_free(with_prior_sigma(graph, sigma), TURNING))
+    return estimate.with_estimates_of(Optimizer().optimize(estimate.problem, task.config.solver)[0])
+
+
+_SMALL = 0.01
+"""m; a mounting, or the origin of a base, is not known better than this."""
+_BY_TAPE = 0.03
+"""Standard deviation of a mounting that is given and right, m."""
+_SIGNIFICANT = 3.0
+"""Standard deviations from which an offset of the lidar is significant."""
+_WRONG_FRAME = 0.1
+"""Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
+_NEVER = 1e-300
+"""Probability density of an offset without a known cause; it is then assigned to the mounting."""
+_SLIPS = 0.5
+"""Prior odds of a robot that slips in turns against one that does not."""
+
+
+def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
+    """Return the settings without the hypothesis that a unit of the wheels is wrong, where a lidar has measured their ways.
+
+    Ranges through walls to an anchor or two may fit wheels several times too short better than a path that is right. Lidar and
+    wheels that agree would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
+    """
+    ways = np.array([float("nan") if log.screening is None else log.screening.lidar_by_wheels for log in logs])
+    if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
+        return config
+    priors = config.calibration
+    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
+
+
+def with_given_mounting_and_clock(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
+    """Return the settings without the calibration values that the recordings fix.
+
+    Against stamps of receipt in bursts no clock has an offset, nor where a format has one clock for all. Where the poses of a
+    log are those of the laser, the laser has its place, and the point about which the robot turns is unknown instead.
+    """
+    priors = config.calibration
+    late = {sensor for log in logs if log.screening is not None for sensor in log.screening.in_bursts}
+    if late or all(log.notes.one_clock for log in logs):
+        priors = replace(priors, laser_delay=0.0, range_delay=0.0 if "odometry" in late else priors.range_delay)
+    mounted = [log.mounting for log in logs if log.scans is not None]
+    if mounted and all(mounting.laser_is_base for mounting in mounted):
+        priors = replace(priors, laser_offset=0.0)
+    return replace(config, calibration=priors)
+
+
+def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
+    """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres.
+
+    It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
+    """
+    calibration, recordings = estimate.graph.calibration, task.recordings
+    places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
+    factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
+    factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
+    other = estimate.other_heights
+    for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
+        if factor != 1.0:
+            high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
+            task.stages.note(
+                "odometry-unit",
+                recording=recording.number + 1,
+                name=recording.name if len(recordings) > 1 else "",
+                factor=factor,
+                checked=recording.has_scans or len(task.given.anchors) > 1 or bool(task.given.distances),
+                high=other.high if other is not None and high else None,
+            )
+    return factors
+
+
+def _lidar_agrees(recording: Recording, factor: float) -> bool:
+    """Return whether lidar distances that are a factor longer than the odometry's are likelier than equal ones."""
+    screening = recording.log.screening
+    ratio = float("nan") if screening is None else screening.lidar_by_wheels
+    return abs(ratio - factor) < abs(ratio - 1.0)
+
+
+_OTHER_UNIT = 0.12
+"""Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
+
+
+TOLERANCE = 0.004
+"""Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
+_PARTS = 8
+"""Parts of a recording whose offsets are compared."""
+_LEAST = 20
+"""Least number of keyframes in a part."""
+
+
+def late(estimate: Estimate, task: Task) -> float:
+    """Return by how much the lidar's clock is later than that with which the clouds were made, s; 0 where that is not shown.
+
+    Undecided, the offset stays an unknown of the problem, with its prior.
+    """
+    calibration = estimate.graph.calibration
+    at = calibration.index("laser_delay")
+    off = calibration.get("laser_delay") - estimate.lidar.delay
+    if at < 0 or estimate.graph.fixed_calibration[at] or abs(off) < TOLERANCE:
+        return 0.0
+    values, sigmas = _by_parts(estimate, at, task)
+    prior = float(prior_sigma(estimate.graph)[at])
+    return off if log_odds_of_constant(values - estimate.lidar.delay, sigmas, prior) > EvidencePolicy.positive else 0.0
+
+
+def _by_parts(estimate: Estimate, at: int, task: Task) -> tuple[Floats, Floats]:
+    """Return the offset (p,), s, that wheels and lidar show in parts of the recordings, and its standard deviation (p,)."""
+    problem, prior = estimate.problem, float(prior_sigma(estimate.graph)[at])
+    values, sigmas = [], []
+    for recording in task.following(estimate).recordings.each:
+        rows = np.arange(recording.rows.start, recording.rows.stop)
+        for part in np.array_split(rows, max(1, min(_PARTS, len(rows) // _LEAST))):
+            try:
+                alone = optimize(stretch(problem, int(part[0]), int(part[-1]) + 1), rough(task.config.solver))[0]
+                sigma = float(marginals(alone).covariances.calibration[at])
+            except SolverError:
+                continue
+            values.append(float(alone.calibration.values[at]))
+            sigmas.append(sigma)
+    return without_prior(np.array(values), np.array(sigmas), prior)
