@@ -102,7 +102,7 @@ def _drawn(poses: Floats, ranges: Ranges, wider: float = 0.0) -> tuple[NDArray[n
     gross, z = gross_share(sigma).astype(np.float32), error / sigma.astype(np.float32)
     square = z * z
     late = 0.15 * np.exp(-2.0 * np.maximum(error, 0.0)) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
-    return error, 0.7 * np.exp(-0.5 * square) + late + gross
+    return error, np.asarray(0.7 * np.exp(-0.5 * square) + late + gross, dtype=np.float32)
 
 
 def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
