@@ -22,7 +22,6 @@ from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
 from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.mapping import MappingConfig, _stages, build_map
-from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Task
 from uwblite.problem.solution import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
@@ -56,8 +55,7 @@ def ate(result, truth) -> float:
 
 
 def test_anchors_covariances_contain_the_correlated_errors_of_their_ranges(result):
-    stated = with_noise_shown(with_fewer_pairs(result.graph))
-    whole = marginals(stated).covariances.anchors
+    whole = marginals(with_fewer_pairs(result.graph)).covariances.anchors
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
     alike = anchors_with_correlated_errors(at_given_poses(result.graph), ranges, whole, MappingConfig().ranges)
     assert all(np.abs(own).max() > 1e-4 for own in alike - whole)

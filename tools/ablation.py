@@ -94,10 +94,14 @@ INGREDIENTS: dict[str, LeftOut] = {
     "columns": LeftOut(patches=(
         ("pipeline.surface_adjustment.join_circles", lambda circles, poses, config=None: np.zeros((0, 3))),
     )),
-    "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
-    "noise of wheels by residuals": LeftOut(patches=(
-        ("pipeline.final_stages.with_noise_shown", lambda graph, certainty: graph),
+    "columns fitted to all rays": LeftOut(patches=(
+        ("pipeline.surface_adjustment.fitted_columns", lambda rays, poses, columns: columns),
     )),
+    "walls that poses bend": LeftOut(patches=(
+        ("lidar.walls._halved", lambda number, *places: np.unique(number, return_inverse=True)[1]),
+    )),
+    "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
+    "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
     "points between beams": LeftOut(patches=(("lidar.beam_gaps.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),

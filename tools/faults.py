@@ -4,7 +4,7 @@
     python tools/faults.py                               3 min of a lab; writes into docs/lab/accuracy.md
     python tools/faults.py --only frozen                 cases whose names contain a word; the page stays
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
-    python tools/faults.py --sound                       sound recordings of every world: false alarms alone
+    python tools/faults.py --sound                       sound recordings of every world and robot: false alarms alone
 
 A map is wrong when its trajectory is off by more than 0.5 m (rms), or an anchor that is called ok by more than 1 m and
 three standard deviations. The truth of a real recording is its map without a fault, whose own standard deviations count as
@@ -22,6 +22,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,9 @@ from faulting.causes import causes_of
 from faulting.every import FAULTS
 from faulting.logs import two_buildings, two_robots
 from faulting.outcome import ANCHOR_BAR, CRASHED, VERDICTS, Outcome, by_kind, counted, summary
+from simulation.laser import NARROW, SPINNING, UNSTATED
 from simulation.plans import PLANS
+from simulation.real_rooms import RealRooms
 from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
@@ -50,6 +53,14 @@ from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
 
 TIME_BAR = 60.0
 """s."""
+SLIPS: dict[str, Any] = {"slips": 3, "spin": 0.6, "speed": 0.4, "scan_rate": 5.0}
+ROBOTS: dict[str, dict[str, Any]] = {
+    "": {},
+    ", spinning lidar and slips": SLIPS | {"laser": SPINNING},
+    ", narrow lidar and slips": SLIPS | {"laser": NARROW},
+    ", real rooms and people": {"rooms": RealRooms(), "people": 2, "laser": UNSTATED, "speed": 0.4, "scan_rate": 5.0},
+}
+"""Settings of robots without faults, by what is added to the name of their world; wheels slip at 0.6 m/s for seconds."""
 
 
 def sorted_log(case: Case) -> tuple[SensorLog, Floats]:
@@ -188,16 +199,16 @@ def checked(log: SensorLog, **map_says: Any) -> int:
     return 3 if diagnose(log, **map_says).doubts else 0
 
 
-def clean_cases(worlds: Sequence[str], minutes: float, seed: int) -> dict[str, Case]:
-    """Return the recordings that faults are put into, by name."""
+def clean_cases(worlds: Sequence[str], minutes: float, seed: int, robots: Sequence[str] = ("",)) -> dict[str, Case]:
+    """Return the recordings that faults are put into, by world and robot."""
     cases = {}
-    for world in worlds:
+    for world, robot in product(worlds, robots):
         if world == "kasdorf":
             cases[world] = real_case(SHARED / "kasdorf_2017-11-17-12-31-28" / "run.log.gz")
             continue
-        trial = made(Settings(world=world, minutes=minutes, seed=seed))
+        trial = made(Settings(world=world, minutes=minutes, seed=seed, **ROBOTS[robot]))
         truth = np.column_stack([np.interp(trial.log.odometry.stamps, trial.stamps, c) for c in _unwrapped(trial.poses).T])
-        cases[world] = Case(trial.log, truth, {name: [place] for name, place in trial.anchors.items()})
+        cases[world + robot] = Case(trial.log, truth, {name: [place] for name, place in trial.anchors.items()})
     return cases
 
 
@@ -252,7 +263,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--verbose", action="store_true", help="show warnings too")
     args = p.parse_args(argv)
     worlds, tasks = (args.worlds or (",".join(PLANS) if args.sound else "lab")).split(","), []
-    cases = clean_cases(worlds, args.minutes, args.seed)
+    cases = clean_cases(worlds, args.minutes, args.seed, list(ROBOTS) if args.sound else [""])
     for world, case in cases.items():
         for name, (fault, kinds) in FAULTS.items():
             if (args.sound and name != "none") or (args.only and not any(word in name for word in args.only)):

@@ -2,17 +2,25 @@
 
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import plain_ranges
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.assessment import decisions, repairs
 from uwblite.assessment.causes import EXPLAINS, explained
+from uwblite.assessment.plausibility import ResultView, _left_without
+from uwblite.assessment.range_agreement import check_range_agreement
 from uwblite.assessment.recording import diagnose
 from uwblite.findings import Finding, doubt, folded, warning
-from uwblite.mapping import build_map
+from uwblite.graph.graph import Graph
+from uwblite.map_result import AnchorEstimate
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.pipeline.estimate import Estimate
+from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import LogNotes, Odometry
 
 
@@ -51,6 +59,55 @@ def test_no_cause_explains_itself_in_a_circle():
 def test_a_fault_of_one_sensor_explains_what_that_sensor_shows(sensor, named):
     pair = [replace(doubt("clock-set-back", ""), sensor=sensor), doubt("wheels-stand-still", "")]
     assert causes(explained(pair))["wheels-stand-still"] == (("clock-set-back",) if named else ())
+
+
+@pytest.mark.parametrize(("kind", "times", "still", "named"), [
+    ("odometry-steps", ((18.0, 30.0),), set(), True), ("odometry-steps", ((60.0, 70.0),), set(), False),
+    ("ranges-disagree", (), set(), True), ("ranges-disagree", (), {("ranges-disagree", "")}, False),
+    ("free-space-violation", (), set(), False),
+])  # fmt: skip
+def test_a_cause_of_a_stretch_explains_what_goes_with_its_times(kind, times, still, named):
+    """Where both have times, these meet; where all ranges are meant, they show no more without it; nothing else."""
+    cause = replace(doubt("worse-than-parts", ""), stretches=((10.0, 20.0),))
+    found = explained([cause, replace(doubt(kind, ""), stretches=times)], lambda _: still)
+    assert causes(found)[kind] == (("worse-than-parts",) if named else ())
+
+
+def planted_view(wrong):
+    """Return what the rules look at: a path of 400 s, 1 Hz, whose ranges to two anchors are 2 m off at times (n,)."""
+    stamps = np.repeat(np.arange(400.0), 2)
+    poses = np.column_stack([0.05 * np.arange(400.0), np.zeros((400, 2))])
+    graph = Graph(poses, np.array([[5.0, 9.0], [12.0, -7.0]]))
+    pose, anchor = np.repeat(np.arange(400), 2), np.tile([0, 1], 400)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(800)
+    off = np.where(wrong[pose], 2.0, 0.0) + noise
+    ranges = plain_ranges(pose, anchor, np.hypot(*(poses[pose, :2] - graph.anchors[anchor]).T) + off, 0.1)
+    table = {
+        "stamp": stamps, "anchor": anchor.astype(float), "agrees": (np.abs(off) < 0.3).astype(float),
+        "weight": np.ones(800), "recording": np.zeros(800), "residual": off,
+    }  # fmt: skip
+    share = float(table["agrees"].mean())
+    anchors = [AnchorEstimate(n, np.zeros(2), np.eye(2), 400, share, 0.0, 0.1, 0.1, "distrusted") for n in "AB"]
+    each = [SimpleNamespace(number=0, frames=SimpleNamespace(stamps=np.arange(400.0)))]
+    recordings = type(
+        "Recordings", (), {"each": each, "__len__": lambda self: 1, "have_scans": False, "of_keyframe": np.zeros(400, int)}
+    )()
+    task = SimpleNamespace(recordings=recordings, stages=Stages(None, None), config=MappingConfig())
+    estimate = Estimate(graph, None, replace(ranges, stamps=stamps), ("A", "B"), None)
+    return ResultView(task, estimate, anchors, (), {}, table, None, 0.1)
+
+
+@pytest.mark.parametrize(("begin", "gone"), [(100.0, True), (300.0, False)])
+def test_the_rules_of_all_ranges_are_asked_again_without_the_times_of_a_cause(begin, gone):
+    """Both anchors are off from 100 to 350 s; a cause that ends there explains it where it begins there as well."""
+    time = np.arange(400.0)
+    view = planted_view((time >= 100.0) & (time < 350.0))
+    before = {(f.kind, f.anchor) for f in check_range_agreement(view.anchors, view.table, view.task)}
+    assert ("ranges-disagree", "") in before
+    cause = replace(doubt("path-displaced", ""), stretches=((begin, 350.0),), recording=1)
+    left = _left_without(view, cause)
+    assert (("ranges-disagree", "") not in left) == gone
+    assert (("anchor-distrusted", "A") not in left) == gone
 
 
 def test_every_kind_of_fact_has_a_rule_of_its_name():

@@ -1,18 +1,14 @@
 """What drifts where nothing but ranges holds the path is a doubt; each pattern by its own name."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
-from uwblite.assessment import drift_tests
-from uwblite.assessment.drift_tests import _bent, _check_scale_beside_lidar
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.mapping import build_map
-from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import Odometry
 
 
@@ -56,43 +52,6 @@ def test_a_wheel_that_slips_for_seconds(sound):
     slipped = Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))
     found = drifts(replace(sound, odometry=slipped), "odometry-slips")
     assert [n.figures["turn"] for n in found if "in some metres" in n.text] == [pytest.approx(0.6, abs=0.2)]
-
-
-@pytest.mark.parametrize(("value", "sigma", "off", "doubted"), [
-    (0.08, 0.03, 0.26, True), (-0.1, 0.03, 0.26, True),
-    (0.06, 0.01, 0.9, False), (0.1, 0.05, 0.9, False), (0.2, 0.01, 0.24, False),
-])  # fmt: skip
-def test_wheels_that_drift_are_a_doubt_beside_a_lidar_where_they_bend_the_path(monkeypatch, value, sigma, off, doubted):
-    """By 7 % and 2.5 standard deviations, and a quarter of a metre: the second of two recordings."""
-    asked = []
-
-    def found(graph, wheels, growth):
-        asked.append(growth)
-        moves = np.zeros((2, 20, 2))
-        moves[1, 10:, 1] = off * np.where(np.arange(10) % 2, 1.0, -1.0)
-        return np.array([0.0, value]), np.array([0.01, sigma]), moves
-
-    monkeypatch.setattr(drift_tests, "added_unknown_and_moves", found)
-    monkeypatch.setattr(drift_tests, "with_fewer_pairs", lambda graph: graph)
-    monkeypatch.setattr(drift_tests, "_growth", lambda graph, wheels, since: since)
-    frames = SimpleNamespace(stamps=np.arange(10.0))
-    each = [SimpleNamespace(rows=slice(10 * k, 10 * k + 10), frames=frames) for k in range(2)]
-    graph = SimpleNamespace(poses=np.column_stack([np.tile(np.arange(10.0), 2), np.zeros((20, 2))]))
-    stages = Stages(None, None)
-    recordings = SimpleNamespace(each=each, stamps=np.zeros(20))
-    stages.findings.extend(_check_scale_beside_lidar(graph, None, recordings, SimpleNamespace(stages=stages)))
-    assert [doubt.kind for doubt in stages.doubts] == ["drift"] * doubted
-    np.testing.assert_allclose(asked[0], np.kron(np.eye(2), np.linspace(-0.5, 0.5, 10)))
-    assert not doubted or f"by {value:+.0%}" in stages.doubts[0].text
-
-
-def test_a_path_that_is_moved_or_turned_as_a_whole_is_not_bent():
-    rng = np.random.default_rng(0)
-    places = 5.0 * rng.standard_normal((40, 2))
-    turned = 0.01 * (places @ [[0.0, 1.0], [-1.0, 0.0]]) + [3.0, -2.0]
-    assert _bent(places, turned) == pytest.approx(0.0, abs=1e-9)
-    longer = 0.1 * (places - places.mean(axis=0))
-    assert _bent(places, turned + longer) == pytest.approx(np.sqrt(np.mean(np.sum(longer**2, axis=1))), rel=1e-9)
 
 
 def with_steps(log, change):

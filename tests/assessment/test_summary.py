@@ -25,7 +25,6 @@ from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
 from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.floor import with_noise_shown
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import preset
 from uwblite.radio.bootstrap_attempt import BootstrapResult
@@ -184,7 +183,7 @@ def test_calibration_that_is_switched_off_is_not_listed(run):
 def test_without_lidar_what_ranges_err_alike_is_stated(run):
     """Errors of 6 cm by direction and distance are in no residual; they count once in the sigmas."""
     result = run[-1]
-    unaware = marginals(with_noise_shown(result.graph))
+    unaware = marginals(result.graph)
     one, other = (np.einsum("kii->k", c[1:, :2, :2]) for c in (result.keyframe_covariances, unaware.covariances.poses))
     # Those of poses between the ones along the path that are computed are interpolated.
     computed = np.unique(np.linspace(0, len(one), 60).round().astype(int))[1:] - 1

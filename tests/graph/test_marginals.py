@@ -9,7 +9,7 @@ from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_syst
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
 from uwblite.graph.joint_covariance import JointCovariance
-from uwblite.graph.marginals import CommonErrors, about_best_fit, added_unknown, added_unknown_and_moves, marginals, shape_error
+from uwblite.graph.marginals import CommonErrors, about_best_fit, added_unknown, marginals, shape_error
 from uwblite.graph.solver import optimize
 from uwblite.graph.variance_components import variances_of_kinds
 
@@ -141,16 +141,6 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
     assert np.abs(found).max() > 1e-3
 
 
-def test_redundancy_is_the_diagonal_of_the_dense_projection():
-    graph, _ = calibrated_loop(n=40)
-    jacobian, _, parts = dense_jacobian(graph)
-    checked = 1.0 - np.einsum("mu,uv,mv->m", jacobian, np.linalg.inv(jacobian.T @ jacobian), jacobian)
-    found = marginals(graph)
-    for edges, part in zip(graph.edges, parts, strict=True):
-        np.testing.assert_allclose(found.redundancy(edges).ravel(), checked[part], atol=1e-7)
-    assert checked.sum() == pytest.approx(len(checked) - jacobian.shape[1])
-
-
 def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
     """Errors drawn from a covariance of no structure, small beside the path; a similarity is z -> a z + b."""
     rng = np.random.default_rng(2)
@@ -231,16 +221,3 @@ def test_a_planted_one_is_found():
     # All residuals grew by half of the pattern: half of a unit less is what takes it off.
     np.testing.assert_allclose(before - after, 0.5, rtol=0.02)
     assert sigma[0] > 0.0
-
-
-def test_the_places_are_said_that_poses_would_have_with_it():
-    graph = loop()[0]
-    graph = optimize(replace(graph, fixed_poses=np.arange(len(graph.poses)) == 0))[0]
-    ranges, odd = graph.edges[2], np.sin(np.arange(len(graph.edges[2])))[:, None]
-    values, sigmas, moves = added_unknown_and_moves(graph, ranges, 2.0 * odd[None])
-    np.testing.assert_array_equal(added_unknown(graph, ranges, 2.0 * odd[None]), [values, sigmas])
-    with_it = replace(ranges, ranges=ranges.ranges - values[0] * 2.0 * odd[:, 0] * ranges.sigma)
-    expected = (optimize(replace(graph, edges=(*graph.edges[:2], with_it)))[0].poses - graph.poses)[:, :2]
-    assert np.abs(expected).max() > 5e-4
-    # To first order, and with the robust weights as they stand.
-    np.testing.assert_allclose(moves[0], expected, atol=0.15 * np.abs(expected).max())

@@ -59,7 +59,7 @@ def test_rays_make_covariances_smaller_in_whatever_frame_the_map_is(around):
     for motion in (np.zeros(3), np.array([30.0, -7.0, 2.0])):
         graph = moved(replace(after.graph, edges=(*after.odometry_and_ranges, after.joint)), motion)
         stated, rays = for_covariances(after.surfaces, graph, task)
-        found.append(marginals(stated, further=rays.equations).covariances)
+        found.append(marginals(stated, further=rays).covariances)
     plain = marginals(replace(after.graph, edges=(*after.odometry_and_ranges, after.joint))).covariances
     sizes = [np.sqrt(np.trace(c.poses[1:, :2, :2], axis1=1, axis2=2)) for c in (*found, plain)]
     np.testing.assert_allclose(sizes[1], sizes[0], rtol=1e-4)
@@ -73,7 +73,7 @@ def test_rays_say_nothing_of_where_the_whole_map_is_and_how_it_is_turned(around)
     graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint), fixed_poses=free)
     stated, rays = for_covariances(after.surfaces, graph, around["task"])
     unknowns = filled(stated, subtrees=True).unknowns
-    found, number = rays.equations(unknowns), unknowns.number["poses"]
+    found, number = rays(unknowns), unknowns.number["poses"]
     for motion in np.eye(3):
         of_poses = np.tile(motion, (len(number), 1)) + motion[2] * np.column_stack(
             [-graph.poses[:, 1], graph.poses[:, 0] + 60.0, np.zeros(len(number))]
@@ -113,7 +113,7 @@ def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(arou
     graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
     stated, rays = for_covariances(after.surfaces, graph, task)
     unknowns = filled(stated, subtrees=True).unknowns
-    found, moves, heading = rays.equations(unknowns), np.zeros(unknowns.size + 1), graph.poses[:, 2]
+    found, moves, heading = rays(unknowns), np.zeros(unknowns.size + 1), graph.poses[:, 2]
     moves[unknowns.number["poses"]] = -np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
     moves[unknowns.number["calibration"][graph.calibration.index("laser_x")]] = 1.0
     assert np.abs(found.among @ moves[:-1]).max() < 1e-9 * np.abs(found.among).max()
@@ -133,13 +133,3 @@ def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, m
     found = adjust_surfaces(before, around["task"])
     assert found.surfaces is None
     assert before.problem.chi2() > found.problem.chi2() >= optimize(found.problem)[0].chi2() * (1.0 - 1e-6)
-
-
-def test_where_all_surfaces_turn_out_to_be_none_pairs_are_left_alone(around, monkeypatch):
-    def nothing(measured, *_):
-        return replace(measured, rays=measured.rays.rows(slice(0))).shown()
-
-    monkeypatch.setattr(surface_adjustment, "with_round_columns", nothing)
-    found = adjust_surfaces(around["before"], around["task"])
-    assert found.surfaces is None
-    np.testing.assert_array_equal(found.joint.T_i_j, around["before"].joint.T_i_j)

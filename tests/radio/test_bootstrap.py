@@ -15,7 +15,7 @@ from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import bootstrap
 from uwblite.radio.bootstrap import bootstrap_graph
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -40,11 +40,9 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     attached = attach_ranges(radio, wheels, frames, mounting)
     edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), TrilaterationConfig())
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
-    config = BootstrapConfig(range_sigma=1.5 * SIGMA)
-    bootstrapped = bootstrap_graph(
-        graph, wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path, config, TrilaterationConfig()
-    )
-    return bootstrapped, frames.stamps
+    measured = Measured(wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path)
+    found = bootstrap_graph(graph, measured, BootstrapConfig(range_sigma=1.5 * SIGMA), TrilaterationConfig())
+    return found, frames.stamps
 
 
 def judged(bootstrapped, keyframe_stamps, stamps, truth, places) -> tuple[float, float]:
@@ -233,7 +231,7 @@ class Tried(Attempt):
     misfits: ClassVar[dict[float, tuple[float, ...]]] = {}
     known: ClassVar[dict[float, float]] = {}
 
-    def __init__(self, graph, odometry, ranges, path, config, search, without=None):
+    def __init__(self, graph, measured, config, search, without=None):
         self.first, self.known = (0, 50), type(self).known if without is None else {}
         self.slipping, self.path, self.config, self.low, self.high = without is not None, np.arange(401.0), config, 0, 0
         self.heading, self.slips = float(graph.calibration.values[0]), np.zeros(400)
@@ -282,5 +280,5 @@ def test_a_heading_error_is_given_up_where_it_cannot_win(monkeypatch, misfits, w
     monkeypatch.setattr(Tried, "known", {})
     turns = [u for u in unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)) if u.key.kind == "heading_scale"]
     graph = Graph(np.zeros((2, 3)), np.zeros((0, 2)), (), block(turns))
-    assert bootstrap_graph(graph, None, None, None, BootstrapConfig(), None) == wins
+    assert bootstrap_graph(graph, None, BootstrapConfig(), None) == wins
     assert {heading: Tried.known[heading] for heading in known} == known

@@ -9,7 +9,8 @@ from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig
+from uwblite.odometry.slips import EVERY, LASTS
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, Measured
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 
 
@@ -97,10 +98,9 @@ def along_a_line(poses=12, sigma=0.1):
     pose, anchor = np.repeat(np.arange(poses), 2), np.tile([0, 1], poses)
     distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
     graph = Graph(truth, anchors)
-    attempt = Attempt(
-        graph, chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma), np.arange(float(poses)),
-        BootstrapConfig(range_sigma=sigma), TrilaterationConfig(),
-    )  # fmt: skip
+    wheels, radio = chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma)
+    measured = Measured(wheels, radio, np.arange(float(poses)))
+    attempt = Attempt(graph, measured, BootstrapConfig(range_sigma=sigma), TrilaterationConfig())
     attempt.placed[:] = True
     return attempt, truth
 
@@ -158,10 +158,8 @@ def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
 
     truth = np.column_stack([np.arange(41.0), np.zeros((41, 2))])
     ranges_to = plain_ranges(np.arange(41), np.arange(41) % 2, np.ones(41), 0.1)
-    attempt = Seeded(
-        Graph(truth, np.zeros((2, 2))), chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0),
-        BootstrapConfig(range_sigma=0.1), TrilaterationConfig(),
-    )  # fmt: skip
+    measured = Measured(chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0))
+    attempt = Seeded(Graph(truth, np.zeros((2, 2))), measured, BootstrapConfig(range_sigma=0.1), TrilaterationConfig())
     length = attempt._seed()
     # 25 m at both ends and between, then 10 and 4 m, then all: none is worth 0.35 for each of two anchors.
     assert [(low, high) for low, high, _ in tried[:2]] == [(0, 26), (15, 41)]
@@ -204,3 +202,33 @@ def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low
     assert (attempt.low, attempt.high) == (min(low, first), max(high, last))
     known = slice(attempt.low, attempt.high)
     np.testing.assert_allclose(se2.between(truth[known], attempt.poses[known]), 0.0, atol=1e-9)
+
+
+def with_measured(attempt, change):
+    """Return the attempt, all of it known, with other ranges (m,)."""
+    attempt.low, attempt.high = 0, len(attempt.path)
+    attempt.ranges = replace(attempt.ranges, ranges=change(attempt.ranges.ranges))
+    return attempt
+
+
+def test_false_ranges_cost_an_attempt_no_more_than_that_they_are_false():
+    """However false they are: the distribution of an anchor's errors has a uniform rest, whose width they set."""
+    rng = np.random.default_rng(4)
+    noise, false = 0.1 * rng.standard_normal(80), np.arange(80) % 8 == 0
+    evidence = [
+        with_measured(along_a_line(poses=40)[0], lambda r, off=off: np.abs(r + noise - off * false)).evidence()
+        for off in (0.0, 1.5, 3.0)
+    ]
+    # A false range of a tenth of them, within metres: log(0.1 / W) in place of about log(1 / 0.25 m).
+    assert evidence[0] - evidence[1] < 6.0 * false.sum()
+    assert abs(evidence[1] - evidence[2]) < 1.0 * false.sum()
+
+
+def test_neighbouring_ranges_count_once_in_the_evidence_and_every_slip_has_its_prior():
+    attempt = with_measured(along_a_line(poses=40)[0], lambda r: r + 0.05)
+    once, every = attempt.evidence(), np.repeat(np.arange(len(attempt.ranges)), 10)
+    attempt.ranges, attempt.live = attempt.ranges.rows(every), np.repeat(attempt.live, 10)
+    assert abs(attempt.evidence() - once) < 1.1 * abs(once)
+    before = attempt.evidence()
+    attempt.slips[[5, 20]] = 1.0
+    assert attempt.evidence() < before - 2.0 * np.log(EVERY / LASTS)

@@ -107,3 +107,9 @@ def test_a_run_of_some_cases_leaves_the_page(monkeypatch, options, written):
 
 def test_every_fault_is_tried_with_sensors_that_exist():
     assert all(set(sensors) <= set(SENSORS) for _, sensors in FAULTS.values())
+
+
+def test_sound_recordings_are_of_every_robot():
+    cases = faults.clean_cases(["room"], 0.2, 1, list(faults.ROBOTS))
+    assert set(cases) == {"room" + robot for robot in faults.ROBOTS}
+    assert len({case.log.scans.ranges.shape[1] for case in cases.values()}) == len(cases)

@@ -1,15 +1,18 @@
 """Causes before consequences: which finding explains which, and the order in which they are told.
 
 A fault of the data shows in many places: a clock that was set back bends the path, moves anchors and scatters ranges. Each rule
-says what it sees; here every consequence names its cause. Nothing is left out, and no severity changes: removing the cause
-from the data would remove the consequence as well, unless it has another cause besides.
+says what it sees; here every consequence names its cause. Nothing is left out, and no severity changes. The table says what a
+cause may explain; it does where both are of one recording, anchor and time, and where what is found in all ranges is found no
+more once the times of the cause are left out. A cause without times concerns all readings of its sensor.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
 from ..findings import SEVERITIES, Finding
+
+Stretches = tuple[tuple[float, float], ...]
 
 
 def _of(*kinds: str | frozenset[str]) -> frozenset[str]:
@@ -89,32 +92,56 @@ _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
 _RANK = {kind: number for number, kind in enumerate(EXPLAINS)}
 
 
-def explained(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+Left = Callable[[Finding], Container[tuple[str, str]]]
+"""Returns the kinds and anchors of what is still found in all ranges where the times of a cause are left out."""
+FOUND_AGAIN = frozenset({"range-scatter", "ranges-disagree", "anchor-distrusted"})
+"""Kinds that `Left` seeks again."""
+
+
+def explained(findings: Iterable[Finding], left: Left = lambda cause: ()) -> tuple[Finding, ...]:
     """Return findings with their causes named, in the order in which they are told.
 
     Worst first; among those of one severity causes come before what they explain, and a finding that nothing explains before
     those that something does.
     """
     given = tuple(findings)
-    named = [replace(f, explained_by=_causes(f, given)) for f in given]
+    named = [replace(f, explained_by=_causes(f, given, left)) for f in given]
     return tuple(sorted(named, key=_place))
 
 
-def _causes(finding: Finding, findings: Iterable[Finding]) -> tuple[str, ...]:
+def _causes(finding: Finding, findings: Iterable[Finding], left: Left) -> tuple[str, ...]:
     """Return the kinds of the findings that explain one, the first cause first."""
-    causes = {cause.kind for cause in findings if _explains(cause, finding)}
+    causes = {cause.kind for cause in findings if _may_explain(cause, finding) and _gone_without(cause, finding, left)}
     return tuple(sorted(causes, key=_RANK.__getitem__))
 
 
-def _explains(cause: Finding, finding: Finding) -> bool:
-    """Return whether a finding is a consequence of another one, of the same recording, anchor and time where they have such."""
+def _gone_without(cause: Finding, finding: Finding, left: Left) -> bool:
+    """Return whether a finding goes with the readings of a cause: with all of its sensor, or with those of its times."""
+    if not cause.stretches or finding.stretches:
+        return True
+    return finding.kind in FOUND_AGAIN and (finding.kind, finding.anchor) not in left(cause)
+
+
+def _may_explain(cause: Finding, finding: Finding) -> bool:
+    """Return whether a finding may be a consequence of another, of its recording, anchor and time where both have such."""
     if finding.kind not in EXPLAINS.get(cause.kind, ()) or _RANK[cause.kind] >= _RANK.get(finding.kind, len(_RANK)):
         return False
     if finding.kind not in _SHOWN_BY.get(cause.sensor, (finding.kind,)):
         return False
     if cause.recording and finding.recording and cause.recording != finding.recording:
         return False
+    if cause.stretches and finding.stretches and not _meet(cause.stretches, finding.stretches):
+        return False
     return not (cause.anchor and finding.anchor and cause.anchor != finding.anchor)
+
+
+def _meet(some: Stretches, others: Stretches) -> bool:
+    """Return whether one of some stretches meets one of others, s."""
+    return any(a <= end + _AFTER and begin <= b + _AFTER for a, b in some for begin, end in others)
+
+
+_AFTER = 5.0
+"""Time that a fault shows in readings after it, s: medians, keyframes, ranges one by one."""
 
 
 def _place(finding: Finding) -> tuple[int, bool, int]:

@@ -80,7 +80,7 @@ def path_displaced(
         "there again, or map the parts before and after separately"
     )
     figures = {"recording": recording, "begin": stretch[0], "end": stretch[1], "apart": apart}
-    return Finding("path-displaced", DOUBT, text, recording=recording, figures=figures)
+    return Finding("path-displaced", DOUBT, text, stretches=(stretch,), recording=recording, figures=figures)
 
 
 def worse_than_parts(recording: int, stretch: tuple[float, float], start: float, off: float, turned: float) -> Finding:

@@ -14,9 +14,8 @@ import numpy as np
 from ..arrays import Floats
 from ..findings import Finding, doubt
 from ..graph.graph import Edges, Graph, edge_weights
-from ..graph.marginals import added_unknown, added_unknown_and_moves
+from ..graph.marginals import added_unknown
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..lidar.joint_refinement import with_fewer_pairs
 from ..odometry.wheels import TurnScale, turn_scales
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
@@ -31,8 +30,6 @@ Faultless recordings, 30 of simulated and three of real places, have up to 0.24 
 _TURN, _TURN_SIGMAS = 0.3, 4.0
 """rad by which turns are wrong over a short stretch, and standard deviations. Faultless recordings, 30 of simulated and three
 of real places, have up to 3.6 sigma with 0.22 rad, the largest of about forty stretches in each."""
-_MISPLACED = 0.25
-"""m, rms, by which a path is bent whose map is doubted: half of the error that makes a map wrong."""
 _WAY, _MOST = 8, 128
 """Steps of such a stretch, 2.4 m, and number of stretches that are tested: those on which the turns fit worst."""
 _STEP = 1e-4
@@ -40,12 +37,9 @@ _STEP = 1e-4
 
 
 def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Doubt a map without lidar in which ranges or wheels drift; with a lidar, one that drifting wheels have displaced much."""
+    """Doubt a map without lidar in which ranges or wheels drift."""
     graph, ranges, wheels, rec = estimate.graph, estimate.ranges, estimate.odometry, task.recordings
-    if ranges is None or not len(wheels) or not estimate.placed.any():
-        return
-    if rec.have_scans:
-        yield from _check_scale_beside_lidar(graph, wheels, rec, task)
+    if ranges is None or not len(wheels) or not estimate.placed.any() or rec.have_scans:
         return
     for recording in rec.each:
         since = _age(recording, rec)
@@ -76,32 +70,6 @@ def _growth(graph: Graph, wheels: OdometryEdges, since: Floats) -> Floats:
     """Return the change (e, 3) of the wheels' residuals by a scale that grows by 1 over a recording."""
     motion = wheels.motion * (1.0 + _STEP * since[wheels.i, None] * np.array([1.0, 1.0, 0.0]))
     return _change(graph, wheels, replace(wheels, motion=motion))
-
-
-def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordings, task: Task) -> Iterator[Finding]:
-    """Doubt a map whose wheels change their scale, where a map without that change has another shape.
-
-    A lidar that sees walls determines the map whatever the wheels count. In a large hall it sees none for most of the time.
-    """
-    fewer = with_fewer_pairs(graph)
-    growth = np.stack([_growth(fewer, wheels, _age(recording, rec)) for recording in rec.each])
-    values, sigmas, moves = added_unknown_and_moves(fewer, wheels, growth)
-    for recording, value, sigma, moved in zip(rec.each, values.tolist(), sigmas.tolist(), moves, strict=True):
-        off = _bent(graph.poses[recording.rows, :2], moved[recording.rows])
-        if abs(value) > max(_SCALE, _SIGMAS * sigma) and off > _MISPLACED:
-            why = (
-                f"{_scale_text(value)}, and the lidar sees too little to hold the path, which that bends by {off:.1f} m (rms): "
-                "drive nearer to walls, or map the parts before and after separately"
-            )
-            yield doubt("drift", why, value=value, sigma=sigma, bent=off)
-
-
-def _bent(places: Floats, moved: Floats) -> float:
-    """Return the rms of moves (k, 2) of places (k, 2), m, without the shift and the turn of the whole."""
-    about = places - places.mean(axis=0)
-    whole = np.column_stack([np.tile(np.eye(2), (len(about), 1)), (about @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()])
-    left = moved.ravel() - whole @ np.linalg.lstsq(whole, moved.ravel(), rcond=None)[0]
-    return float(np.sqrt(np.sum(left**2) / len(places)))
 
 
 def _check_turns(graph: Graph, wheels: OdometryEdges, rec: Recordings) -> Iterator[Finding]:

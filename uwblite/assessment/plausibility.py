@@ -4,7 +4,8 @@ Each rule yields findings; docs/findings.md describes their kinds.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,9 +22,9 @@ from .causes import explained
 from .certainty import check_certainty, check_other_side
 from .decisions import RULES
 from .drift_tests import check_drifts, check_turn_scales
-from .range_agreement import check_range_agreement, check_wheels_against_lidar
+from .range_agreement import DISAGREE, check_range_agreement, check_wheels_against_lidar
 from .repairs import check_recordings, say
-from .residual_tests import check_residuals
+from .residual_tests import check_range_scatter, check_residuals
 from .untied_parts import check_untied_parts, check_untied_recordings
 
 _UNUSUAL = 3.0
@@ -85,7 +86,29 @@ def judge(view: ResultView) -> None:
     findings = view.task.stages.findings
     for rule in RESULT_RULES:
         findings.extend(rule(view))
-    findings[:] = explained(findings)
+    findings[:] = explained(findings, partial(_left_without, view))
+
+
+def _left_without(view: ResultView, cause: Finding) -> set[tuple[str, str]]:
+    """Return kind and anchor of what remains of the findings about all ranges where the times of a cause are left out."""
+    ranges, table = view.estimate.ranges, view.table
+    if ranges is None:
+        return set()
+    during = np.zeros(len(ranges), dtype=bool)
+    for begin, end in cause.stretches:
+        during |= (table["stamp"] >= begin) & (table["stamp"] <= end)
+    kept = np.flatnonzero(~during | ((table["recording"] != cause.recording - 1) & (cause.recording > 0)))
+    table = {name: column[kept] for name, column in table.items()}
+    anchors = []
+    for k, anchor in enumerate(view.anchors):
+        agrees = table["agrees"][table["anchor"] == k]
+        share = float(agrees.mean()) if len(agrees) else 1.0
+        well = anchor.status == "distrusted" and share >= DISAGREE
+        anchors.append(replace(anchor, used_share=share, status="ok" if well else anchor.status))
+    estimate = replace(view.estimate, ranges=ranges.rows(kept))
+    scatter = check_range_scatter(estimate, table["residual"], view.grid, view.task)
+    found = [*scatter, *check_range_agreement(anchors, table, view.task), *check_anchors(anchors)]
+    return {(finding.kind, finding.anchor) for finding in found}
 
 
 def check_repairs(task: Task) -> list[Finding]:
@@ -104,7 +127,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate]) -> Iterator[Finding]:
         if anchor.status != "ok":
             add = doubt if anchor.status == "mirror-ambiguous" and unclear else warning
             text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
-            yield add(f"anchor-{anchor.status}", text, anchor=anchor.id)
+            yield replace(add(f"anchor-{anchor.status}", text, anchor=anchor.id), anchor=anchor.id)
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone; drive curves near the anchors"
         yield doubt("no-anchor", text)

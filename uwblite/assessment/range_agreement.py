@@ -61,6 +61,8 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
         yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
 
 
+DISAGREE = 0.5
+"""Share of an anchor's ranges that agree with the map, below which it is distrusted."""
 _LEAST_AGREEING = 0.3
 """Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
 

@@ -20,6 +20,7 @@ from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
 from ..sensor_log.sensors import name_and_number
 from . import plausibility
+from .range_agreement import DISAGREE
 from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor")
@@ -28,8 +29,6 @@ _SHORT = 0.5
 """m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
 _FEW_SHORT, _SHARE_SHORT = 3, 0.05
 """Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
-_AGREE = 0.5
-"""Share of an anchor's ranges that must agree with the map."""
 _IMPLAUSIBLE_BIAS = 1.6
 """Constant error of an anchor's ranges, m, twice that of the worst radios: its place is more probably wrong."""
 _SHOWN = 0.7
@@ -169,7 +168,7 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
         range, m: it stands nearer than that, and with a larger uncertainty the place is unknown. bias : constant error, m.
         scatter : robust standard deviation of its ranges about the map, m.
     """
-    if used < _AGREE:
+    if used < DISAGREE:
         return f"only {used:.0%} of its ranges agree with the map"
     if not sigma < longest:
         return f"its place is known to {sigma:.3g} m only, and its longest range is {longest:.1f} m"

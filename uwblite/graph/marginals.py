@@ -178,23 +178,6 @@ class Marginals:
         ends = np.cumsum([part.size for part in rows.values()])[:-1]
         return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
 
-    def redundancy(self, edges: Edges) -> Floats:
-        """Return the redundancy of each residual (e, d) of some of the graph's edges: 0 = not checked by others, 1 = fully.
-
-        1 - w j H^-1 j^T for each row j of the Jacobian (W. Baarda, A testing procedure for use in geodetic networks, 1968):
-        the sum over residuals is what the sum of their squares is expected to be.
-        """
-        blocks = edges.linearize(self._graph).blocks
-        number = np.concatenate([self.unknowns.number[name][index] for name, index, _ in blocks], axis=1)
-        jacobian = np.concatenate([own for *_, own in blocks], axis=2)
-        row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
-        free = (row >= 0) & (column >= 0)
-        covariance = np.zeros(row.shape)
-        covariance[free] = selected_inverse(self._factor, row[free], column[free])
-        explained = np.einsum("edk,ekl,edl->ed", jacobian, covariance, jacobian)
-        # In undetermined directions the covariance is rounding error.
-        return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
-
     def solve(self, right: Floats) -> Floats:
         """Return H^-1 times right (size, m)."""
         return np.asarray(self._factor.solve(right))
@@ -247,11 +230,6 @@ _COLUMNS_AT_ONCE = 16
 
 
 def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats]:
-    """Return values and standard deviations of further unknowns; see added_unknown_and_moves."""
-    return added_unknown_and_moves(graph, edges, shifts)[:2]
-
-
-def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats, Floats]:
     """Estimate, each alone, further unknowns of some edges of an optimised graph, to first order.
 
     With J, r and W of the whole graph and s the change of the residuals by one unit of the unknown: its value is -b / a and its
@@ -264,8 +242,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
 
     Returns
     -------
-    (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly. And
-    (k, p, 2) the changes of the poses' places with each value, m.
+    (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly.
     """
     normal = filled(graph, subtrees=True)
     lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
@@ -281,9 +258,7 @@ def added_unknown_and_moves(graph: Graph, edges: Edges, shifts: Floats) -> tuple
     score = np.einsum("ked,ed->k", weighted, lin.residuals) - solved.T @ normal.gradient
     seen = left > _ROUNDING * total
     divisor = np.where(seen, left, 1.0)
-    values = np.where(seen, -score / divisor, 0.0)
-    places = np.append(solved, np.zeros((1, len(shifts))), axis=0)[normal.unknowns.number["poses"][:, :2]]
-    return values, np.where(seen, 1.0 / np.sqrt(divisor), np.inf), -values[:, None, None] * np.moveaxis(places, 2, 0)
+    return np.where(seen, -score / divisor, 0.0), np.where(seen, 1.0 / np.sqrt(divisor), np.inf)
 
 
 _ROUNDING = 1e-9

@@ -116,10 +116,8 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
 
 def _products(rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> Floats:
     """Return for each group the sums (g, 8, 8) of products of derivatives by the pose (3), by the surface (4), and residual."""
-    curved = bool(found.surfaces.round[rays.surface[0]])
-    share, narrow = 1.0 / (found.noise.ratio**2 * found.noise.alike[int(curved)]), 1.0 / (kernel * found.noise.ratio) ** 2
-    sums = _sums_on_columns if curved else _sums_on_walls
-    return sums(rays, first, found.surfaces, sensors, poses, share, narrow)
+    sums = _sums_on_columns if found.surfaces.round[rays.surface[0]] else _sums_on_walls
+    return sums(rays, first, found, sensors, poses, kernel)
 
 
 def _groups(rays: SurfaceRays) -> Ints:
@@ -130,15 +128,15 @@ def _groups(rays: SurfaceRays) -> Ints:
 
 
 def _sums_on_columns(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
+    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
 ) -> Floats:
-    lines = linearized(rays, surfaces, sensors, poses)
+    lines, (share, narrow) = linearized(rays, found.surfaces, sensors, poses), found.noise.weights(True, kernel)
     rows = np.column_stack([lines.by_pose, lines.by_surface, lines.residual])
     rows *= (np.sqrt(share) / (1.0 + lines.residual**2 * narrow))[:, None]
-    found = np.empty((len(first), 8, 8))
+    products = np.empty((len(first), 8, 8))
     for a in range(8):
-        found[:, a, a:] = found[:, a:, a] = np.add.reduceat(rows[:, a:] * rows[:, a, None], first, axis=0)
-    return found
+        products[:, a, a:] = products[:, a:, a] = np.add.reduceat(rows[:, a:] * rows[:, a, None], first, axis=0)
+    return products
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,24 +180,24 @@ def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Float
 
 
 def _sums_on_walls(
-    rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats, share: float, narrow: float
+    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
 ) -> Floats:
-    on = _at_walls(rays, first, surfaces, sensors)
+    on, (share, narrow) = _at_walls(rays, first, found.surfaces, sensors), found.noise.weights(False, kernel)
     weight = share * on.information / (1.0 + on.residual**2 * on.information * narrow) ** 2
     should_end = on.along - on.residual / on.incidence * on.sideways
     parts = np.stack([np.ones(len(weight)), should_end, on.incidence, on.residual])
-    found = np.empty((len(first), 4, 4))
+    products = np.empty((len(first), 4, 4))
     for a in range(4):
         weighted = weight * parts[a]
         for b in range(a, 4):
-            found[:, a, b] = found[:, b, a] = np.add.reduceat(weighted * parts[b], first)
+            products[:, a, b] = products[:, b, a] = np.add.reduceat(weighted * parts[b], first)
     arm = (sensors - poses)[rays.keyframe[first], :2]
     by_part = np.zeros((len(first), 8, 4))
     by_part[:, :2, 0] = on.normal
     by_part[:, 2, 0] = on.normal[:, 1] * arm[:, 0] - on.normal[:, 0] * arm[:, 1]
     by_part[:, 3, 0], by_part[:, 4, 0] = on.beside, -1.0
     by_part[:, 2, 1], by_part[:, 3, 1], by_part[:, 5, 2], by_part[:, 7, 3] = -1.0, 1.0, -1.0, 1.0
-    return np.asarray(by_part @ found @ by_part.transpose(0, 2, 1))
+    return np.asarray(by_part @ products @ by_part.transpose(0, 2, 1))
 
 
 def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayNoise:
@@ -207,22 +205,6 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
     shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts(surfaces)]
     residual, place = (np.concatenate(part) for part in zip(*shown, strict=True))
     return learnt_noise(residual, place, rays.surface, surfaces.round)
-
-
-def misfit(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> Floats:
-    """Return the rms residual (s,) of the rays of each surface, relative to the learnt noise; 1 where the surface has the
-    assumed shape."""
-    many = len(found.surfaces.facing)
-    count, squares = np.zeros(many), np.zeros(many)
-    for rays in found.rays.in_parts(found.surfaces):
-        residual = _shown(rays, found.surfaces, sensors, poses)[0] / found.noise.ratio
-        count += np.bincount(rays.surface, minlength=many)
-        squares += np.bincount(rays.surface, np.minimum(residual**2, _CLIP**2), many)
-    return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
-
-
-_CLIP = 5.0
-"""Standard deviations of a residual beyond which it does not count."""
 
 
 def _shown(

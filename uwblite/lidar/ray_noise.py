@@ -42,6 +42,11 @@ class RayNoise:
     alike: Floats
     """(2,) design effect of rays on walls and on columns, 1 or more."""
 
+    def weights(self, curved: bool, kernel: float) -> tuple[float, float]:
+        """Return the information of a ray on a wall or a column relative to that by data sheets, and the inverse square of the
+        width of a robust kernel, of so many standard deviations, on residuals by data sheets."""
+        return 1.0 / (self.ratio**2 * float(self.alike[int(curved)])), 1.0 / (kernel * self.ratio) ** 2
+
 
 UNLEARNT = RayNoise(1.0, np.full(2, ALIKE))
 

@@ -144,12 +144,6 @@ class MeasuredSurfaces:
     rays: SurfaceRays
     noise: RayNoise
 
-    def shown(self) -> "MeasuredSurfaces":
-        """Return only the surfaces that have rays."""
-        used = np.unique(self.rays.surface)
-        rays = replace(self.rays, surface=np.searchsorted(used, self.rays.surface).astype(np.int32))
-        return replace(self, surfaces=self.surfaces.rows(used), rays=rays)
-
 
 def as_rays(rays: ScanPoints) -> SurfaceRays:
     """Return rays of which it is not known yet on which surface they end."""

@@ -5,8 +5,6 @@ with the square root of the distance. So the residuals of single steps show the 
 the common errors. Poses that rays on surfaces determine have errors too, and follow the wheels by their weight: an error with
 variance w, assumed as s, and a measurement with variance v leave a residual with variance (s / (s + v))^2 (w + v).
 
-The same residuals show by how much the stated covariances must be larger than single steps suggest (`with_noise_shown`).
-
 A step sideways, in the frame in its middle, is slip: for rolling wheels it is far below the assumed noise.
 """
 
@@ -16,11 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Bools, Floats, spread
+from ..arrays import Floats, spread
 from ..graph.eliminated import Blocks, rows_of
-from ..graph.graph import Graph, edge_weights, kernel_weights
-from ..graph.marginals import marginals
-from ..graph.pose_edges import OdometryEdges, ScanEdges
+from ..graph.graph import Graph, kernel_weights
+from ..graph.pose_edges import OdometryEdges
 from ..graph.unknowns import Unknowns
 
 PATCH = 10
@@ -64,7 +61,7 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
     """
     noise, patch = np.ones(3), np.zeros(2)
     if len(wheels) > PATCH:
-        shown = _steps_and_sums(wheels, graph, certainty, np.ones(len(wheels), dtype=bool))
+        shown = _steps_and_sums(wheels, graph, certainty)
         root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
         for k, ((one, of_one), (ten, of_ten)) in enumerate(shown):
             if min(of_one, of_ten) < _ENOUGH:
@@ -78,82 +75,24 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
     return replace(wheels, sqrt_information=wheels.sqrt_information / noise[:, None]), replace(even(wheels), sigma=patch)
 
 
-def with_noise_shown(graph: Graph, certainty: Floats | None = None) -> Graph:
-    """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
-
-    Errors common to a patch of floor grow faster than with the square root of the distance, which single steps do not show. Two
-    kinds of residuals do: sums over ten consecutive steps whose ends the lidar determines better than the wheels, and steps
-    that no scan measured, as far as ranges check them, since ranges check distances of many metres. The assumed noise has the
-    weight of two residuals.
-
-    Parameters
-    ----------
-    certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by what is not among the graph's edges; None = none.
-    """
-    scans, seen = [e for e in graph.edges if isinstance(e, ScanEdges)], np.zeros((len(graph.poses), 3, 3))
-    measured = np.zeros(max(len(graph.poses) - 1, 0), dtype=bool)
-    for e in scans:
-        measured[np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1]] = True
-        weight = edge_weights(e, graph)
-        for name, index, by_pose in e.linearize(graph).blocks:
-            if name == "poses":
-                np.add.at(seen, index, np.einsum("e,eda,edb->eab", weight, by_pose, by_pose))
-    if certainty is not None:
-        seen += certainty
-    return replace(
-        graph, edges=tuple(_as_shown(e, graph, seen, measured) if isinstance(e, OdometryEdges) else e for e in graph.edges)
-    )
-
-
-def _as_shown(wheels: OdometryEdges, graph: Graph, certainty: Floats, measured: Bools) -> OdometryEdges:
-    """Scale the noise of the edges along, across and in heading to what errors add up to over many steps."""
-    own, variance, sums = measured[wheels.i], np.ones(3), np.zeros(3)
-    if len(wheels) > PATCH:
-        for k, ((one, of_one), (ten, of_ten)) in enumerate(_steps_and_sums(wheels, graph, certainty, own)):
-            if min(of_one, of_ten) > 0:
-                variance[k], sums[k] = max(one + _ADDS_UP * max(ten - one, 0.0), 1.0), of_ten / PATCH
-    squares, checked = _by_redundancy(wheels, graph, ~own)
-    factor = np.sqrt((_ASSUMED + sums * variance + squares) / (_ASSUMED + sums + checked))
-    return replace(wheels, sqrt_information=wheels.sqrt_information / np.clip(factor, 1.0 / _MOST_FLOOR, _MOST_FLOOR)[:, None])
-
-
-def _by_redundancy(wheels: OdometryEdges, graph: Graph, some: Bools) -> tuple[Floats, Floats]:
-    """Return the weighted squares (3,) of the residuals of some edges, and how many of them other measurements check:
-    Helmert's variance components, with Baarda's redundancy."""
-    if not some.any():
-        return np.zeros(3), np.zeros(3)
-    squares = edge_weights(wheels, graph)[some, None] * np.square(wheels.residuals(graph)[some])
-    return squares.sum(axis=0), marginals(graph).redundancy(wheels)[some].sum(axis=0)
-
-
-_ASSUMED = 2.0
-"""Weight of the assumed noise, in residuals: it is right within a factor of two."""
-_ADDS_UP = 3.0
-"""Ratio of the correlated part of the variance over many steps to that over ten: the sum of exp(-|k| / 10) over all k
-but 0 is 19, and that of (1 - |k| / 10) exp(-|k| / 10) within ten steps 6.4."""
-_MOST_FLOOR = 3.0
-"""Largest factor: more is slip, not floor."""
-
 _Shown = tuple[float, int]
 """Variance relative to that assumed, and how many residuals show it."""
 
 
-def _steps_and_sums(wheels: OdometryEdges, graph: Graph, certainty: Floats, some: Bools) -> Iterator[tuple[_Shown, _Shown]]:
-    """Yield ahead, sideways and in heading the variance of the errors of some steps (e,), and that per step of their sums over
-    ten consecutive ones, which lie on one or two patches of floor; see `learnt`."""
+def _steps_and_sums(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> Iterator[tuple[_Shown, _Shown]]:
+    """Yield ahead, sideways and in heading the variance of the errors of steps (e,), and that per step of their sums over ten
+    consecutive ones, which lie on one or two patches of floor; see `learnt`."""
     root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
     pose, residuals = _pose_variance(graph, certainty), wheels.residuals(graph)
     ends, roots = (np.concatenate([np.zeros((1, 3)), np.cumsum(v, axis=0)]) for v in (residuals, root))
-    count = np.concatenate([[0], np.cumsum(some)])
     # Windows that cross the boundary of two recordings are excluded.
-    ten = np.flatnonzero((wheels.j[PATCH - 1 :] - wheels.i[: 1 - PATCH] == PATCH) & (count[PATCH:] - count[:-PATCH] == PATCH))
-    one = np.flatnonzero(some)
-    of_one = (pose[wheels.i[one]] + pose[wheels.j[one]]) * root[one] ** 2
+    ten = np.flatnonzero(wheels.j[PATCH - 1 :] - wheels.i[: 1 - PATCH] == PATCH)
+    of_one = (pose[wheels.i] + pose[wheels.j]) * root**2
     mean = (roots[ten + PATCH] - roots[ten]) / PATCH
     of_ten = (pose[wheels.i[ten]] + pose[wheels.j[ten + PATCH - 1]]) * mean**2 / PATCH
     summed = (ends[ten + PATCH] - ends[ten]) / np.sqrt(PATCH)
     for k in range(3):
-        yield _shown(residuals[one, k], of_one[:, k]), _shown(summed[:, k], of_ten[:, k])
+        yield _shown(residuals[:, k], of_one[:, k]), _shown(summed[:, k], of_ten[:, k])
 
 
 def _pose_variance(graph: Graph, certainty: Floats) -> Floats:

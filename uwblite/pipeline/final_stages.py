@@ -18,7 +18,6 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..odometry.attached import choose_scans
-from ..odometry.floor import with_noise_shown
 from ..odometry.keyframes import KeyframeConfig
 from ..problem.solution import at_given_poses
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
@@ -52,18 +51,15 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
 
 
 def covariances_of(estimate: Estimate, task: Task) -> Covariances:
-    """Return the covariances of a finished estimate, with the correlated errors of odometry and ranges in them."""
+    """Return the covariances of a finished estimate, with the correlated errors of ranges in them."""
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.intp))
-    graph, rays, certainty = with_fewer_pairs(estimate.graph), None, None
-    if estimate.surfaces is not None:
-        graph, on_surfaces = for_covariances(estimate.surfaces, graph, task)
-        rays, certainty = on_surfaces.equations, on_surfaces.sums.poses
-    stated = with_noise_shown(graph, certainty)
-    found = marginals(stated, among=along, further=rays)
+    graph, surfaces = with_fewer_pairs(estimate.graph), estimate.surfaces
+    graph, rays = (graph, None) if surfaces is None else for_covariances(surfaces, graph, task)
+    found = marginals(graph, among=along, further=rays)
     covariances = found.covariances
     if estimate.ranges is not None:
-        covariances = _with_correlated_ranges(found, stated, estimate, task.config.ranges)
+        covariances = _with_correlated_ranges(found, graph, estimate, task.config.ranges)
     if not task.recordings.have_scans:
         return covariances
     return replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))

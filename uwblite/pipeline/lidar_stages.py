@@ -15,7 +15,7 @@ from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.range_errors import without_pattern
 from .estimate import Estimate, ScanClouds, Task
 from .progress import solver_figures
-from .radio_stages import with_range_noise
+from .radio_stages import evidence_against, with_range_noise
 
 
 def pairs(estimate: Estimate, graph: Graph, settings: RefinementConfig, task: Task) -> tuple[Ints, Ints]:
@@ -65,21 +65,25 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
-    constrains these, and it is matched again. With the ranges corrected by what they err by in common in each direction, the
-    adjustment to surfaces solves once more.
+    constrains these, and the poses may absorb the error as well: the evidence decides between the two weightings, and where it
+    is for the ranges, the lidar is matched again. With the ranges corrected by what they err by in common in each direction,
+    the adjustment to surfaces solves once more.
     """
     if estimate.ranges is None or estimate.joint is None:
         return estimate
-    before, optimizer = estimate.graph.poses, Optimizer()
+    before, optimizer = estimate, Optimizer()
     quick = replace(rough(task.config.solver), relative_decrease=_TO_COME)
-    estimate = with_range_noise(estimate, task.config).solved(quick, optimizer)[0]
-    if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
+    estimate = with_range_noise(before, task.config).solved(quick, optimizer)[0]
+    if (shift := estimate.moved_since(before.graph.poses)) >= task.config.refinement.same_pairs:
         # The analysis of other pairs of clouds cannot be used again, and it is large.
         optimizer = Optimizer()
+        steady = before.solved(rough(task.config.solver))[0]
+        if evidence_against(with_range_noise(estimate, task.config), steady, task.config) <= 0.0:
+            return _without_pattern(steady, task)
         estimate = _matched_once_more(estimate, shift, task)
-        before = estimate.graph.poses
+        before = estimate
         estimate = with_range_noise(estimate, task.config).solved(quick, optimizer)[0]
-    if estimate.moved_since(before) >= _STILL:
+    if estimate.moved_since(before.graph.poses) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
     del optimizer  # The optimizer's analysis takes as much memory as the covariances.
     task.stages.report("joint refinement", 1, 1)

@@ -23,6 +23,7 @@ from ..odometry.wheels import redundancy, sideways_priors, variance_factors, whe
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
+from ..radio.bootstrap_attempt import Measured
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import assumed, short_term_sigma
@@ -105,7 +106,8 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     # Differences of neighbours do not show the part of the errors that lasts.
     sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
     settings = replace(config.bootstrap, range_sigma=sigma)
-    found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
+    measured = Measured(estimate.odometry, ranges, path - path[0])
+    found = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.

@@ -13,7 +13,7 @@ the weight of a few, and pairs keep their weight. On columns they get hardly any
 it, to the side from which it is seen, so that pairs err along the path by what the robot passes of them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from ..graph.unknowns import Unknowns, moved
 from ..graph.work import RAYS
 from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
-from ..lidar.ray_equations import RaySums, misfit, noise_of, weighted_sums
+from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.ray_noise import UNLEARNT, RayNoise
 from ..lidar.surface_rays import (
     NEAR,
@@ -53,16 +53,6 @@ from .recordings import Recording
 
 _AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
-
-
-def with_round_columns(found: MeasuredSurfaces, sensors: Floats, poses: Floats) -> MeasuredSurfaces:
-    """Return the surfaces without columns that are not round; for the parameters see ray_equations.linearized."""
-    none = found.surfaces.round & (misfit(found, sensors, poses) > _MISFIT)
-    return replace(found, rays=found.rays.rows(~none[found.rays.surface])).shown()
-
-
-_MISFIT = 1.3
-"""Rms residual of the rays of a column, relative to their noise, beyond which it is not round; that of a circle is 1."""
 
 
 _ON_RIM = 0.06
@@ -169,22 +159,8 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RaysOfGraph:
-    """Information of the rays about a graph's unknowns, for covariances."""
-
-    sums: RaySums
-    surfaces: Surfaces
-    graph: Graph
-    lidar: "_Lidar"
-
-    def equations(self, unknowns: Unknowns) -> Blocks:
-        """Return the normal equations of the rays by the numbers of the graph's unknowns."""
-        return _blocks(self.sums, self.surfaces, self.graph, self.lidar, unknowns)
-
-
-def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, RaysOfGraph]:
-    """Return a graph, and the information of the rays about it, for covariances.
+def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
+    """Return a graph, and the normal equations of the rays by the numbers of its unknowns, for covariances.
 
     Rays have the weight of the adjustment. Pairs of clouds contain the same points, and others: they get half their weight.
     """
@@ -194,7 +170,7 @@ def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
     sums = weighted_sums(found, lidar.sensors, graph.poses, _KERNEL)
-    return replace(graph, edges=tuple(edges)), RaysOfGraph(sums, found.surfaces, graph, lidar)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _blocks(sums, found.surfaces, graph, lidar, unknowns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,7 +219,6 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
         if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
-            found, order = with_round_columns(found, lidar.sensors, poses), None
             kind = points_on(estimate.lidar.clouds, found, lidar.sensors)
         if not len(found.rays.keyframe):
             break

@@ -5,22 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
 from ..graph.graph import Calibration, Graph
-from ..graph.pose_edges import OdometryEdges
-from ..graph.range_edges import RangeEdges
-from .bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult
+from .bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
 from .trilateration import TrilaterationConfig
 
 
-def bootstrap_graph(
-    graph: Graph,
-    odometry: OdometryEdges,
-    ranges: RangeEdges,
-    path: Floats,
-    config: BootstrapConfig,
-    search: TrilaterationConfig,
-) -> BootstrapResult:
+def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, search: TrilaterationConfig) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
     Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A
@@ -33,12 +23,9 @@ def bootstrap_graph(
     Parameters
     ----------
     graph : poses (k, 3) by dead reckoning, anchors (a, 2) of any value, calibration block; its edges (priors) stay.
-    odometry : k - 1 edges between consecutive poses.
-    ranges : all ranges; those that cannot be distances must have weight 0.
-    path : (k,) travelled distance at each pose, m.
     """
     first, *others = (
-        Attempt(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
+        Attempt(replace(graph, calibration=calibration), measured, config, search)
         for heading_scale in config.heading_scales
         if (calibration := _with_heading_scale(graph.calibration, heading_scale)) is not None
     )
@@ -51,7 +38,7 @@ def bootstrap_graph(
     tried, slipping = [_likeliest_heading(first, begun, others, config)] if others else [first], list[Attempt]()
     while len(slipping) <= _STARTS and (not slipping or slipping[-1].slips.any()):
         # The wheels may have slipped in the first stretch as well.
-        slipping.append(Attempt(graph, odometry, ranges, path, config, search, [each.first for each in slipping]))
+        slipping.append(Attempt(graph, measured, config, search, [each.first for each in slipping]))
         slipping[-1].run()
     agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
     return max([*tried, *agreeing], key=Attempt.evidence).estimate()

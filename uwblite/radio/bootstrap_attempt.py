@@ -7,7 +7,7 @@ poses extends at both ends. Each piece is appended by the calibrated odometry, o
 again and anchors not yet placed are searched from the poses so far.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -17,13 +17,14 @@ from .. import se2
 from ..arrays import Bools, Floats, runs_of, spread
 from ..config import setting
 from ..graph.gnc import tightened
-from ..graph.graph import Edges, Graph, edge_cost
+from ..graph.graph import Graph, edge_cost
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..odometry.slips import with_slips
 from ..problem.alternatives import EvidencePolicy
+from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, effective_sigma
 from .slip_search import TagRanges, likeliest_slip, log_prior
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
@@ -73,13 +74,29 @@ class BootstrapResult:
     """(e,) probability that the wheels slipped over each step; empty = not sought."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What a bootstrap rests on."""
+
+    odometry: OdometryEdges
+    """Between consecutive poses."""
+    ranges: RangeEdges
+    """All; those that cannot be distances have weight 0."""
+    path: Floats
+    """(k,) travelled distance at each pose, m."""
+
+
 class Attempt:
     """The poses in [low, high) are known, the anchors in `placed` have a position."""
 
     def __init__(
-        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
-        search: TrilaterationConfig, without: Sequence[tuple[int, int]] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        graph: Graph,
+        measured: Measured,
+        config: BootstrapConfig,
+        search: TrilaterationConfig,
+        without: Sequence[tuple[int, int]] | None = None,
+    ) -> None:
         """Take what is known.
 
         Parameters
@@ -87,12 +104,12 @@ class Attempt:
         without : stretches, of poses first <= k < last, none of which the first one overlaps; wheels may slip then. None = they
             do not.
         """
-        self.seeks, self.without = without is not None, without or ()
-        self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
-        self.config, self.search = config, search
-        self.live = ranges.alive
-        self.wheels, self.slips = odometry, np.zeros(len(odometry))
-        self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
+        self.seeks, self.without, self.first = without is not None, without or (), (0, 0)
+        self.odometry, self.ranges, self.path = measured.odometry, measured.ranges, measured.path
+        self.graph, self.config, self.search = graph, config, search
+        self.live = self.ranges.alive
+        self.wheels, self.slips = self.odometry, np.zeros(len(self.odometry))
+        self.poses = se2.chain(graph.poses[0], self.odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
         self.sigma = np.full(len(graph.anchors), config.range_sigma)
@@ -171,20 +188,22 @@ class Attempt:
         return BootstrapResult(final, self.placed, found, self.doubtful, self.slips)
 
     def evidence(self) -> float:
-        """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant."""
-        part, number = self._part(self.low, self.high), len(runs_of(self.slips > 0.0))
-        edges = [self._as_often_as_independent(e, part) if isinstance(e, RangeEdges) else e for e in part.edges]
-        ranges = sum(len(e) for e in edges if isinstance(e, RangeEdges))
-        return number * log_prior(0.0, ranges // (number + 1)) - _cost_of(edges, part)
+        """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant.
 
-    def _as_often_as_independent(self, ranges: RangeEdges, part: Graph) -> RangeEdges:
-        """Return ranges of the assumed noise that count as often as they have errors of their own: neighbours are alike."""
-        usual, weights, tags = RangeNoiseConfig(), np.ones(len(ranges)), ranges.tag_positions(part.poses)
-        noise = RangeNoise(np.sqrt(1.0 - usual.slow_share), np.sqrt(usual.slow_share), usual.correlation_length)
-        for anchor in np.unique(ranges.anchor):
-            own = ranges.anchor == anchor
-            weights[own] = effective_sigma(tags[own], noise) ** -2
-        return replace(ranges, sigma=np.full(len(ranges), self.config.range_sigma), weights=weights)
+        Of ranges the distribution of each anchor's errors is learnt, late and false ones included; neighbours are alike.
+        """
+        part, number = self._part(self.low, self.high), len(runs_of(self.slips > 0.0))
+        likely = independent = 0.0
+        for edges in part.edges:
+            if isinstance(edges, RangeEdges):
+                errors, shares = -edges.residuals(part)[:, 0] * edges.sigma, _independent(edges, part.poses)
+                independent += float(shares.sum())
+                for own in (edges.anchor == anchor for anchor in np.unique(edges.anchor)):
+                    mixture = nlos_mixture.fit(errors[own], self.config.range_sigma)
+                    likely += float(shares[own] @ mixture.log_density(errors[own]))
+            else:
+                likely -= 0.5 * float(edge_cost(edges, edges.residuals(part)))
+        return likely + number * log_prior(0.0, independent / (number + 1))
 
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
@@ -323,9 +342,10 @@ class Attempt:
             self.poses, self.slips, self.wheels = before
 
     def _cost(self, low: int, high: int) -> float:
-        """Return half the robust chi2 of wheels and ranges over the poses [low, high)."""
-        part = self._part(low, high)
-        return _cost_of(part.edges, part)
+        """Return half the robust chi2 of wheels and ranges over the poses [low, high), that of ranges as annealing ends."""
+        part, kernel = self._part(low, high), Kernel("geman-mcclure", _SCALES[-1])
+        robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in part.edges)
+        return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
 
     def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
@@ -370,11 +390,14 @@ class Attempt:
         return alone.with_edges(wheels, radio)
 
 
-def _cost_of(edges: Iterable[Edges], part: Graph) -> float:
-    """Return half the chi2 of a part's edges, that of its ranges as annealing ends."""
-    kernel = Kernel("geman-mcclure", _SCALES[-1])
-    robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in edges)
-    return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
+def _independent(ranges: RangeEdges, poses: Floats) -> Floats:
+    """Return which share (m,) of each range is independent of its neighbours'."""
+    usual, shares, tags = RangeNoiseConfig(), np.ones(len(ranges)), ranges.tag_positions(poses)
+    noise = RangeNoise(np.sqrt(1.0 - usual.slow_share), np.sqrt(usual.slow_share), usual.correlation_length)
+    for anchor in np.unique(ranges.anchor):
+        own = ranges.anchor == anchor
+        shares[own] = effective_sigma(tags[own], noise) ** -2
+    return shares
 
 
 _SCALES = (20.0, 6.0, 3.0)

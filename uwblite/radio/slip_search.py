@@ -95,9 +95,9 @@ def likeliest_slip(poses: Floats, duration: Floats, ranges: TagRanges) -> Slip |
     return slip
 
 
-def log_prior(duration: float, ranges: int) -> float:
+def log_prior(duration: float, ranges: float) -> float:
     """Return the logarithm of the prior probability of a slip within a time, s, whose motion so many ranges tell (Schwarz)."""
-    return float(np.log(min(max(duration, LASTS) / EVERY, 1.0)) - 1.5 * np.log(max(ranges, 1)))
+    return float(np.log(min(max(duration, LASTS) / EVERY, 1.0)) - 1.5 * np.log(max(ranges, 1.0)))
 
 
 def _motions(counted: Floats) -> Floats:

@@ -242,14 +242,16 @@ class DelayPolicy:
     fewest: int = 10
     """Ranges to one anchor in a window: three give its place."""
     contradicts: float = 0.03
-    """Odds of a window below which what it shows is no offset."""
+    """Odds of the offset of all windows to the likeliest of one, below which that one contradicts it."""
+    wrong: float = 0.1
+    """Share of windows that may contradict the offset: wheels slip in some."""
 
 
 def without_delay(log: SensorLog, policy: DelayPolicy = DelayPolicy()) -> tuple[SensorLog, list[Fact]]:
     """Move the stamps of a radio whose clock is off by seconds, as its ranges show along the path that the wheels count.
 
-    In each window the ranges to one anchor are those from the path to one place, at the right offset alone. A window that
-    contradicts the offset of most shows that it is none (wheels that stood still, anchors that were moved).
+    In each window the ranges to one anchor are those from the path to one place, at the right offset alone. No window alone
+    decides, and windows that each show another offset show that there is none (bad wheels, anchors that were moved).
     """
     if log.ranges is None:
         return log, []
@@ -265,8 +267,10 @@ def without_delay(log: SensorLog, policy: DelayPolicy = DelayPolicy()) -> tuple[
                 parts.append(_log_likelihoods(places, ranges[own], policy.noise)[None])
     likely = np.concatenate(parts)
     total = likely.sum(axis=0)
-    weights, gains = np.exp(total - total.max()), likely[:, np.argmax(total)] - likely[:, len(offsets) // 2]
-    if gains.sum() + np.log(weights.mean() * policy.prior) < 0.0 or gains.min() < np.log(policy.contradicts):
+    weights, best = np.exp(total - total.max()), likely[:, np.argmax(total)]
+    gains, lost = best - likely[:, len(offsets) // 2], best - likely.max(axis=1)
+    most = gains.sum() - gains.max()
+    if most + np.log(weights.mean() * policy.prior) < 0.0 or np.quantile(lost, policy.wrong) < np.log(policy.contradicts):
         return log, []
     by = float(np.average(offsets, weights=weights))
     moved = replace(log.ranges, stamps=log.ranges.stamps + by)
