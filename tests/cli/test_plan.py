@@ -44,6 +44,13 @@ def test_a_path_goes_to_a_table_and_a_picture(rooms, tmp_path, capsys):
     assert answer["length"] == pytest.approx(table[-1, 3], abs=1e-4)
 
 
+def test_a_picture_of_somebody_else_is_not_replaced(rooms, tmp_path, capsys):
+    (tmp_path / "plan.png").write_bytes(b"mine")
+    assert main([*rooms, "--from", "3,1", "--to", "3,1.5", "--force"]) != 0
+    assert "plan.png was not written by uwblite" in capsys.readouterr().err
+    assert (tmp_path / "plan.png").read_bytes() == b"mine"
+
+
 def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_path, capsys):
     words = [*rooms[:-1], "0.35", "--from", "3,1", "--to", "3,3", "--json"]
     assert main(words) == 1

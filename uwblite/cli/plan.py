@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import ConfigError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.files import write_text
+from ..io.folders import refuse_foreign_picture
 from ..io.formats import refuse_existing
 from ..io.map_server import read_map
 from ..io.png import write_png
@@ -17,11 +18,15 @@ from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.picture import Overlay, PictureAnchor, draw_map
 from . import console
 
+_HEAD = "x,y,theta,distance,clearance"
+"""Of the table."""
+
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
+    refuse_foreign_picture(table, picture, _HEAD)
     grid, anchors = _read(args.map)
     try:
         planner = make_planner(grid, args.radius, unknown=args.unknown)
@@ -68,7 +73,7 @@ def _table(path: PlannedPath) -> str:
     """Return the path as CSV; m, m, rad, m from the start, m from the nearest obstacle."""
     rows = zip(path.poses.tolist(), path.distances.tolist(), path.clearances.tolist(), strict=True)
     lines = [f"{x:.4f},{y:.4f},{theta:.4f},{far:.4f},{clear:.3f}" for (x, y, theta), far, clear in rows]
-    return "\n".join(["x,y,theta,distance,clearance", *lines]) + "\n"
+    return "\n".join([_HEAD, *lines]) + "\n"
 
 
 def _figures(args: argparse.Namespace, path: PlannedPath) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..io.files import write_text
+from ..io.folders import refuse_foreign_picture
 from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.stored_result import StoredResult, read_result
@@ -16,11 +17,15 @@ from ..report.picture import PictureAnchor
 from . import console
 from .wording import signed
 
+_HEAD = "id,x,y,mean_error,error_95"
+"""Of the table."""
+
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
+    refuse_foreign_picture(table, picture, _HEAD)
     result = read_result(args.map)
     if result.grid is None:
         raise ConfigError(f"{args.map} has no map.yaml: without a map there is no free space to plan for")
@@ -57,7 +62,7 @@ def _figures(args: argparse.Namespace, plan: AnchorPlan, today: int) -> dict[str
 
 def _table(figures: dict[str, Any]) -> str:
     """Return the places as CSV; lengths in metres; errors with this anchor and those before it."""
-    lines = ["id,x,y,mean_error,error_95"]
+    lines = [_HEAD]
     lines += [f"{a['id']},{a['x']:.3f},{a['y']:.3f},{a['mean_error']:.3f},{a['error_95']:.3f}" for a in figures["anchors"]]
     return "\n".join(lines) + "\n"
 

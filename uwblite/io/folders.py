@@ -79,6 +79,12 @@ def unmarked(folder: Path, names: Iterable[str], mark: str, start: str) -> list[
     return [folder / name for name in names if (folder / name).is_file()]
 
 
+def refuse_foreign_picture(table: str, picture: str, head: str) -> None:
+    """Refuse to replace a table and the picture of the same name beside it, unless the table begins as uwblite writes it."""
+    file = Path(table)
+    refuse_foreign(unmarked(file.parent, (file.name, Path(picture).name), file.name, head))
+
+
 def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
     _repair(folder, owned)
     beside = not folder.exists() or _may_change_places(folder, owned)

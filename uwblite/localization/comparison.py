@@ -49,8 +49,6 @@ class Comparison:
     looks: int
     """Number of their scans."""
     ranges: Ranges
-    by_ranges: Floats
-    """(h,) the ranges' part of the log-likelihood."""
     independent: float
     """Rays that count as independent."""
 
@@ -139,7 +137,6 @@ class PlaceSearch:
             yield hypotheses.MATCHES * PER_FACTOR * len(parts[-1]) * min(len(recent.hit), TRACK_RAYS)
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        by_ranges = range_likelihood.range_likelihood(poses, ranges)
         fit, known = np.zeros((2, len(poses)))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
@@ -148,10 +145,10 @@ class PlaceSearch:
                 agreement = self.walls.agreement(poses[part], rays)
                 fit[part], known[part] = agreement.log_likelihood, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
-        weight = by_ranges + independent * fit
+        weight = range_likelihood.range_likelihood(poses, ranges) + independent * fit
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])
-        parts_of = (weight[new], fit[new], known[new], rays, looks, ranges, by_ranges[new], independent)
+        parts_of = (weight[new], fit[new], known[new], rays, looks, ranges, independent)
         return Comparison(places, found.complete, *parts_of)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:

@@ -269,10 +269,10 @@ class PoseEstimator:
         certain = verdict.needed(fitting, proven)
         undecided = verdict.undecided(self._bank, best, found.complete, certain)
         agreed = self._agreed(None if undecided else pose)
-        fit, likelihood = float(found.fit[best]), float(found.by_ranges[best])
+        fit = float(found.fit[best])
         # Rays that end beyond the map say nothing about it.
         rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
-        odds = verdict.map_odds(fit, known, rays, likelihood, fitting, agreed)
+        odds = verdict.map_odds(fit, known, rays, fitting, agreed)
         self._reason = (
             undecided
             or verdict.nowhere(odds, fitting)

@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import Floats
 from . import hypotheses
 from .hypotheses import Hypotheses
-from .range_likelihood import range_errors, series
+from .range_likelihood import range_errors, series, shared_likelihood
 from .scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
 from .walls import Rays, Walls
 from .window import Ranges
@@ -91,15 +91,15 @@ class MapOdds:
         return _AGREED * self.agreed + (min(measured, 0.0) if self.alone else measured)
 
 
-def map_odds(fit: float, ends: float, rays: float, likelihood: float, fitting: "RangeFit", agreed: float) -> MapOdds:
+def map_odds(fit: float, ends: float, rays: float, fitting: "RangeFit", agreed: float) -> MapOdds:
     """Return the odds of a place.
 
     Parameters
     ----------
     fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
-    likelihood : of the ranges, 0 = all as expected. fitting : how they agree. agreed : m driven over which searches agree.
+    fitting : how the ranges agree. agreed : m driven over which searches agree.
     """
-    ranges = likelihood - fitting.independent * ELSEWHERE[1]
+    ranges = fitting.likelihood - fitting.independent * ELSEWHERE[1]
     sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
     scans = rays * (fit - (ELSEWHERE[0] if ranged else _ELSEWHERE_ALONE)) if sees else 0.0
     return MapOdds(scans, ranges, agreed, not (sees and ranged))
@@ -153,6 +153,8 @@ class RangeFit:
     """Anchors whose ranges agree."""
     independent: float
     """Independent ranges whose information they all have."""
+    likelihood: float
+    """Their log-likelihood, as of so many; 0 = all as expected."""
 
     @property
     def enough(self) -> bool:
@@ -162,10 +164,11 @@ class RangeFit:
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
     if not len(ranges):
-        return RangeFit(0, 0.0, 0, 0.0)
+        return RangeFit(0, 0.0, 0, 0.0, 0.0)
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
     anchors = len(np.unique(ranges.anchor[agree]))
-    return RangeFit(len(ranges), float(agree.mean()), anchors, float(series(ranges).share.sum()))
+    independent, likelihood = float(series(ranges).share.sum()), float(shared_likelihood(pose[None], ranges)[0])
+    return RangeFit(len(ranges), float(agree.mean()), anchors, independent, likelihood)
 
 
 def too_little(rays: Rays, ranges: Ranges) -> str:
