@@ -348,7 +348,7 @@ def test_a_place_that_only_an_impossible_bias_explains_is_not_ok(shared_data):
 @pytest.mark.slow
 def test_an_id_of_two_anchors_is_left_out_and_named(shared_data):
     log = _under_one_id(read_log(shared_data / "kasdorf_2017-11-17-12-31-28" / "run.log.gz"))
-    for lidar, doubts, status in ((True, [], "ok"), (False, ["ranges-disagree"], "distrusted")):
+    for lidar, doubts, status in ((True, [], "ok"), (False, ["uncertain", "ranges-disagree"], "distrusted")):
         result = build_map(log.without(lidar=not lidar))
         assert {anchor.id: anchor.status for anchor in result.anchors} == {"180": status}
         assert any(w.kind == "shared-name" and "177" in w.text for w in result.warnings)

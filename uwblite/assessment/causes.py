@@ -130,7 +130,7 @@ def _may_explain(cause: Finding, finding: Finding) -> bool:
         return False
     if cause.recording and finding.recording and cause.recording != finding.recording:
         return False
-    if cause.stretches and finding.stretches and not _meet(cause.stretches, finding.stretches):
+    if cause.stretches and finding.stretches and finding.kind not in _ASIDE and not _meet(cause.stretches, finding.stretches):
         return False
     return not (cause.anchor and finding.anchor and cause.anchor != finding.anchor)
 
@@ -140,6 +140,8 @@ def _meet(some: Stretches, others: Stretches) -> bool:
     return any(a <= end + _AFTER and begin <= b + _AFTER for a, b in some for begin, end in others)
 
 
+_ASIDE = frozenset({"path-displaced"})
+"""Kinds whose times are those of a part on one side of the cause, however far from it."""
 _AFTER = 5.0
 """Time that a fault shows in readings after it, s: medians, keyframes, ranges one by one."""
 

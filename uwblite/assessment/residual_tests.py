@@ -15,6 +15,7 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
+from ..loop_closure.closures import LoopClosureConfig
 from ..loop_closure.loose_links import untied_breaks
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
@@ -117,6 +118,10 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         yield between_keyframes(found, recordings, span)
         measured[stretch[0] : stretch[1] + 1] &= off[stretch[0] : stretch[1] + 1] < _SUDDEN
     if recordings.have_scans:
+        if not estimate.placed.any():
+            # Loops pull at steps that nothing else measures; a torn map is off by more than wheels slip.
+            way, turn = _error_of(wheels, far, whitened)
+            far = far[(way > LoopClosureConfig.slip) | (turn > LoopClosureConfig.slip_angle)]
         measured[far] = False
         loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
         far = np.intersect1d(far, loose)
@@ -125,11 +130,16 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         yield _slips(far, whitened, wheels, recordings)
 
 
+def _error_of(wheels: OdometryEdges, at: Ints, whitened: Floats) -> tuple[Floats, Floats]:
+    """Return way, m, and turn, rad, by which steps (s,) of the odometry are off."""
+    off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
+
+
 def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Recordings) -> Finding:
     """Return the finding on single steps (s,) that are far off by the ranges, where no scans tie their sides."""
-    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at]))
     when = listed([seconds(recordings, k) for k in wheels.i[at].tolist()])
-    way, turn = float(np.hypot(off[:, 0], off[:, 1]).max()), float(off[:, 2].max())
+    way, turn = (float(values.max()) for values in _error_of(wheels, at, whitened))
     text = (
         f"at t = {when} s the ranges contradict the odometry by up to {way:.2f} m and {turn:.2f} rad: the wheels slipped or "
         "were stuck, or the robot was carried"
