@@ -10,6 +10,7 @@ from helpers.told import told
 from uwblite import se2
 from uwblite.screening import range_motion
 from uwblite.screening.range_motion import (
+    DelayPolicy,
     _agreed,
     _by_anchor,
     _driven,
@@ -364,6 +365,17 @@ def test_a_radio_in_time_is_left_whatever_the_wheels_do(seed, still):
     assert without_delay(log) == (log, [])
     nothing = replace(log, ranges=None)
     assert without_delay(nothing) == (nothing, [])
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_windows_that_each_show_another_offset_show_none(seed):
+    """Wheels that turn at random for a quarter of an hour: without that criterion, these ranges would be moved by up to 1 s."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 400.0)
+    wheels = planted.odometry(stamps, truth, rng, noise=0.05, turn_noise=0.6)
+    log = SensorLog(wheels, planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.15, outliers=0.1), None)
+    assert without_delay(log, DelayPolicy(contradicts=1e-300))[1]
+    assert without_delay(log) == (log, [])
 
 
 def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():

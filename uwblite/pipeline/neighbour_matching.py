@@ -49,14 +49,14 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    track, shown = _followed(estimate, steps, task), estimate.odometry.slips
-    if shown is None:
+    track, by_ranges = _followed(estimate, steps, task), estimate.odometry.slips
+    if by_ranges is None:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
         estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
     if estimate.ranges is None or not np.any(track.slips > _LIKELY):
         return estimate
-    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=shown)), track, task.following(estimate))
+    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), task.following(estimate))
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
@@ -98,7 +98,7 @@ def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     return _with_inflated_ranges(replace(estimate, odometry=wheels, steps=edges)).solved(rough(task.config.solver))[0]
 
 
-def _with_slips(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
@@ -134,7 +134,6 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
     before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
     task = task.following(estimate)
-    estimate = replace(estimate, scans=None)
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
     return estimate

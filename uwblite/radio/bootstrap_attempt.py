@@ -196,7 +196,7 @@ class Attempt:
         likely = independent = 0.0
         for edges in part.edges:
             if isinstance(edges, RangeEdges):
-                errors, shares = -edges.residuals(part)[:, 0] * edges.sigma, _independent(edges, part.poses)
+                errors, shares = -edges.residuals(part)[:, 0] * edges.sigma, _independent_shares(edges, part.poses)
                 independent += float(shares.sum())
                 for own in (edges.anchor == anchor for anchor in np.unique(edges.anchor)):
                     mixture = nlos_mixture.fit(errors[own], self.config.range_sigma)
@@ -390,7 +390,7 @@ class Attempt:
         return alone.with_edges(wheels, radio)
 
 
-def _independent(ranges: RangeEdges, poses: Floats) -> Floats:
+def _independent_shares(ranges: RangeEdges, poses: Floats) -> Floats:
     """Return which share (m,) of each range is independent of its neighbours'."""
     usual, shares, tags = RangeNoiseConfig(), np.ones(len(ranges)), ranges.tag_positions(poses)
     noise = RangeNoise(np.sqrt(1.0 - usual.slow_share), np.sqrt(usual.slow_share), usual.correlation_length)

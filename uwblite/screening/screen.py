@@ -65,11 +65,8 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     facts += [*spread, *times, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks, without_own_body]
     repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
-    repairs += (
-        [range_motion.without_delay, directions.heading_with_the_path]
-        + [directions.laser_upright] * turn_laser
-        + [with_late_scans_placed]
-    )
+    repairs += [range_motion.without_delay, directions.heading_with_the_path]
+    repairs += [directions.laser_upright] * turn_laser + [with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)
         facts += more
