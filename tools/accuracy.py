@@ -7,8 +7,9 @@
 
 Parts: simulated (buildings x seeds against bars), oracle (against what the measurements allow, and the Cramer-Rao bound),
 fusion (all sensors against some of them), real (recordings of others, where they are: UWBLITE_SHARED_DATA; with it benchmark:
-two of them against relations and published figures; --perturb N: N perturbed runs of each that has a lidar as well), injection
-(false closures and ranges into a good graph). What each ingredient buys is measured by tools/ablation.py, and how true the
+two of them against relations and published figures; --perturb N: N perturbed runs of each that has a lidar as well),
+registration (how often placements of clouds are right, by the probability that they state), injection (false closures and
+ranges into a good graph). What each ingredient buys is measured by tools/ablation.py, and how true the
 stated uncertainties are by tools/consistency.py; both write into the same page.
 """
 
@@ -26,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 import oracle
+import registration_law
 from simulation.laser import NARROW, SPINNING
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings, simulate
@@ -54,13 +56,16 @@ from uwblite.graph.graph import Edges, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import SQUARED
+from uwblite.graph.work import Work
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_relations
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.pipeline import scan_clouds
+from uwblite.pipeline.recordings import gather
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
-PARTS = ("simulated", "oracle", "fusion", "real", "benchmark", "injection")
+PARTS = ("simulated", "oracle", "fusion", "real", "benchmark", "registration", "injection")
 WORST = 1.6
 """The worst seed may exceed the bar on the mean by this factor."""
 
@@ -434,6 +439,36 @@ def halves(config: MappingConfig) -> str:
     )
 
 
+def registered(args: argparse.Namespace) -> str:
+    """Register neighbouring clouds with priors about the truth; return how often placements of a probability are right."""
+    config, rows = override(MappingConfig(), args.set), []
+    for name in asked(args, [*LAW_WORLDS, *LAW_REAL]):
+        if name in LAW_WORLDS:
+            trial = made(fusion_task(name, 0, args.seed, ()).settings)
+            log, stamps, poses, error = trial.log, trial.stamps, trial.poses, 0.002
+        elif (SHARED / name).is_dir():
+            log, error = read_log(SHARED / name / "run.log.gz"), LAW_REAL[name]
+            stamps, poses = true_path(SHARED / name, log)
+        else:
+            continue
+        recordings = gather([log], config.keyframes)
+        inside = (recordings.stamps >= stamps[0]) & (recordings.stamps <= stamps[-1])
+        clouds = scan_clouds.make(recordings, config, 0.0, Work()).clouds.chosen(np.flatnonzero(inside))
+        truth = se2.interpolate_trajectory(stamps, poses, recordings.stamps[inside])
+        rows.append((name, registration_law.placements(clouds, truth, 1, np.random.default_rng(args.seed), error)))
+        print(f"{name}: log score {rows[-1][1].log_score:.3f}", file=sys.stderr, flush=True)
+    return (
+        "## Registration\n\nNeighbouring clouds, registered with priors about the truth: the noise of wheels, and slips of "
+        f"half a metre and 0.4 rad\nin {registration_law.SLIPS:.0%} of the pairs. *Right*: within the stated covariance and "
+        f"the error of the truth, chi2 below {registration_law.CHI2}.\n\n{registration_law.report(rows)}"
+    )
+
+
+LAW_WORLDS = ("hall", "corridor", "lab", "room", "orchard", "warehouse")
+LAW_REAL = {"slips/barn_1": 0.02, "slips/market_1": 0.02, "slips/rotunda_3": 0.02, "slips/slip_office": 0.02}
+"""Recordings of others, and the standard deviation of a step of their truth, m and rad."""
+
+
 def injection(args: argparse.Namespace) -> str:
     """Put false closures and ranges into good graphs; return what they cost."""
     rows = []
@@ -485,6 +520,7 @@ def solved(graph: Graph, trial: Trial, stamps: np.ndarray) -> float:
 
 NAMES = {
     "simulated": ROWS, "oracle": ORACLE_ROWS, "fusion": [*FUSION_WORLDS, *FUSION_REAL], "real": REAL, "benchmark": BENCHMARK,
+    "registration": [*LAW_WORLDS, *LAW_REAL],
 }  # fmt: skip
 """Recordings of each part."""
 
@@ -505,7 +541,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--perturb", type=int, default=0, metavar="N", help="perturbed runs of each benchmark recording (0)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
-    parts = (simulated, oracles, fusion, real, benchmark, injection)
+    parts = (simulated, oracles, fusion, real, benchmark, registered, injection)
     made_by = dict(zip(PARTS, parts, strict=True))
     if not args.print and not args.out.exists():
         args.out.write_text(HEAD)

@@ -17,7 +17,7 @@ from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
 from uwblite.lidar import joint_refinement, overlap, scan_matching
-from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.cloud_rasters import ScanClouds, rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
     _best_views,
@@ -25,6 +25,7 @@ from uwblite.lidar.joint_refinement import (
     choose_pairs,
     measured_again,
     refine,
+    unmeasured,
     with_fewer_pairs,
 )
 from uwblite.lidar.overlap import surface_cells
@@ -37,10 +38,11 @@ NOISE = np.array([0.01, 0.005, 0.006])
 def refined(graph, clouds, path, config=CONFIG, selections=2):
     """Return the result of choosing pairs and refining, twice as the walk does."""
     recording = np.zeros(len(clouds), dtype=np.intp)
-    raster, twist, result = rasterize(clouds, 0.2 * config.first_gate, config.first_gate), np.zeros((len(clouds), 3)), None
+    scans, result = ScanClouds(clouds, rasterize(clouds, 0.2 * config.first_gate, config.first_gate), 0.0), None
     for _ in range(selections):
         i, j = choose_pairs(clouds, graph.poses, path, recording, config)
-        result = refine(graph, clouds, raster, twist, i, j, config, SolverConfig())
+        pairs = unmeasured(graph, i, j, np.zeros((len(clouds), 3)), 0.0)
+        result = refine(graph, scans, pairs, config, SolverConfig())
         graph = graph.updated(result.graph.poses, graph.anchors, graph.calibration.values)
     return result
 
@@ -181,7 +183,7 @@ def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_a
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
     whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
-    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
+    monkeypatch.setattr(overlap.OverlapPolicy, "points_at_once", 37)
     monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
     parts = overlap.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
@@ -220,14 +222,13 @@ def test_rounds_are_reported_and_bounded():
     recording, reported = np.zeros(len(truth), dtype=np.intp), []
     i, j = choose_pairs(clouds, graph.poses, path, recording, CONFIG)
     config = replace(CONFIG, rounds=3)
-    raster = rasterize(clouds, 0.1, 0.5)
-    result = refine(
-        graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig(), lambda *a: reported.append(a)
-    )
+    scans = ScanClouds(clouds, rasterize(clouds, 0.1, 0.5), 0.0)
+    pairs = unmeasured(graph, i, j, np.zeros((len(truth), 3)), 0.0)
+    result = refine(graph, scans, pairs, config, SolverConfig(), lambda *a: reported.append(a))
     assert result.rounds == 3
     assert reported == [(1, 3), (2, 3), (3, 3)]
     assert len(result.edges) == result.used.sum()
-    again = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig())
+    again = refine(graph, scans, pairs, config, SolverConfig())
     assert again.graph.poses.tobytes() == result.graph.poses.tobytes()
 
 
@@ -247,9 +248,9 @@ def test_a_cloud_in_many_pairs_informs_each_of_them_less():
 def test_pairs_measured_again_say_the_same_and_less_where_points_weigh_less():
     truth, path, clouds = room(6, 0.01, 8.0)
     result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path)
-    raster = rasterize(clouds, 0.2 * CONFIG.first_gate, CONFIG.first_gate)
+    scans = ScanClouds(clouds, rasterize(clouds, 0.2 * CONFIG.first_gate, CONFIG.first_gate), 0.0)
     again = [
-        measured_again(result.edges, result.graph, clouds, raster, CONFIG, np.full(len(clouds.points), w)) for w in (1.0, 0.25)
+        measured_again(result.edges, result.graph, scans, CONFIG, np.full(len(clouds.points), w)) for w in (1.0, 0.25)
     ]
     sizes = [np.linalg.norm(e.sqrt_information, axis=(1, 2)) for e in (result.edges, *again)]
     # The width of the kernel is that of the noise assumed beforehand, not of the noise learnt.

@@ -7,8 +7,8 @@ from helpers.laser_walks import CORRIDOR, HALL, scanned
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.free_space import free_space, seen_beyond
-from uwblite.lidar.overlap import _AGAINST, _MARGIN, _NOISE, directional_overlap, net_overlap
-from uwblite.lidar.visibility import nearest_by_bearing
+from uwblite.lidar.overlap import OverlapPolicy, directional_overlap, net_overlap
+from uwblite.lidar.visibility import VisibilityPolicy, nearest_by_bearing
 
 GATE, SPACING = 0.15, 0.02
 FIRST, SECOND = np.array([0]), np.array([1])
@@ -42,8 +42,8 @@ def by_loops(clouds, pose, free):
             distance = np.hypot(*(other - point).T)
             k = np.argmin(distance)
             good = distance[k] <= GATE and normal @ facing[k] > np.sqrt(0.5)
-            seen = seen_beyond(space, se2.transform(frame, point[None]), _MARGIN)[1][0] > 0
-            total += np.outer(normal, normal) * (1.0 if good else -_AGAINST * seen)
+            seen = seen_beyond(space, se2.transform(frame, point[None]), VisibilityPolicy.margin)[1][0] > 0
+            total += np.outer(normal, normal) * (1.0 if good else -OverlapPolicy.against * seen)
     angle = np.linspace(0.0, np.pi, 3600)
     u = np.stack([np.cos(angle), np.sin(angle)])
     return SPACING * np.min(np.einsum("an,ab,bn->n", u, total, u))
@@ -118,7 +118,7 @@ def share_by_loops(clouds, pose):
             k = np.argmin(distance)
             asked += np.outer(normal, normal)
             matched += np.outer(normal, normal) * (distance[k] <= GATE and normal @ m[k] > np.sqrt(0.5))
-    asked += _NOISE * np.trace(asked) * np.eye(2)
+    asked += OverlapPolicy.noise * np.trace(asked) * np.eye(2)
     angle = np.linspace(0.0, np.pi, 3600)
     u = np.stack([np.cos(angle), np.sin(angle)])
     return np.min(np.einsum("an,ab,bn->n", u, matched, u) / np.einsum("an,ab,bn->n", u, asked, u))

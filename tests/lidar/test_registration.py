@@ -2,28 +2,30 @@
 
 import numpy as np
 import pytest
-from helpers.laser_walks import ROOM, scanned
+import registration_law
+from helpers.laser_walks import HALL, ROOM, scanned, walked
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
-from uwblite.lidar.object_likelihood import ObjectLikelihood, ObjectPolicy, matched_by_chance, objects
-from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, of_fallible
-from uwblite.lidar.scan_matching import PairPoints, pair_points
-from uwblite.lidar.visibility import nearest_by_bearing
+from uwblite.lidar.object_likelihood import ObjectLikelihood, matched_by_chance, objects, pairs_of
+from uwblite.lidar.registration import Prior, RegistrationConfig, of_fallible, register
 
 SIGMA = 0.02
 SOUND, SLIPPED = np.array([0.01, 0.01, 0.01]), np.array([0.4, 0.4, 0.3])
 
 
+def compared(clouds, mean):
+    """Return the likelihood of two clouds, and their pair."""
+    pairs, raster = pairs_of(clouds, np.array([0]), np.array([1])), rasterize(clouds, 0.1, 0.5)
+    return ObjectLikelihood.of(clouds, raster, SIGMA, pairs, np.array([mean])), pairs
+
+
 def registered(clouds, mean, sound=SOUND, slipped=SLIPPED):
     """Register cloud 1 in cloud 0 where the odometry counts a motion."""
-    covariance, raster = np.diag(sound**2)[None], rasterize(clouds, 0.1, 0.5)
+    (seen, pairs), covariance = compared(clouds, mean), np.diag(sound**2)[None]
     prior = Prior(np.array([mean]), covariance, covariance + np.diag(slipped**2))
-    one, points = np.array([0]), pair_points(clouds, np.array([1]), 150)
-    chance = matched_by_chance(clouds, raster, one, points, prior.mean)
-    registration = Registration(clouds, raster, nearest_by_bearing(clouds), SIGMA, chance)
-    return registration, points, prior, registration.register(one, one + 1, points, prior, prior.mean)
+    return seen, pairs, prior, register(seen, pairs, prior, prior.mean)
 
 
 @pytest.fixture(scope="module")
@@ -66,18 +68,16 @@ def test_what_is_measured_leaves_the_prior_out(room):
 def test_the_evidence_is_that_of_numerical_integration(room):
     """Laplace's approximation, within half a unit of the sum over a grid; the likelihood's constant cancels in neither."""
     truth, clouds = room
-    registration, points, prior, found = registered(clouds, se2.between(truth[0], truth[1]))
+    seen, pairs, prior, found = registered(clouds, se2.between(truth[0], truth[1]))
     mode, spread = found.sound.pose[0], np.sqrt(np.diag(found.sound.covariance[0]))
     axis = np.linspace(-5.0, 5.0, 13)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     shifts = grid @ np.linalg.cholesky(found.sound.covariance[0]).T
-    many = np.zeros(len(grid), dtype=np.int64)
-    rows = PairPoints(np.repeat(points.row, len(grid), axis=0))
-    _, judged = registration.objects.match(many, rows, mode + shifts, ObjectPolicy.gate, np.zeros((len(grid), 3, 3)))
+    log = seen.log_likelihood(pairs.rows(np.zeros(len(grid), dtype=np.intp)), mode + shifts)
     off = mode + shifts - prior.mean
     information = np.linalg.inv(prior.covariance[0])
-    log = np.concatenate([part.likelihood for part in judged]) - 0.5 * np.einsum("gi,ij,gj->g", off, information, off)
-    log -= 0.5 * np.linalg.slogdet(prior.covariance[0])[1] + 1.5 * np.log(2.0 * np.pi)
+    log -= 0.5 * np.einsum("gi,ij,gj->g", off, information, off) + 1.5 * np.log(2.0 * np.pi)
+    log -= 0.5 * np.linalg.slogdet(prior.covariance[0])[1]
     cell = (axis[1] - axis[0]) ** 3 * np.sqrt(np.linalg.det(found.sound.covariance[0]))
     assert found.sound.evidence[0] == pytest.approx(np.log(np.sum(np.exp(log - log.max())) * cell) + log.max(), abs=0.7)
     assert spread.max() < SOUND.max()
@@ -91,11 +91,10 @@ def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
     before = scanned(truth[:1], np.concatenate([walls, thing]), 0.005, 1)
     after = scanned(truth[1:], np.concatenate([walls, thing + np.array([0.06, 0.0, 0.06, 0.0])]), 0.005, 2)
     clouds = joined([before, after])
-    registration, points, _, found = registered(clouds, truth[1])
+    seen, pairs, _, found = registered(clouds, truth[1])
     assert found.log_odds[0] < 0.0
     assert np.abs(se2.between(truth[1], found.sound.pose[0])).max() < 0.01
-    one = np.array([0])
-    moving = registration.objects.moving(one, one + 1, points, found.sound.pose, found.sound.covariance)
+    moving = seen.moving(pairs, found.sound.pose, found.sound.covariance)
     x = clouds.points[:, 0] + truth[clouds.owner, 0]
     on_thing = (clouds.owner == 1) & (np.abs(x - 1.26) < 0.05) & (np.abs(clouds.points[:, 1]) < 0.85)
     assert moving[on_thing].mean() > 0.9
@@ -126,11 +125,9 @@ def test_how_often_things_move_is_learnt(moving, seen):
     They are 0.16 of all and, with those of both, 0.18 of 0.82 that say anything; one in ten is by chance where it was before.
     """
     clouds = crowd(moving, 4)
-    i = np.arange(59)
-    points, raster, still = pair_points(clouds, i + 1, 150), rasterize(clouds, 0.1, 0.5), np.zeros((59, 3))
-    chance = matched_by_chance(clouds, raster, i, points, still)
-    judge = ObjectLikelihood(clouds, raster, nearest_by_bearing(clouds), SIGMA, chance)
-    judge.learn_moves(i, points, still)
+    i, still = np.arange(59), np.zeros((59, 3))
+    pairs = pairs_of(clouds, i, i + 1)
+    judge = ObjectLikelihood.of(clouds, rasterize(clouds, 0.1, 0.5), SIGMA, pairs, still).learnt(pairs, still)
     # Three standard deviations of a share of 580 posts, and what is expected beforehand.
     assert judge.moves == pytest.approx(seen, abs=3.0 * np.sqrt(max(seen, 1e-3) / 580))
 
@@ -163,10 +160,24 @@ def test_points_match_by_chance_in_clutter_and_hardly_in_a_room(room):
     full = scanned(truth, np.array(shelves), 0.005, 4)
     one, step = np.array([0]), se2.between(truth[:1], truth[1:])
     shares = [
-        matched_by_chance(c, rasterize(c, 0.1, 0.5), one, pair_points(c, one + 1, 150), step)[0] for c in (clouds, full)
+        matched_by_chance(c, rasterize(c, 0.1, 0.5), pairs_of(c, one, one + 1), step)[0] for c in (clouds, full)
     ]
     assert shares[0] < 0.2
     assert shares[1] > shares[0] + 0.1
+
+
+def test_of_placements_called_right_with_a_probability_that_share_is_right():
+    """Pairs of a walk through a hall, a fifth of them with wheels that slipped by half a metre."""
+    truth, _, clouds = walked(7, HALL, 60.0)
+    law = registration_law.placements(clouds, truth, 1, np.random.default_rng(1), 0.005)
+    for limit in (0.5, 0.9):
+        sure = law.probability > limit
+        assert sure.sum() > 0.5 * len(sure)
+        # Three standard deviations of a share.
+        expected = law.probability[sure].mean()
+        assert law.right[sure].mean() > expected - 3.0 * np.sqrt(expected * (1.0 - expected) / sure.sum())
+    assert law.log_score > np.log(0.8)
+    assert registration_law.report([("walk", law)]).count("walk |") >= 2
 
 
 def test_evidence_that_may_be_wrong_is_bounded_and_keeps_its_sign():

@@ -5,7 +5,7 @@ import pytest
 from helpers.planted import box, drive, scans
 
 from uwblite import se2
-from uwblite.lidar.scan_odometry import _FIRST_GATE, _pairs, _points, _searched, misfits, scan_steps
+from uwblite.lidar.scan_odometry import ScanStepPolicy, _pairs, _points, _searched, misfits, scan_steps
 from uwblite.sensor_log import SensorMounting
 
 WALLS = np.concatenate([box(9, 7), box(1, 2) + np.array([2.5, 1.5] * 2)])
@@ -33,7 +33,7 @@ def test_motions_are_found_whatever_the_mounting(mounting):
     right, wrong = (misfits(lidar, mounting, FIRST, SECOND, exact + off) for off in (np.zeros(3), np.array([0.1, 0.1, 0.0])))
     assert np.all(right < 0.2 * wrong)
     away = misfits(lidar, mounting, FIRST, SECOND, exact + np.array([90.0, 0.0, 0.0]))
-    np.testing.assert_allclose(away, _FIRST_GATE**2)
+    np.testing.assert_allclose(away, ScanStepPolicy.first_gate**2)
 
 
 def test_along_a_bare_corridor_a_scan_matches_the_next_one_no_better_if_the_robot_stood():

@@ -11,7 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
-from uwblite.lidar.scan_to_scan import TrackingConfig, descend, follow, reattached
+from uwblite.lidar.scan_to_scan import follow, match_plainly, reattached
 from uwblite.odometry.slips import EVERY, LASTS
 
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -31,8 +31,8 @@ def tracked(truth, clouds, stated, by_ranges=None):
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps, TrackingConfig())
+    steps = match_plainly(clouds, raster, wheels.i, stated, GATE)
+    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps)
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
     poses[astray] = se2.compose(poses[astray], np.array([0.2, -0.1, 0.8]))
     tied[astray] = False
     raster = rasterize(clouds, 0.1, GATE)
-    found, laid = reattached(clouds, raster, poses, np.arange(len(truth)) * 1.0, tied, GATE, TrackingConfig())
+    found, laid = reattached(clouds, raster, poses, np.arange(len(truth)) * 1.0, tied, GATE)
     assert laid.tolist() == [astray]
     error = se2.between(se2.between(truth[astray - 1], truth[astray]), se2.between(found[astray - 1], found[astray]))
     assert np.hypot(*error[:2]) < 0.02
@@ -174,7 +174,7 @@ def test_as_many_as_three_keyframes_in_a_row_are_laid_where_their_stamps_say(wal
     poses = truth.copy()
     poses[run] += [30.0, 0.0, 1.0]
     stamps = 1e6 + np.arange(len(truth))
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE, TrackingConfig())
+    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE)
     assert laid.tolist() == run.tolist()
     error = se2.between(truth[run], found[run])
     assert np.abs(error[:, :2]).max() < 0.03
@@ -186,6 +186,6 @@ def test_keyframes_without_neighbours_on_both_sides_stay(walk):
     tied = np.ones(len(truth), dtype=bool)
     tied[[0, -1]] = False
     tied[4:9] = False
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE, TrackingConfig())
+    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE)
     assert len(laid) == 0
     np.testing.assert_array_equal(found, truth)

@@ -16,7 +16,7 @@ from uwblite.lidar.submaps import SubmapConfig
 from uwblite.lidar.visibility import observed_free_space
 from uwblite.loop_closure.closures import LoopClosureConfig
 from uwblite.loop_closure.loose_links import (
-    _LEAST_POINTS,
+    LinkPolicy,
     _pieces,
     contradicted,
     loose_links,
@@ -151,7 +151,7 @@ def test_pieces_end_at_the_next_link(walk):
     several = {(int(r), int(a), int(b)) for r, a, b in zip(reference[:, 0], first[:, 0], last[:, 0], strict=True)}
     assert several == {(10, 5, 11), (11, 11, 15), (14, 11, 15), (15, 15, 21)}
     single = {tuple(row) for row in np.column_stack([reference, first[:, 1], last[:, 1]]).tolist()}
-    enough = clouds.counts >= _LEAST_POINTS
+    enough = clouds.counts >= LinkPolicy.points
     expected = {(b, a + n, a + n, a + n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[a + n]}
     expected |= {(a, b - n, b - n, b - n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[b - n]}
     assert single == expected

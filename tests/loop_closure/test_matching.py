@@ -78,7 +78,7 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
         target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
     )  # fmt: skip
     fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
-    for candidates.long, places, step in ((False, config.places, fine), (True, matching._MANY_PLACES, coarse)):
+    for candidates.long, places, step in ((False, config.places, fine), (True, matching.MatchingPolicy.many_places, coarse)):
         asked.clear(), steps.clear()
         rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
         wide = (3, 7, 9.0, 9.0, config.search_angle)

@@ -11,10 +11,8 @@ from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.solver import SolverConfig
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig
 from uwblite.loop_closure.slid_stretches import (
-    _AGREES,
-    _CLEAR_HEADING,
-    _CLEAR_PLACE,
     NEAR,
+    SlidPolicy,
     directions_constrained,
     jumps,
     moved_by,
@@ -151,15 +149,15 @@ def test_what_scan_edges_fix_is_counted_step_by_step(seed):
     i, j = i[i != j], j[i != j]
     size = len(i)
     wide = rng.random((size, 3)) < 0.35
-    limits = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
+    limits = np.array([SlidPolicy.clear_place, SlidPolicy.clear_place, SlidPolicy.clear_heading])
     root = np.eye(3) / (limits * np.where(wide, 1.01, 0.99))[:, None, :]
-    off = np.where(rng.random(size) < 0.2, 1.05, 0.95) * _AGREES
+    off = np.where(rng.random(size) < 0.2, 1.05, 0.95) * SlidPolicy.agrees
     T = se2.between(truth[i], truth[j])
     T[:, 0] += off / root[:, 0, 0]
     none = np.zeros((size, 3))
     edges = ScanEdges(i, j, T, root, none, none, scan_indices(Calibration()))
     graph = Graph(truth, edges=(wheels, edges))
-    agrees = np.abs(edges.residuals(graph)).max(axis=1) < _AGREES
+    agrees = np.abs(edges.residuals(graph)).max(axis=1) < SlidPolicy.agrees
     fixed = (~wide).sum(axis=1)
     count, best = np.zeros((2, KEYFRAMES), dtype=int)
     for a, b, f in zip(np.minimum(i, j)[agrees], np.maximum(i, j)[agrees], fixed[agrees], strict=True):

@@ -15,11 +15,11 @@ from uwblite.assessment.causes import explained
 from uwblite.constraints import Constraints
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.lidar.scan_matching import pair_points
+from uwblite.lidar.object_likelihood import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.broken_steps import broken_steps
-from uwblite.pipeline.broken_stretches import _registration, _stretch, replace_broken_stretches
+from uwblite.pipeline.broken_stretches import _likelihood, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
@@ -158,11 +158,11 @@ def test_the_stretch_is_the_slip_around_the_broken_step():
 
 
 def test_rays_are_less_probable_beside_their_walls():
-    sound, task, _ = walked()
+    sound, _, _ = walked()
     clouds, poses = sound.lidar.clouds, sound.graph.poses
     i = np.arange(0, 40, 4)
     at = se2.between(poses[i], poses[i + 1])
-    rays, points = _registration(sound, task), pair_points(clouds, i + 1, 150)
-    right, wrong = (rays.log_likelihood(i, points, pose) for pose in (at, se2.compose(at, np.array([0.5, 0.5, 0.0]))))
+    rays, pairs = _likelihood(sound), pairs_of(clouds, i, i + 1)
+    right, wrong = (rays.log_likelihood(pairs, pose) for pose in (at, se2.compose(at, np.array([0.5, 0.5, 0.0]))))
     assert np.all(right > wrong)
-    assert rays.log_likelihood(i[:0], points, at[:0]).shape == (0,)
+    assert rays.log_likelihood(pairs.rows(i[:0]), at[:0]).shape == (0,)

@@ -26,6 +26,7 @@ from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import optimize
+from uwblite.lidar.cloud_rasters import ScanClouds
 from uwblite.pipeline import calibration_checks
 from uwblite.pipeline.calibration_checks import (
     odometry_unit_factors,
@@ -34,7 +35,7 @@ from uwblite.pipeline.calibration_checks import (
     with_slip_in_turns,
     with_units_checked,
 )
-from uwblite.pipeline.estimate import Estimate, OtherHeights, ScanClouds
+from uwblite.pipeline.estimate import Estimate, OtherHeights
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import Recordings

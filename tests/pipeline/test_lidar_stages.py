@@ -11,8 +11,9 @@ from helpers.told import doubted
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.lidar.cloud_rasters import ScanClouds
 from uwblite.pipeline import lidar_stages, neighbour_matching
-from uwblite.pipeline.estimate import Estimate, ScanClouds
+from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.lidar_stages import check_map_consistency
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages

@@ -55,6 +55,18 @@ class CloudRasters:
         return self.nearest[first[:, None] + np.arange(_RUN)].reshape(wide, runs * _RUN)[:, :high]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanClouds:
+    """The lidar of all recordings, ready for matching."""
+
+    clouds: Clouds
+    """One per keyframe."""
+    raster: CloudRasters
+    """Of the same clouds."""
+    delay: float
+    """Offset of the lidar's clock with which the clouds were made, s."""
+
+
 def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     """Build the rasters: each point with a normal writes its number into the cells within reach, nearest cells last.
 

@@ -20,7 +20,7 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Optimizer, SolverConfig, SolverSummary
-from .cloud_rasters import CloudRasters
+from .cloud_rasters import ScanClouds
 from .clouds import Clouds
 from .overlap import surface_cells
 from .scan_matching import PairFactors, match, measured, pair_points
@@ -140,40 +140,40 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
     return i, j
 
 
-def refine(
-    graph: Graph,
-    clouds: Clouds,
-    raster: CloudRasters,
-    twist: Floats,
-    i: Ints,
-    j: Ints,
-    config: RefinementConfig,
-    solver: SolverConfig,
-    on_round: Callable[[int, int], None] | None = None,
-    delay: float = 0.0,
-) -> RefinementResult:
-    """Match all pairs and solve the graph, round by round.
+def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> ScanEdges:
+    """Return pairs of clouds (e,), (e,) as scan edges that nothing has measured yet.
 
     Parameters
     ----------
-    graph : wheels, radio, priors and other edges; scan edges come from here.
-    clouds, raster : see clouds.build and cloud_rasters.rasterize; the raster's reach bounds the gate.
-    twist : (k, 3) velocity of the base at each keyframe.
+    graph : in which they are. twist : (k, 3) velocity of the base at each keyframe.
     delay : of the lidar's clock, s, with which the clouds were made.
     """
     # Lines seen obliquely are tilted a little, so the cloud that gives the points seems shifted towards its laser: half a
     # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
+    none, names = np.broadcast_to(0.0, (len(i), 3, 3)), scan_indices(graph.calibration)
+    return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
+
+
+def refine(
+    graph: Graph, scans: ScanClouds, pairs: ScanEdges, config: RefinementConfig, solver: SolverConfig,
+    on_round: Callable[[int, int], None] | None = None,
+) -> RefinementResult:
+    """Match all pairs and solve the graph, round by round.
+
+    Parameters
+    ----------
+    graph : wheels, radio, priors and other edges; scan edges come from here.
+    scans : their raster's reach bounds the gate. pairs : see unmeasured.
+    """
+    i, j, clouds, raster = pairs.i, pairs.j, scans.clouds, scans.raster
     points = pair_points(clouds, j, config.points)
-    names = scan_indices(graph.calibration)
     gate, sigma, rounds, fit = config.first_gate, config.sigma, 0, np.inf
-    none = np.broadcast_to(0.0, (len(i), 3, 3))
-    probe = ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     optimizer = Optimizer()
     # The next round looks all matches up again: one successful step is enough.
     brief = replace(solver, max_iterations=12, relative_decrease=0.5)
-    T_i_j = probe.relative(graph)
+    T_i_j = pairs.relative(graph)
     while True:
         factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
         used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
@@ -182,10 +182,10 @@ def refine(
             sigma = max(sigma, 0.25 * config.sigma)
         z, sqrt_information = measured(factors, T_i_j, sigma**2 * _shared(i, j, used, config))
         # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.
-        edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
+        edges = replace(pairs, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
         solved, summary = optimizer.optimize(graph.with_edges(edges), brief)
         graph = graph.with_estimates_of(solved)
-        before, T_i_j = T_i_j, probe.relative(graph)
+        before, T_i_j = T_i_j, pairs.relative(graph)
         moved = _surfaces_moved(factors, used, T_i_j - before)
         rounds += 1
         if on_round is not None:
@@ -210,12 +210,13 @@ def _shared(i: Ints, j: Ints, used: Bools, config: RefinementConfig) -> Floats:
 
 
 def measured_again(
-    pairs: ScanEdges, graph: Graph, clouds: Clouds, raster: CloudRasters, config: RefinementConfig, weight: Floats
+    pairs: ScanEdges, graph: Graph, scans: ScanClouds, config: RefinementConfig, weight: Floats
 ) -> ScanEdges:
     """Return refined pairs as the poses of a graph have them, measured with weights (p,) of the clouds' points."""
-    T_i_j, points = pairs.relative(graph), pair_points(clouds, pairs.j, config.points)
+    T_i_j, points = pairs.relative(graph), pair_points(scans.clouds, pairs.j, config.points)
     gate = config.last_gate
-    factors = match(clouds, raster, pairs.i, T_i_j, points, gate, max(gate / 3.0, 2.5 * config.sigma), weight)
+    kernel = max(gate / 3.0, 2.5 * config.sigma)
+    factors = match(scans.clouds, scans.raster, pairs.i, T_i_j, points, gate, kernel, weight)
     variance = factors.squared.sum() / max(factors.weight.sum(), 1.0)
     shared = _shared(pairs.i, pairs.j, np.ones(len(pairs), dtype=bool), config)
     z, sqrt_information = measured(factors, T_i_j, max(variance, (0.25 * config.sigma) ** 2) * shared)

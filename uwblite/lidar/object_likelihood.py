@@ -11,17 +11,18 @@ where g is what a match gains over one by chance, at most as much as an object t
 the place.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .free_space import free_space
-from .scan_matching import Correspondences, PairFactors, PairPoints, condensed, correspondences
-from .visibility import in_free_space
+from .scan_matching import Correspondences, PairFactors, PairPoints, condensed, correspondences, pair_points
+from .visibility import in_free_space, nearest_by_bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +39,18 @@ class ObjectPolicy:
     """Distance between neighbouring points that ends an object, m."""
     moves: ClassVar[float] = 0.03
     """Probability that an object moves by itself, before any was seen: one in a room of thirty things."""
+    unlikely: ClassVar[float] = 0.5
+    """Probability of standing still below which an object moves."""
     sure: ClassVar[float] = 0.99
     """Probability of standing still from which on an object counts as one that does."""
     long: ClassVar[float] = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
     fits: ClassVar[float] = 5.0 / 6.0
     """Share of the points in view that match in the true place."""
+    points: ClassVar[int] = 150
+    """Points looked up per pair."""
+    largest: ClassVar[float] = 50.0
+    """Largest exponent; beyond it a probability is one or none to rounding."""
     aside: ClassVar[float] = 0.4
     """Distance along both axes at which no point is where it belongs, m; along a wall, points match all the same."""
 
@@ -60,58 +67,102 @@ class Judged:
     """(e,) the same where every point agreed."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudPairs(Table):
+    """Pairs (e) of clouds of which one is placed in the other."""
+
+    i: Ints
+    """(e,) targets."""
+    j: Ints
+    """(e,) sources."""
+    points: PairPoints
+    """Of the sources."""
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+def pairs_of(clouds: Clouds, i: Ints, j: Ints) -> CloudPairs:
+    """Return pairs of targets i (e,) and sources j (e,)."""
+    return CloudPairs(i, j, pair_points(clouds, j, ObjectPolicy.points))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ObjectLikelihood:
     """Clouds whose surfaces are compared with each other."""
 
-    def __init__(self, clouds: Clouds, raster: CloudRasters, nearest: Floats, sigma: float, chance: Floats) -> None:
-        """Take clouds and their rasters; for the others see Registration."""
-        self._clouds, self._raster, self._sigma, self._chance = clouds, raster, sigma, chance
-        self._free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        self._object, self._length = objects(clouds, ObjectPolicy.gap)
-        self.moves = ObjectPolicy.moves
+    clouds: Clouds
+    raster: CloudRasters
+    sigma: float
+    """Standard deviation of a match, m."""
+    chance: Floats
+    """(k,) share of points that match each cloud by chance, see matched_by_chance."""
+    free: Floats
+    """(k, bearings) m, free space around each cloud by bearing, see FreeSpace.ranges."""
+    number: Ints
+    """(p,) object of each point within its cloud."""
+    length: Floats
+    """(p,) m, of that object."""
+    moves: float = ObjectPolicy.moves
+    """Probability that an object moves by itself."""
 
-    def learn_moves(self, i: Ints, points: PairPoints, pose: Floats) -> None:
-        """Estimate the probability that an object moves by the objects of pairs where matching ended, at poses (e, 3).
+    @classmethod
+    def of(cls, clouds: Clouds, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
+        """Return that of clouds with their raster, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
+        chance = matched_by_chance(clouds, raster, pairs, poses)
+        nearest = nearest_by_bearing(clouds)
+        free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
+        return cls(clouds, raster, sigma, chance, free, *objects(clouds, ObjectPolicy.gap))
+
+    def learnt(self, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
+        """Return the likelihood with the probability that an object moves as pairs where matching ended, at poses (e, 3), show.
 
         An empty hall has few things that move and a museum many: what contradicts the place of a cloud counts accordingly.
         """
-        moved, known, exact = 1.0, 1.0 / ObjectPolicy.moves, np.zeros((len(i), 3, 3))
-        for found in correspondences(self._clouds, self._raster, i, pose, points, ObjectPolicy.gate):
-            some = found.pairs
-            static = self._judge(found, i[some], pose[some], exact[some]).static
-            moved += float(np.sum(static < _UNLIKELY))
-            known += float(np.sum((static < _UNLIKELY) | (static > ObjectPolicy.sure)))
-        self.moves = moved / known
+        moved = stood = 0.0
+        for _, judged in self._judged(pairs, poses, ObjectPolicy.gate):
+            moved += float(np.sum(judged.static < ObjectPolicy.unlikely))
+            stood += float(np.sum(judged.static > ObjectPolicy.sure))
+        return replace(self, moves=(1.0 + moved) / (1.0 / ObjectPolicy.moves + moved + stood))
+
+    def log_likelihood(self, pairs: CloudPairs, poses: Floats) -> Floats:
+        """Return the log likelihood (e,) of sources at poses (e, 3) by that in unknown space."""
+        return np.concatenate([judged.likelihood for _, judged in self._judged(pairs, poses, ObjectPolicy.gate)])
 
     def match(
-        self, i: Ints, points: PairPoints, pose: Floats, gate: float, covariance: Floats
+        self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None
     ) -> tuple[PairFactors, list[Judged]]:
         """Return factors of the objects that do not move, and how each pair agrees, at poses (e, 3)."""
-        parts, judged = [], []
-        for found in correspondences(self._clouds, self._raster, i, pose, points, gate):
-            some = found.pairs
-            own = self._judge(found, i[some], pose[some], covariance[some])
-            weight = np.take_along_axis(own.static, self._object[found.row], axis=1) * found.good
-            parts.append(condensed(self._clouds, found, max(gate / 2.0, 3.0 * self._sigma), np.sqrt(weight)))
-            judged.append(own)
-        return concatenated(parts), judged
+        parts, agreement = [], []
+        for found, judged in self._judged(pairs, poses, gate, covariance):
+            weight = np.take_along_axis(judged.static, self.number[found.row], axis=1) * found.good
+            parts.append(condensed(self.clouds, found, max(gate / 2.0, 3.0 * self.sigma), np.sqrt(weight)))
+            agreement.append(judged)
+        return concatenated(parts), agreement
 
-    def moving(self, i: Ints, j: Ints, points: PairPoints, pose: Floats, covariance: Floats) -> Bools:
-        """Return which points (p,) of all clouds belong to objects of sources j (e,) that moved by themselves.
+    def moving(self, pairs: CloudPairs, poses: Floats, covariance: Floats) -> Bools:
+        """Return which points (p,) of all clouds belong to objects of sources that moved by themselves.
 
         Parameters
         ----------
-        pose, covariance : (e, 3) T_i_j and (e, 3, 3). For the others see register.
+        poses, covariance : (e, 3) T_i_j and (e, 3, 3).
         """
-        moves = np.zeros(len(self._clouds.points), dtype=bool)
-        for found in correspondences(self._clouds, self._raster, i, pose, points, ObjectPolicy.gate):
-            some = found.pairs
-            judged = self._judge(found, i[some], pose[some], covariance[some])
-            for source, static in zip(j[some].tolist(), judged.static, strict=True):
-                rows = slice(int(self._clouds.offsets[source]), int(self._clouds.offsets[source + 1]))
-                number = np.minimum(self._object[rows], len(static) - 1)
-                moves[rows] |= (static[number] < _UNLIKELY) & (self._object[rows] < len(static))
+        moves = np.zeros(len(self.clouds.points), dtype=bool)
+        for found, judged in self._judged(pairs, poses, ObjectPolicy.gate, covariance):
+            for source, static in zip(pairs.j[found.pairs].tolist(), judged.static, strict=True):
+                rows = slice(int(self.clouds.offsets[source]), int(self.clouds.offsets[source + 1]))
+                own = self.number[rows]
+                moves[rows] |= (static[np.minimum(own, len(static) - 1)] < ObjectPolicy.unlikely) & (own < len(static))
         return moves
+
+    def _judged(
+        self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None
+    ) -> Iterator[tuple[Correspondences, Judged]]:
+        """Yield some pairs at a time, what their points match, and how their objects agree."""
+        covariance = np.zeros((len(pairs), 3, 3)) if covariance is None else covariance
+        for found in correspondences(self.clouds, self.raster, pairs.i, poses, pairs.points, gate):
+            some = found.pairs
+            yield found, self._judge(found, pairs.i[some], poses[some], covariance[some])
 
     def _judge(self, found: Correspondences, i: Ints, pose: Floats, covariance: Floats) -> Judged:
         """Judge the objects of some pairs (e,) at poses (e, 3), whose covariance (e, 3, 3) is left out of the residuals."""
@@ -119,16 +170,16 @@ class ObjectLikelihood:
         (nx, ny), (rx, ry) = found.normal, found.arm
         jacobian = np.stack([nx, ny, ny * rx - nx * ry])
         # What the prior leaves open shifts a surface without making it a thing that moves.
-        variance = self._sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
+        variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
         squared = np.square(found.distance) / variance
         cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
-        through, in_view = in_free_space(self._free, i, rx + pose[:, :1], ry + pose[:, 1:2])
+        through, in_view = in_free_space(self.free, i, rx + pose[:, :1], ry + pose[:, 1:2])
         through &= usable & ~found.good
         missed = usable & ~found.good & in_view & ~through
-        chance = self._chance[i][:, None]
+        chance = self.chance[i][:, None]
         cost += 2.0 * np.log(np.maximum((1.0 - chance) / (1.0 - c.fits), 1.0)) * missed
         cost[through] = c.outlier
-        group = self._object[found.row]
+        group = self.number[found.row]
         many = int(group.max(initial=0)) + 1
         key = (np.arange(len(i))[:, None] * many + group)[usable]
         chi2, matched, asked = (
@@ -137,32 +188,32 @@ class ObjectLikelihood:
         )
         # An object longer than any that moves by itself would be several that move together.
         most = np.full((len(i), many), -np.log(self.moves))
-        most.reshape(-1)[key] *= np.maximum(self._length[found.row[usable]] / c.long, 1.0)
-        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self._sigma))
+        most.reshape(-1)[key] *= np.maximum(self.length[found.row[usable]] / c.long, 1.0)
+        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
         return Judged(
-            1.0 / (1.0 + np.exp(np.clip(-most - stays, -_HUGE, _HUGE))),
+            1.0 / (1.0 + np.exp(np.clip(-most - stays, -ObjectPolicy.largest, ObjectPolicy.largest))),
             np.logaddexp(fixed + stays, -most).sum(axis=1),
             np.logaddexp(fixed + np.minimum(gain * asked, most), -most).sum(axis=1),
         )
 
 
-def matched_by_chance(clouds: Clouds, raster: CloudRasters, i: Ints, points: PairPoints, mean: Floats) -> Floats:
-    """Return the share (k,) of points of sources that match each target cloud i (e,) where they do not belong: aside.
+def matched_by_chance(clouds: Clouds, raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> Floats:
+    """Return the share (k,) of points of sources that match each target cloud where they do not belong: aside.
 
     Parameters
     ----------
-    points : of the sources, see pair_points. mean : (e, 3) about where these belong, T_i_j.
+    mean : (e, 3) about where these belong, T_i_j.
     """
-    matched = np.ones(len(i))
+    matched = np.ones(len(pairs))
     for x in (-ObjectPolicy.aside, ObjectPolicy.aside):
         for y in (-ObjectPolicy.aside, ObjectPolicy.aside):
             aside = mean + np.array([x, y, 0.0])
-            for found in correspondences(clouds, raster, i, aside, points, ObjectPolicy.gate):
+            for found in correspondences(clouds, raster, pairs.i, aside, pairs.points, ObjectPolicy.gate):
                 matched[found.pairs] += found.good.sum(axis=1)
     # One match of three beforehand (Laplace's rule of succession).
     chance = np.full(len(clouds), 1.0 / 3.0)
-    chance[i] = matched / (4 * (points.row >= 0).sum(axis=1) + 3)
+    chance[pairs.i] = matched / (4 * (pairs.points.row >= 0).sum(axis=1) + 3)
     return chance
 
 
@@ -175,7 +226,3 @@ def objects(clouds: Clouds, gap: float) -> tuple[Ints, Floats]:
     length = np.bincount(number, np.concatenate([[0.0], away])[: len(points)] * ~new)
     first = number[np.minimum(clouds.offsets[:-1], max(len(points) - 1, 0))] if len(points) else number
     return number - first[owner], length[number]
-
-
-_UNLIKELY, _HUGE = 0.5, 50.0
-"""Probability of standing still below which an object moves, and the largest exponent."""

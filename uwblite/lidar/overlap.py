@@ -6,6 +6,8 @@ points and weights w, a direction u has the sum u^T (sum w n n^T) u, and eigenva
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +19,23 @@ from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .free_space import FreeSpace, seen_beyond
 from .scan_matching import Correspondences, correspondences, pair_points
+from .visibility import VisibilityPolicy
 
-_NOISE = 0.005
-"""Share of the points added in every direction: fewer points that face it, as along a bare wall, are noise of normals."""
-_AGAINST = 2.0
-"""Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true place five
-of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
-_MARGIN = 0.3
-"""Distance behind the observed free space up to which a point counts as in view, m."""
+
+@dataclass(frozen=True, slots=True)
+class OverlapPolicy:
+    """Surface that two clouds have in common."""
+
+    noise: ClassVar[float] = 0.005
+    """Share of the points added in every direction: fewer points that face it, as along a bare wall, are noise of normals."""
+    against: ClassVar[float] = 2.0
+    """Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true
+    place five of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) /
+    (1/2)) = 2.2."""
+    points_at_once: ClassVar[int] = 1 << 16
+    """Points brought into the map's frame at once."""
+    surface_cell: ClassVar[float] = 0.5
+    """Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
 
 
 def directional_overlap(
@@ -39,11 +50,15 @@ def directional_overlap(
     ----------
     limit : most points looked up per cloud. gate : farthest match, m.
     """
-    asked, matched = _both_ways(
-        clouds, raster, i, j, T_i_j, limit, gate, lambda found, *_: (found.row >= 0).astype(np.float64),
-        lambda found, *_: found.good.astype(np.float64),
-    )  # fmt: skip
-    noise = _NOISE * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
+
+    def looked_up(found: Correspondences, *_: Ints | Floats) -> Floats:
+        return (found.row >= 0).astype(np.float64)
+
+    def good(found: Correspondences, *_: Ints | Floats) -> Floats:
+        return found.good.astype(np.float64)
+
+    asked, matched = _both_ways(clouds, raster, i, j, T_i_j, limit, gate, looked_up, good)
+    noise = OverlapPolicy.noise * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
     root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))
     return np.asarray(np.linalg.eigvalsh(root @ matched @ np.swapaxes(root, 1, 2))[:, 0])
 
@@ -71,7 +86,7 @@ def net_overlap(
             missed &= _in_view(clouds, free, i, T_i_j, found)
         # The points looked up stand for those left out.
         asked = np.maximum((found.row >= 0).sum(axis=1), 1)
-        return np.asarray((found.good - _AGAINST * missed) * (clouds.counts[j] / asked)[:, None])
+        return np.asarray((found.good - OverlapPolicy.against * missed) * (clouds.counts[j] / asked)[:, None])
 
     (both,) = _both_ways(clouds, raster, i, j, T_i_j, limit, gate, weight)
     return np.asarray(spacing * np.linalg.eigvalsh(both)[:, 0])
@@ -104,23 +119,18 @@ def _both_ways(
 def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, found: Correspondences) -> Bools:
     """Return which points (e, n) were in view from the places at which clouds i (e,) were seen."""
     points = se2.transform(T_i_j[:, None, :], clouds.points[found.row])
-    return np.array([seen_beyond(free[k], p, _MARGIN)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
-
-
-_POINTS_AT_ONCE = 1 << 16
-"""Points brought into the map's frame at once."""
-_SURFACE_CELL = 0.5
-"""Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
+    seen = [seen_beyond(free[k], p, VisibilityPolicy.margin)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)]
+    return np.array(seen, dtype=bool)
 
 
 def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
     usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
-    for first in range(0, len(usable), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
+    for first in range(0, len(usable), OverlapPolicy.points_at_once):
+        part = slice(first, first + OverlapPolicy.points_at_once)
         owner = clouds.owner[usable[part]]
-        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / _SURFACE_CELL)
+        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / OverlapPolicy.surface_cell)
         bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
         facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.intp) % 8
     cell -= cell.min(axis=0, initial=0)
@@ -137,8 +147,8 @@ def _seen_cells(
     owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
 ) -> Iterator[tuple[Wides, Wides]]:
     """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
-    for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
+    for first in range(0, max(len(owner), 1), OverlapPolicy.points_at_once):
+        part = slice(first, first + OverlapPolicy.points_at_once)
         key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * 8 + facing[part]
         many = int(key.max(initial=0)) + 1
         yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)

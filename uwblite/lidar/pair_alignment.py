@@ -1,6 +1,7 @@
 """Point-to-line ICP of many pairs of clouds at once, each pair on its own."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,12 +11,19 @@ from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import PairFactors, PairPoints, match, nondegenerate_step
 
-_FARTHEST, _WIDEST = 0.3, 0.15
-"""Longest step of one iteration, m and rad."""
-_GATE_PER_STEP = 10.0
-"""Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
-_CONVERGED = 1e-4
-"""Steps below this end the descent, m or rad."""
+
+@dataclass(frozen=True, slots=True)
+class DescentPolicy:
+    """Descent of one pair of clouds."""
+
+    farthest: ClassVar[float] = 0.3
+    """Longest step of one iteration, m."""
+    widest: ClassVar[float] = 0.15
+    """The same in heading, rad."""
+    gate_per_step: ClassVar[float] = 10.0
+    """Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
+    converged: ClassVar[float] = 1e-4
+    """Steps below this end the descent, m or rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,12 +64,12 @@ def align_pairs(
         some = PairPoints(points.row[moving])
         step = nondegenerate_step(match(clouds, raster, i[moving], pose[moving], some, gate, gate / 2.0))[0]
         length = np.abs(step).max(axis=1)
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / DescentPolicy.farthest, np.abs(step[:, 2]) / DescentPolicy.widest)
         pose[moving] += step / np.maximum(reach, 1.0)[:, None]
-        left = (length >= _CONVERGED) | (gate > last_gate)
+        left = (length >= DescentPolicy.converged) | (gate > last_gate)
         if not left.any():
             break
-        gate = np.maximum(np.minimum(0.8 * gate, _GATE_PER_STEP * length), last_gate)[left]
+        gate = np.maximum(np.minimum(0.8 * gate, DescentPolicy.gate_per_step * length), last_gate)[left]
         moving = moving[left]
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     return Aligned(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))

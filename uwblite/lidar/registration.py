@@ -9,7 +9,7 @@ are compared by their evidence, the marginal likelihood of the source's surfaces
 where the sum is that of object_likelihood. Two clouds may also show nothing of each other's place; then neither part gains.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,17 +17,11 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
-from .cloud_rasters import CloudRasters, rasterize
-from .clouds import Clouds
-from .correlative_matching import search
-from .object_likelihood import ObjectLikelihood, ObjectPolicy
+from . import correlative_matching
+from .cloud_rasters import rasterize
+from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy
 from .raster_search import Window, best_poses
-from .scan_matching import (
-    PairFactors,
-    PairPoints,
-    nondegenerate_step,
-    pair_points,
-)
+from .scan_matching import PairFactors, nondegenerate_step, pair_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +32,8 @@ class RegistrationConfig:
     """Farthest match at the beginning of the descent, m; the reach of the rasters."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
+    same: ClassVar[float] = 16.27
+    """Squared Mahalanobis distance up to which two modes are one; one in a thousand exceeds it by chance."""
     worth: ClassVar[float] = 0.02
     """Posterior odds of a slip below which it is not searched for."""
     good_share: ClassVar[float] = 0.75
@@ -50,7 +46,7 @@ class RegistrationConfig:
     """Points that such a search looks up."""
     cell: ClassVar[float] = 0.1
     """Step of such a search in x and y, m."""
-    wide: ClassVar[float] = 1.2
+    wide: ClassVar[float] = 3.0
     """Half-width of a search from which on one correlation of all shifts takes less time, m."""
     linear: ClassVar[float] = 0.1
     """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
@@ -80,6 +76,16 @@ class Prior(Table):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Gaussian(Table):
+    """One part of such a prior."""
+
+    mean: Floats
+    """(e, 3) T_i_j."""
+    covariance: Floats
+    """(e, 3, 3)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Placed(Table):
     """Where descent ended, of e pairs."""
 
@@ -91,6 +97,8 @@ class Placed(Table):
     """(e, 3, 3) of the pose by matches and prior."""
     evidence: Floats
     """(e,) log marginal likelihood."""
+    likelihood: Floats
+    """(e,) log likelihood of the source there, by that in unknown space."""
     evidence_lost: Floats
     """(e,) by how much the log likelihood is below that of surfaces that all agree at the prior's mean."""
 
@@ -98,6 +106,12 @@ class Placed(Table):
     def share(self) -> Floats:
         """(e,) share of the points looked up that match, 0..1."""
         return self.factors.matched / np.maximum(self.factors.asked, 1)
+
+    def replaced(self, rows: Ints, others: "Placed", better: Bools) -> "Placed":
+        """Return placements some rows (r,) of which are replaced by others (r,) where these are better (r,)."""
+        which = np.arange(len(self.pose))
+        which[rows[better]] = len(which) + np.flatnonzero(better)
+        return concatenated([self, others]).rows(which)
 
     def measured(self, variance: float) -> tuple[Floats, Floats]:
         """Return what the matches alone measure, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
@@ -118,153 +132,138 @@ class Placed(Table):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """The modes of e pairs."""
+    """The modes of e pairs, one for each part of the prior; where a slip was not worth a search, both are the same."""
 
     sound: Placed
     """Where the odometry holds."""
-    searched: Ints
-    """(s,) pairs that may lie elsewhere."""
     slipped: Placed
-    """Of these, where the wheels slipped."""
+    """Where the wheels slipped."""
     log_odds: Floats
     """(e,) log of the evidence for a slip by that against it; 0 where the clouds say nothing."""
+    searched: Ints
+    """Pairs (s,) for which a slip was sought."""
+
+    def posterior(self, slips: float) -> Floats:
+        """Return the probabilities (3, e) that pairs lie at the sound mode, at that of a slip if that is another place, and at
+        none of these.
+
+        Parameters
+        ----------
+        slips : probability of a slip beforehand.
+        """
+        useless = RegistrationConfig.useless
+        parts = np.stack([
+            np.log((1.0 - useless) * (1.0 - slips)) + self.sound.evidence,
+            np.log((1.0 - useless) * slips) + self.slipped.evidence,
+            np.full(len(self.log_odds), np.log(useless)),
+        ])
+        # Any of them may be favoured falsely, however much.
+        likely = np.exp(parts - np.logaddexp.reduce(parts, axis=0))
+        off = _difference(self.slipped.pose, self.sound.pose)
+        both = self.sound.covariance + self.slipped.covariance
+        same = np.einsum("ei,ei->e", off, np.linalg.solve(both, off[:, :, None])[:, :, 0]) < RegistrationConfig.same
+        likely[:2] = np.where(same, np.stack([likely[:2].sum(axis=0), np.zeros(len(same))]), likely[:2])
+        return np.asarray((1.0 - useless) * likely + useless * np.array([[0.0], [0.0], [1.0]]))
 
     def chosen(self, probability: Floats) -> Placed:
         """Return the likelier mode of each pair, slips having a probability (e,)."""
-        return _replaced(self.sound, self.searched, self.slipped, probability[self.searched] > 0.5)
+        return self.sound.replaced(np.arange(len(probability)), self.slipped, probability > 0.5)
 
 
-def _replaced(placed: Placed, rows: Ints, others: Placed, better: Bools) -> Placed:
-    """Return pairs of which some rows (r,) are replaced by others where these are better (r,)."""
-    which = np.arange(len(placed.pose))
-    which[rows[better]] = len(which) + np.flatnonzero(better)
-    return concatenated([placed, others]).rows(which)
+Starts = Callable[[ObjectLikelihood, CloudPairs, Gaussian], list[Floats]]
+"""Gives poses (e, 3) from which matching begins."""
 
 
-def _best(placed: Sequence[Placed]) -> Placed:
-    """Return of several placements of the same pairs those with the largest evidence."""
-    best = np.argmax([p.evidence for p in placed], axis=0)
-    return concatenated(list(placed)).rows(best * len(best) + np.arange(len(best)))
+def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: Floats) -> Placement:
+    """Place the sources of pairs (e,) in their targets.
+
+    Parameters
+    ----------
+    other : (e, 3) further poses to start from.
+    """
+    c = RegistrationConfig
+    sound = descend(objects, pairs, prior.mean, Gaussian(prior.mean, prior.covariance))
+    log_odds = np.where(sound.factors.asked > 0, _most_odds(objects, sound, prior), 0.0)
+    rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
+    some, wide = pairs.rows(rows), Gaussian(prior.mean[rows], prior.slipped[rows])
+    slipped = descend(objects, some, other[rows], wide)
+    for least, starts in ((c.good_share, _shares), (c.least_share, _searched)):
+        poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
+        found = _from_best(objects, some.rows(poor), wide.rows(poor), starts)
+        slipped = slipped.replaced(poor, found, found.evidence > slipped.evidence[poor])
+    none = np.log(c.useless)
+    log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
+    slipped = sound.replaced(rows, slipped, np.ones(len(rows), dtype=bool))
+    return Placement(sound, slipped, of_fallible(log_odds, c.useless), rows)
 
 
-class Registration:
-    """Clouds ready for registration with each other."""
+def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:
+    """Place pairs (e,), each from the best of several starts."""
+    placed = [descend(objects, pairs, start, prior) for start in starts(objects, pairs, prior)]
+    best = np.argmax([each.evidence for each in placed], axis=0)
+    return concatenated(placed).rows(best * len(pairs) + np.arange(len(pairs)))
 
-    def __init__(self, clouds: Clouds, raster: CloudRasters, nearest: Floats, sigma: float, chance: Floats) -> None:
-        """Take clouds and their rasters.
 
-        Parameters
-        ----------
-        nearest : surface by bearing, see visibility. sigma : standard deviation of a match, m. chance : see matched_by_chance.
-        """
-        self._clouds, self._raster, self.sigma = clouds, raster, sigma
-        self.objects = ObjectLikelihood(clouds, raster, nearest, sigma, chance)
+def _shares(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
+    """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
+    return [share * prior.mean for share in (1.0, 0.5, 0.0)]
 
-    def register(self, i: Ints, j: Ints, points: PairPoints, prior: Prior, other: Floats) -> Placement:
-        """Place sources j (e,) in targets i (e,).
 
-        Parameters
-        ----------
-        points : of the sources, see pair_points. other : (e, 3) further poses to start from.
-        """
-        c = RegistrationConfig
-        sound = self._descend(i, points, prior.mean, prior.mean, prior.covariance)
-        log_odds = np.where(sound.factors.asked > 0, self._most_odds(sound, prior), 0.0)
-        rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
-        slipped = self._from_best(i, points, prior, rows, [other[rows]])
-        for least, further in ((c.good_share, self._shares), (c.least_share, self._searched)):
-            poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
-            lost = rows[poor]
-            found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
-            slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
-        none = np.log(c.useless)
-        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
-        return Placement(sound, rows, slipped, of_fallible(log_odds, c.useless))
+def _searched(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
+    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view.
 
-    def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
-        """Place some pairs (r,) whose wheels slipped, from the best of several starts (r, 3)."""
-        some, own = PairPoints(points.row[rows]), prior.rows(rows)
-        return _best([self._descend(i[rows], some, start, own.mean, own.slipped) for start in starts])
+    Where the wheels counted metres, the window is as large as the clouds: all its shifts are one correlation there.
+    """
+    c, clouds, within = RegistrationConfig, objects.clouds, 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
+    starts = np.tile(prior.mean, (c.places, 1, 1))
+    for row, (target, source) in enumerate(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)):
+        own, other = (clouds.chosen(np.array([k])) for k in (target, source))
+        view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (own, other))
+        low, high = (np.clip(prior.mean[row, :2] + side * within[row, :2], -view, view) for side in (-1.0, 1.0))
+        middle, half = np.append(0.5 * (low + high), prior.mean[row, 2]), 0.5 * (high - low)
+        turn = min(float(within[row, 2]), np.pi)
+        if half[:2].max() > c.wide:
+            found = correlative_matching.search(own, other, middle, (float(half[0]), float(half[1]), turn)).poses
+        else:
+            pair, raster = clouds.chosen(np.array([target, source])), rasterize(own, c.cell, c.first_gate)
+            points = pair_points(pair, np.array([1]), c.scored).of(0)
+            found = best_poses(pair, raster, points, middle, Window(float(half.max()), turn), c.places)
+        starts[: len(found), row] = found[: c.places]
+    return list(starts)
 
-    def _descend(self, i: Ints, points: PairPoints, start: Floats, mean: Floats, covariance: Floats) -> Placed:
-        """Place sources in targets i (e,) under Gaussian priors, each from its start (e, 3).
 
-        Parameters
-        ----------
-        mean, covariance : (e, 3) and (e, 3, 3) of x, y, heading of T_i_j. points : of the sources, see pair_points.
-        """
-        c = RegistrationConfig
-        information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        pose, variance = start.copy(), self.sigma**2
-        gate, temper, left = c.first_gate, 1.0, np.arange(len(i))
-        for _ in range(c.iterations):
-            factors, _ = self.objects.match(i[left], PairPoints(points.row[left]), pose[left], gate, covariance[left] * temper)
-            step = self._step(factors, information[left], pose[left], mean[left])
-            pose[left] += step
-            if gate <= ObjectPolicy.gate and temper < c.cold:
-                left = left[np.abs(step).max(axis=1) >= c.converged]
-            gate, temper = max(gate * c.shrink, ObjectPolicy.gate), temper * c.cooling
-        pose[:, 2] = se2.wrap_angle(pose[:, 2])
-        factors, judged = self.objects.match(i, points, pose, ObjectPolicy.gate, np.zeros_like(covariance))
-        likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
-        hessian = factors.hessian / (variance * ObjectPolicy.correlation)
-        off = _difference(pose, mean)
-        distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
-        prior = -distance - 0.5 * np.linalg.slogdet(covariance)[1]
-        volume = -0.5 * np.linalg.slogdet(hessian + information)[1]
-        evidence, lost = likelihood + prior + volume, distance + most - likelihood
-        after = np.asarray(np.linalg.inv(hessian + information), dtype=np.float64)
-        return Placed(pose, factors, after, evidence, lost)
+def _most_odds(objects: ObjectLikelihood, placed: Placed, prior: Prior) -> Floats:
+    """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
+    hessian = placed.factors.hessian / (objects.sigma**2 * ObjectPolicy.correlation)
+    here, there = (np.linalg.slogdet(np.eye(3) + cov @ hessian)[1] for cov in (prior.covariance, prior.slipped))
+    return np.asarray(placed.evidence_lost + 0.5 * (here - there))
 
-    @staticmethod
-    def _shares(i: Ints, j: Ints, prior: Prior) -> list[Floats]:
-        """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
-        return [share * prior.mean for share in (1.0, 0.5, 0.0)]
 
-    def _searched(self, i: Ints, j: Ints, prior: Prior) -> list[Floats]:
-        """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view.
-
-        Where the wheels counted metres, the window is as large as the clouds: all its shifts are one correlation there.
-        """
-        c, within = RegistrationConfig, 2.0 * np.sqrt(np.einsum("eii->ei", prior.slipped))
-        starts = np.tile(prior.mean, (c.places, 1, 1))
-        for row, (target, source) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
-            own, other = (self._clouds.chosen(np.array([k])) for k in (target, source))
-            view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (own, other))
-            low, high = (np.clip(prior.mean[row, :2] + side * within[row, :2], -view, view) for side in (-1.0, 1.0))
-            middle, half = np.append(0.5 * (low + high), prior.mean[row, 2]), 0.5 * (high - low)
-            turn = min(float(within[row, 2]), np.pi)
-            if half[:2].max() > c.wide:
-                found = search(own, other, middle, (float(half[0]), float(half[1]), turn)).poses
-            else:
-                pair, raster = self._clouds.chosen(np.array([target, source])), rasterize(own, c.cell, c.first_gate)
-                points = pair_points(pair, np.array([1]), c.scored).of(0)
-                found = best_poses(pair, raster, points, middle, Window(float(half.max()), turn), c.places)
-            starts[: len(found), row] = found[: c.places]
-        return list(starts)
-
-    def _most_odds(self, placed: Placed, prior: Prior) -> Floats:
-        """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
-        hessian = placed.factors.hessian / (self.sigma**2 * ObjectPolicy.correlation)
-        here, there = (np.linalg.slogdet(np.eye(3) + cov @ hessian)[1] for cov in (prior.covariance, prior.slipped))
-        return np.asarray(placed.evidence_lost + 0.5 * (here - there))
-
-    def _step(self, factors: PairFactors, information: Floats, pose: Floats, mean: Floats) -> Floats:
-        """Return a damped Gauss-Newton step (e, 3) of matches and prior."""
-        scale = self.sigma**2 * ObjectPolicy.correlation
-        hessian = factors.hessian / scale + information
-        gradient = factors.gradient / scale + np.einsum("eij,ej->ei", information, _difference(pose, mean))
-        step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        far, wide = RegistrationConfig.farthest
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / far, np.abs(step[:, 2]) / wide)
-        return np.asarray(step / np.maximum(reach, 1.0)[:, None])
-
-    def log_likelihood(self, i: Ints, points: PairPoints, pose: Floats) -> Floats:
-        """Return the log likelihood (e,) of sources in targets i (e,) at poses (e, 3), by that in unknown space."""
-        if not len(i):
-            return np.zeros(0)
-        _, judged = self.objects.match(i, points, pose, ObjectPolicy.gate, np.zeros((len(i), 3, 3)))
-        return np.concatenate([part.likelihood for part in judged])
+def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: Gaussian) -> Placed:
+    """Place the sources of pairs (e,) in their targets by matches and a prior, each from its start (e, 3)."""
+    c, scale = RegistrationConfig, objects.sigma**2 * ObjectPolicy.correlation
+    information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+    pose, gate, temper, left = start.copy(), c.first_gate, 1.0, np.arange(len(pairs))
+    for _ in range(c.iterations):
+        factors, _ = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)
+        hessian = factors.hessian / scale + information[left]
+        pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
+        step = -np.linalg.solve(hessian, (factors.gradient / scale + pull)[..., None])[..., 0]
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / c.farthest[0], np.abs(step[:, 2]) / c.farthest[1])
+        step /= np.maximum(reach, 1.0)[:, None]
+        pose[left] += step
+        if gate <= ObjectPolicy.gate and temper < c.cold:
+            left = left[np.abs(step).max(axis=1) >= c.converged]
+        gate, temper = max(gate * c.shrink, ObjectPolicy.gate), temper * c.cooling
+    pose[:, 2] = se2.wrap_angle(pose[:, 2])
+    factors, judged = objects.match(pairs, pose, ObjectPolicy.gate)
+    likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
+    hessian = factors.hessian / scale + information
+    off = _difference(pose, prior.mean)
+    distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
+    volume = -0.5 * (np.linalg.slogdet(prior.covariance)[1] + np.linalg.slogdet(hessian)[1])
+    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    return Placed(pose, factors, covariance, likelihood - distance + volume, likelihood, distance + most - likelihood)
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:
@@ -273,13 +272,9 @@ def of_fallible(log_odds: Floats, wrong: float) -> Floats:
     Where people crowd about the robot, one pair of clouds can favour a false place by any factor: the model of the surfaces is
     wrong there, and only several pairs in a row tell.
     """
-    favoured = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_HUGE, _HUGE)))
+    favoured = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -ObjectPolicy.largest, ObjectPolicy.largest)))
     right = (1.0 - wrong) * favoured + wrong * (1.0 - favoured)
     return np.asarray(np.log(right) - np.log1p(-right))
-
-
-_UNLIKELY, _HUGE = 0.5, 50.0
-"""Probability of standing still below which an object moves, and the largest exponent."""
 
 
 def _difference(pose: Floats, mean: Floats) -> Floats:

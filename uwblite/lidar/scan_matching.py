@@ -45,7 +45,7 @@ class PairFactors(Table):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PairPoints:
+class PairPoints(Table):
     """The points that pairs look up: those of cloud j with a normal, thinned."""
 
     row: NDArray[np.int32]

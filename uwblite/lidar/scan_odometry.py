@@ -4,6 +4,9 @@ Scans a moment apart are aligned point to line from a guess; where few points th
 finds the place.
 """
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 
 from .. import se2
@@ -19,20 +22,31 @@ from .pair_alignment import align_pairs
 from .scan_matching import PairPoints
 from .visibility import nearest_by_bearing, pair_violations
 
-_FIRST_GATE, _LAST_GATE = 0.4, 0.12
-"""Farthest match in the first and last iteration, m."""
-_POINTS = 200
-"""Points looked up per pair."""
-_GOOD_SHARE = 0.75
-"""Pairs that share at least this part of their points need no search."""
-_GAIN = 0.05
-"""A search must raise the share by this to count."""
-_SEARCH = (0.6, 0.6, 0.6)
-"""Half-widths of the search, m, m, rad."""
-_LEAST_POINTS = 25
-"""Clouds with fewer points measure nothing."""
-_AT_ONCE = 128
-"""Pairs of scans whose rasters are in memory at once."""
+
+@dataclass(frozen=True, slots=True)
+class ScanStepPolicy:
+    """Matching of single scans a moment apart."""
+
+    first_gate: ClassVar[float] = 0.4
+    """Farthest match in the first iteration, m."""
+    last_gate: ClassVar[float] = 0.12
+    """The same in the last, m."""
+    points: ClassVar[int] = 200
+    """Points looked up per pair."""
+    good_share: ClassVar[float] = 0.75
+    """Pairs that share at least this part of their points need no search."""
+    gain: ClassVar[float] = 0.05
+    """A search must raise the share by this to count."""
+    search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
+    """Half-widths of the search, m, m, rad."""
+    least_points: ClassVar[int] = 25
+    """Clouds with fewer points measure nothing."""
+    at_once: ClassVar[int] = 128
+    """Pairs of scans whose rasters are in memory at once."""
+    well_seen: ClassVar[float] = 0.9
+    """Quantile of a scan's readings up to which it sees whatever is there."""
+    least_in_sight: ClassVar[float] = 0.5
+    """Share of the points that must be nearer."""
 
 
 def scan_steps(
@@ -53,9 +67,9 @@ def scan_steps(
     Motions T_first_second (e, 3) and the share of points that match (e,), 0..1; 0 where there are too few.
     """
     steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
-    for low in range(0, len(first), _AT_ONCE):
-        rows = slice(low, low + _AT_ONCE)
-        allowed = -(-searches * _AT_ONCE // len(first))
+    for low in range(0, len(first), ScanStepPolicy.at_once):
+        rows = slice(low, low + ScanStepPolicy.at_once)
+        allowed = -(-searches * ScanStepPolicy.at_once // len(first))
         step, share = _block(scans, mounting, first[rows], second[rows], guess[rows], allowed)
         steps.append(step)
         shares.append(share)
@@ -70,8 +84,8 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
     """
     built, raster, i, _, points = _pairs(scans, mounting, first, second)
     points = _in_sight(built, i, motion, points, scans, mounting)
-    found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
-    return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+    found = scan_matching.match(built, raster, i, motion, points, ScanStepPolicy.first_gate, ScanStepPolicy.first_gate)
+    return (found.squared + ScanStepPolicy.first_gate**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
 
 
 def _in_sight(
@@ -86,19 +100,15 @@ def _in_sight(
     in_laser = se2.transform(se2.inverse(mounting.T_base_laser), built.points.astype(np.float64))
     away = np.hypot(in_laser[:, 0], in_laser[:, 1])
     ends = zip(built.offsets[:-1].tolist(), built.offsets[1:].tolist(), strict=True)
-    reach = np.array([np.quantile(away[a:b], _WELL_SEEN) if b > a else 0.0 for a, b in ends])
+    reach = np.array([np.quantile(away[a:b], ScanStepPolicy.well_seen) if b > a else 0.0 for a, b in ends])
     T_laser_first = se2.compose(se2.inverse(mounting.T_base_laser), motion)[:, None]
     at = se2.transform(T_laser_first, built.points.astype(np.float64).take(points.row, axis=0))
     bearing = np.arctan2(at[..., 1], at[..., 0]) * (-1.0 if mounting.laser_flipped else 1.0)
     middle, half = 0.5 * (scans.angles[0] + scans.angles[-1]), 0.5 * abs(scans.angles[-1] - scans.angles[0])
     seen = (np.abs(se2.wrap_angle(bearing - middle)) <= half) & (np.hypot(at[..., 0], at[..., 1]) <= reach[i, None])
     seen &= points.row >= 0
-    few = seen.sum(axis=1) < _LEAST_IN_SIGHT * (points.row >= 0).sum(axis=1)
+    few = seen.sum(axis=1) < ScanStepPolicy.least_in_sight * (points.row >= 0).sum(axis=1)
     return PairPoints(np.where(seen | few[:, None], points.row, -1).astype(np.int32))
-
-
-_WELL_SEEN, _LEAST_IN_SIGHT = 0.9, 0.5
-"""Quantile of a scan's readings up to which it sees whatever is there, and the share of the points that must be nearer."""
 
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
@@ -108,7 +118,7 @@ def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints,
     along the corridor show the motion.
     """
     built, raster, i, j, _ = _pairs(scans, mounting, first, second)
-    return directional_overlap(built, raster, i, j, motion, _POINTS, _LAST_GATE)
+    return directional_overlap(built, raster, i, j, motion, ScanStepPolicy.points, ScanStepPolicy.last_gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
@@ -125,8 +135,8 @@ def _pairs(
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
-    points = scan_matching.pair_points(built, j, _POINTS)
+    raster = cloud_rasters.rasterize(built, config.raster, ScanStepPolicy.first_gate)
+    points = scan_matching.pair_points(built, j, ScanStepPolicy.points)
     return built, raster, i, j, points
 
 
@@ -134,13 +144,13 @@ def _block(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
 ) -> tuple[Floats, Floats]:
     built, raster, i, j, points = _pairs(scans, mounting, first, second)
-    aligned = align_pairs(built, raster, i, guess, points, _FIRST_GATE, _LAST_GATE)
-    enough = aligned.factors.asked >= _LEAST_POINTS
+    aligned = align_pairs(built, raster, i, guess, points, ScanStepPolicy.first_gate, ScanStepPolicy.last_gate)
+    enough = aligned.factors.asked >= ScanStepPolicy.least_points
     pose, share = aligned.pose.copy(), np.where(enough, aligned.share, 0.0)
-    poor = np.flatnonzero((share < _GOOD_SHARE) & enough)
+    poor = np.flatnonzero((share < ScanStepPolicy.good_share) & enough)
     for row in poor[np.argsort(share[poor], kind="stable")][:searches].tolist():
         found = _searched(built, raster, int(i[row]), int(j[row]), guess[row])
-        if found is not None and found[1] > share[row] + _GAIN:
+        if found is not None and found[1] > share[row] + ScanStepPolicy.gain:
             pose[row], share[row] = found
     return pose, share
 
@@ -148,12 +158,12 @@ def _block(
 def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats) -> tuple[Floats, float] | None:
     """Return the best pose of cloud j in cloud i and the share of points that match there."""
     target, source = (make_cloud(p, p + n) for p, n in (built.cloud(i), built.cloud(j)))
-    places = search(target, source, guess, _SEARCH, CorrelativeConfig())
+    places = search(target, source, guess, ScanStepPolicy.search, CorrelativeConfig())
     if not len(places.poses):
         return None
     one = np.ones(len(places.poses), dtype=np.intp)
-    points = scan_matching.pair_points(built, one * j, _POINTS)
-    aligned = align_pairs(built, raster, one * i, places.poses, points, 0.3, _LAST_GATE)
+    points = scan_matching.pair_points(built, one * j, ScanStepPolicy.points)
+    aligned = align_pairs(built, raster, one * i, places.poses, points, 0.3, ScanStepPolicy.last_gate)
     best = int(np.argmax(aligned.share))
     return aligned.pose[best], float(aligned.share[best])
 

@@ -5,7 +5,8 @@ people, glass and doors cause a few per cent. If it is wrong, half of the surfac
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,31 +17,37 @@ from .clouds import Clouds
 from .free_space import FreeSpace, contradiction, free_space, seen_beyond
 from .submaps import Submaps
 
-_BEARINGS = 120
-"""Bins of the free space around a keyframe: so wide that the points of a wall 5 m away leave none empty."""
-_MARGIN = 0.3
-"""How far inside the free space a point must stand to count, m."""
-_VIEWS = 8
-"""Keyframes of a sub-map whose free space is used."""
-_REVISIT = 2.0
-"""Keyframes nearer to each other than this are at one place, m."""
-_APART = 10.0
-"""Travelled distance between two visits, m."""
-_REVISITS = 400
-"""Most revisits that are compared."""
-_COMMON = 10
-"""Points of the other that a visit must be able to see to be compared."""
-_NEIGHBOURS = 64
-"""Keyframes around one among which another visit is sought."""
+
+@dataclass(frozen=True, slots=True)
+class VisibilityPolicy:
+    """Free space around clouds, and visits whose views are compared."""
+
+    bearings: ClassVar[int] = 120
+    """Bins of the free space around a keyframe: so wide that the points of a wall 5 m away leave none empty."""
+    margin: ClassVar[float] = 0.3
+    """How far inside the free space a point must stand to count, m."""
+    views: ClassVar[int] = 8
+    """Keyframes of a sub-map whose free space is used."""
+    revisit: ClassVar[float] = 2.0
+    """Keyframes nearer to each other than this are at one place, m."""
+    apart: ClassVar[float] = 10.0
+    """Travelled distance between two visits, m."""
+    revisits: ClassVar[int] = 400
+    """Most revisits that are compared."""
+    common: ClassVar[int] = 10
+    """Points of the other that a visit must be able to see to be compared."""
+    neighbours: ClassVar[int] = 64
+    """Keyframes around one among which another visit is sought."""
 
 
 def nearest_by_bearing(clouds: Clouds) -> Floats:
     """Return how far (k, bearings), m, the nearest point of each cloud is in every direction; inf where there is none."""
     distance, bearing = np.hypot(clouds.points[:, 0], clouds.points[:, 1]), se2.bearing(clouds.points)
-    bins = np.clip(((bearing + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.intp), 0, _BEARINGS - 1)
-    nearest = np.full(len(clouds) * _BEARINGS, np.inf)
-    np.minimum.at(nearest, clouds.owner.astype(np.intp) * _BEARINGS + bins, distance)
-    return nearest.reshape(-1, _BEARINGS)
+    many = VisibilityPolicy.bearings
+    bins = np.clip(((bearing + np.pi) * (many / (2.0 * np.pi))).astype(np.intp), 0, many - 1)
+    nearest = np.full(len(clouds) * many, np.inf)
+    np.minimum.at(nearest, clouds.owner.astype(np.intp) * many + bins, distance)
+    return nearest.reshape(-1, many)
 
 
 def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> tuple[Bools, Bools]:
@@ -51,10 +58,10 @@ def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> tuple[Bools, B
     free : (k, bearings) m, see FreeSpace.ranges; of all clouds.
     """
     distance = np.sqrt(x * x + y * y)
-    bins = ((np.arctan2(y, x) + np.pi) * (_BEARINGS / (2.0 * np.pi))).astype(np.intp)
-    bins *= bins < _BEARINGS
+    bins = ((np.arctan2(y, x) + np.pi) * (VisibilityPolicy.bearings / (2.0 * np.pi))).astype(np.intp)
+    bins *= bins < VisibilityPolicy.bearings
     until = free[i[:, None], bins]
-    return distance < until - _MARGIN, (until > 0.0) & (distance < until + _MARGIN)
+    return distance < until - VisibilityPolicy.margin, (until > 0.0) & (distance < until + VisibilityPolicy.margin)
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
@@ -67,7 +74,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
     nearest = nearest_by_bearing(clouds)
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
-        views = np.unique(np.linspace(first, last - 1, _VIEWS).round().astype(np.intp))
+        views = np.unique(np.linspace(first, last - 1, VisibilityPolicy.views).round().astype(np.intp))
         free.append(free_space(se2.between(poses[reference], poses[views]), nearest[views]))
     return free
 
@@ -80,7 +87,7 @@ def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
     kept = np.ones(len(submaps.clouds.points), dtype=bool)
     for k, own in enumerate(free):
         rows = slice(submaps.clouds.offsets[k], submaps.clouds.offsets[k + 1])
-        through, in_view = seen_beyond(own, submaps.clouds.cloud(k)[0], _MARGIN)
+        through, in_view = seen_beyond(own, submaps.clouds.cloud(k)[0], VisibilityPolicy.margin)
         kept[rows] = 2 * through <= in_view
     return replace(submaps, clouds=submaps.clouds.only(kept))
 
@@ -93,8 +100,8 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
     free_a, free_b : see observed_free_space. points_a (n, 2), points_b (m, 2), m : each in its own frame.
     T_a_b : (3,) pose of b in a.
     """
-    one, _ = contradiction(free_a, se2.transform(T_a_b, points_b), _MARGIN)
-    other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a), _MARGIN)
+    one, _ = contradiction(free_a, se2.transform(T_a_b, points_b), VisibilityPolicy.margin)
+    other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a), VisibilityPolicy.margin)
     return max(one, other)
 
 
@@ -150,8 +157,8 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
     through, seen, compared = 0.0, 0.0, []
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
         points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(free_space(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
-        if visible * len(points) >= _COMMON:
+        share, visible = contradiction(free_space(np.zeros((1, 3)), nearest[a : a + 1]), points, VisibilityPolicy.margin)
+        if visible * len(points) >= VisibilityPolicy.common:
             through += share * visible * len(points)
             seen += visible * len(points)
             compared.append((min(a, b), max(a, b)))
@@ -161,11 +168,12 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
 
 def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]:
     """Return pairs (p,), (p,) of keyframes that lie together but were not driven one after the other."""
-    distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=min(_NEIGHBOURS, len(poses)), distance_upper_bound=_REVISIT)
+    many, c = min(VisibilityPolicy.neighbours, len(poses)), VisibilityPolicy
+    distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=many, distance_upper_bound=c.revisit)
     distance, other = distance.reshape(len(poses), -1), other.reshape(len(poses), -1)
     other = np.minimum(other, len(poses) - 1)
-    again = (np.abs(path[other] - path[:, None]) > _APART) | (recording[other] != recording[:, None])
+    again = (np.abs(path[other] - path[:, None]) > VisibilityPolicy.apart) | (recording[other] != recording[:, None])
     again &= np.isfinite(distance)
     i = np.flatnonzero(again.any(axis=1))
-    i = i[np.unique(np.linspace(0, len(i) - 1, min(_REVISITS, len(i))).round().astype(np.intp))]
+    i = i[np.unique(np.linspace(0, len(i) - 1, min(VisibilityPolicy.revisits, len(i))).round().astype(np.intp))]
     return i, other[i, np.argmax(again[i], axis=1)].astype(np.intp)

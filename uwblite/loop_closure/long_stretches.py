@@ -6,7 +6,8 @@ which one sub-map of a corridor fits. Stretches of tens of metres fit at one pla
 as walls do (net_overlap). The likeliest pairs come first: each closed loop reduces the uncertainty of the others.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,16 +19,23 @@ from ..lidar.submaps import Submaps
 from .candidates import Candidates, overlap_probability, propose, uncertain
 from .closures import LoopClosureConfig
 
-_LENGTH = 30.0
-"""Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays within the
-gate of the final matching. Each begins in the middle of the one before."""
-_WIDER = 2.0
-"""Factor on the standard deviations of a chain of steps: a bias that following steps share, a robot that tilts, floors that
-give way, adds up along the way, and the covariance contains none (twice the stated heading in a hospital)."""
-_NEVER = 1e-4
-"""Probability of an overlap up to which pairs are not tried; the covariance may be too small, but not by so much."""
-_AT_ONCE, _PART = 40, 8
-"""Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
+
+@dataclass(frozen=True, slots=True)
+class StretchPolicy:
+    """Stretches of the path that are compared where sub-maps are too uncertain."""
+
+    length: ClassVar[float] = 30.0
+    """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays
+    within the gate of the final matching. Each begins in the middle of the one before."""
+    wider: ClassVar[float] = 2.0
+    """Factor on the standard deviations of a chain of steps: a bias that following steps share, a robot that tilts, floors
+    that give way, adds up along the way, and the covariance contains none (twice the stated heading in a hospital)."""
+    never: ClassVar[float] = 1e-4
+    """Probability of an overlap up to which pairs are not tried; the covariance may be too small, but not by so much."""
+    at_once: ClassVar[int] = 40
+    """Pairs tried before the graph is solved again."""
+    part: ClassVar[int] = 8
+    """Stretches for each of them where that is more."""
 
 
 def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
@@ -37,7 +45,7 @@ def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
     ----------
     path : (k,) travelled distance, m. recording : (k,).
     """
-    first, last = submaps.cut(path, recording, _LENGTH / 2.0)
+    first, last = submaps.cut(path, recording, StretchPolicy.length / 2.0)
     goes_on = recording[first[1:]] == recording[first[:-1]]
     last[:-1] = np.where(goes_on, last[1:], last[:-1])
     return first, last, (first + last - 1) // 2
@@ -56,7 +64,7 @@ def any_uncertain(
 
 
 def _wide(config: LoopClosureConfig) -> LoopClosureConfig:
-    return replace(config, reach=_LENGTH / 2.0, search_limit=np.inf)
+    return replace(config, reach=StretchPolicy.length / 2.0, search_limit=np.inf)
 
 
 def uncertain_pairs(
@@ -72,17 +80,17 @@ def uncertain_pairs(
     found = replace(found, long=True)
     chance = overlap_probability(found.guess, found.covariance, wide.reach)
     order = np.argsort(-chance, kind="stable")
-    return found.rows(order[chance[order] > _NEVER])
+    return found.rows(order[chance[order] > StretchPolicy.never])
 
 
 def first_of(candidates: Candidates, pieces: Submaps) -> Candidates:
     """Return the candidates that are tried before the graph is solved again, as uncertain as a chain of steps may be."""
-    first = candidates.rows(slice(0, max(_AT_ONCE, len(pieces) // _PART)))
-    wider = 1.0 if candidates.constrained else _WIDER
+    first = candidates.rows(slice(0, max(StretchPolicy.at_once, len(pieces) // StretchPolicy.part)))
+    wider = 1.0 if candidates.constrained else StretchPolicy.wider
     return replace(first, covariance=wider**2 * first.covariance, spread=wider * first.spread)
 
 
 def likely(candidates: Candidates) -> Candidates:
     """Return the candidates whose stretches overlap within one standard deviation."""
     distance = np.hypot(candidates.guess[:, 0], candidates.guess[:, 1])
-    return candidates.rows(np.flatnonzero(distance < _LENGTH / 2.0 + candidates.spread / 3.0))
+    return candidates.rows(np.flatnonzero(distance < StretchPolicy.length / 2.0 + candidates.spread / 3.0))

@@ -4,7 +4,8 @@ A cloud made in a fast turn, behind people or over a gap in the scans may match 
 step of the odometry, and an error of this step turns all poses before it.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,30 +20,39 @@ from .candidates import Candidates
 from .closures import LoopClosureConfig
 from .slid_stretches import NEAR, directions_constrained, tied_parts
 
-_LEAST_CONSTRAINED = 2
-"""Least number of directions that scans fix in a measured link: along a bare corridor, only the odometry measures."""
-_ALL = 3
-"""Directions of a pose."""
-_VIEWS = 6
-"""Keyframes of one side that make its sub-map; fewer do not count as a part of a map."""
-_SINGLE = 3
-"""Keyframes of the other side that are each matched with it: after more, the views no longer overlap."""
-_LEAST_POINTS = 30
-"""Clouds with fewer points are not matched."""
-_DISTANCE = 1.2
-"""Half-width of the search, m: an odometry that stands still while the robot turns fast is not wrong by more in one step."""
-_EXCEPTIONS, _SHARE = 5, 0.02
-"""Links, and share of all steps, up to which they are exceptions; a lidar that loses more sees too little for a search."""
 ANOTHER_VISIT = 10.0
 """Travelled distance between two visits, m."""
-_FAR = 10.0
-"""Standard deviations from which a match contradicts the odometry."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPolicy:
+    """Links that no scan measures, and what is matched across them."""
+
+    constrained: ClassVar[int] = 2
+    """Least number of directions that scans fix in a measured link: along a bare corridor, only the odometry measures."""
+    directions: ClassVar[int] = 3
+    """Directions of a pose."""
+    views: ClassVar[int] = 6
+    """Keyframes of one side that make its sub-map; fewer do not count as a part of a map."""
+    single: ClassVar[int] = 3
+    """Keyframes of the other side that are each matched with it: after more, the views no longer overlap."""
+    points: ClassVar[int] = 30
+    """Clouds with fewer points are not matched."""
+    distance: ClassVar[float] = 1.2
+    """Half-width of the search, m: an odometry that stands still while the robot turns fast is not wrong by more in one
+    step."""
+    exceptions: ClassVar[int] = 5
+    """Links up to which they are exceptions."""
+    share: ClassVar[float] = 0.02
+    """The same as a share of all steps; a lidar that loses more sees too little for a search."""
+    far: ClassVar[float] = 10.0
+    """Standard deviations from which a match contradicts the odometry."""
 
 
 def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
     """Return the steps of the odometry (l,) that scan edges do not fix; none where these are no exceptions."""
-    links = np.flatnonzero(directions_constrained(graph)[wheels.i] < _LEAST_CONSTRAINED)
-    return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
+    links = np.flatnonzero(directions_constrained(graph)[wheels.i] < LinkPolicy.constrained)
+    return links if len(links) <= max(LinkPolicy.exceptions, LinkPolicy.share * len(wheels)) else links[:0]
 
 
 def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
@@ -55,8 +65,9 @@ def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Fl
     ----------
     path : (k,) travelled distance, m.
     """
-    part = tied_parts(wheels, replace(graph, edges=tuple(_near_or_again(e, path) for e in graph.edges)), _ALL, measured)
-    large = np.flatnonzero(np.bincount(part)[part] >= _VIEWS)
+    near_or_again = replace(graph, edges=tuple(_near_or_again(e, path) for e in graph.edges))
+    part = tied_parts(wheels, near_or_again, LinkPolicy.directions, measured)
+    large = np.flatnonzero(np.bincount(part)[part] >= LinkPolicy.views)
     if not len(large):
         return large
     # A few keyframes between two breaks do not form a part: they belong to the part before.
@@ -80,7 +91,7 @@ def spanned(wheels: OdometryEdges, ties: RelativePoseEdges) -> Bools:
 
 def contradicted(wheels: OdometryEdges, graph: Graph) -> Bools:
     """Return which steps of the odometry (e,) a graph is far from."""
-    return np.asarray(np.abs(wheels.residuals(graph)).max(axis=1, initial=0.0) > _FAR)
+    return np.asarray(np.abs(wheels.residuals(graph)).max(axis=1, initial=0.0) > LinkPolicy.far)
 
 
 def loosened(wheels: OdometryEdges, steps: Bools, config: LoopClosureConfig) -> OdometryEdges:
@@ -110,7 +121,7 @@ def propose(
     target = 2 * np.arange(len(first))
     guess = se2.between(graph.poses[reference[:, 0]], graph.poses[reference[:, 1]])
     covariance = np.tile(np.diag([config.slip**2, config.slip**2, config.slip_angle**2]), (len(target), 1, 1))
-    return Candidates(target, target + 1, guess, covariance, np.full(len(target), _DISTANCE), False), made
+    return Candidates(target, target + 1, guess, covariance, np.full(len(target), LinkPolicy.distance), False), made
 
 
 def _pieces(before: Ints, after: Ints, clouds: Clouds, recording: Ints) -> tuple[Ints, Ints, Ints]:
@@ -128,11 +139,11 @@ def _pieces(before: Ints, after: Ints, clouds: Clouds, recording: Ints) -> tuple
     sound[1:] = np.maximum(sound[1:], after[:-1])
     until[:-1] = np.minimum(until[:-1], before[1:] + 1)
     parts = []
-    for n in range(_SINGLE):
+    for n in range(LinkPolicy.single):
         behind, ahead = before - n, after + n
-        onto = np.maximum(before + 1 - _VIEWS, sound), before + 1, before, ahead, ahead + 1, ahead
-        back = after, np.minimum(after + _VIEWS, until), after, behind, behind + 1, behind
+        onto = np.maximum(before + 1 - LinkPolicy.views, sound), before + 1, before, ahead, ahead + 1, ahead
+        back = after, np.minimum(after + LinkPolicy.views, until), after, behind, behind + 1, behind
         parts += [np.stack(onto, axis=1)[ahead < end], np.stack(back, axis=1)[behind >= start]]
     pieces = np.concatenate(parts).reshape(-1, 2, 3)
-    pieces = pieces[clouds.counts[pieces[:, 1, 2]] >= _LEAST_POINTS]
+    pieces = pieces[clouds.counts[pieces[:, 1, 2]] >= LinkPolicy.points]
     return pieces[..., 0], pieces[..., 1], pieces[..., 2]

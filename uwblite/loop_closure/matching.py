@@ -6,6 +6,7 @@ Candidates are matched in batches, each with the sub-maps it needs: by one proce
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,14 +26,21 @@ from .candidates import Candidates
 from .closures import LoopClosureConfig
 from .parallel import in_order
 
-_AT_ONCE = 32
-"""Candidates of a batch."""
-_MANY_PLACES = 20
-"""Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
-_MANY_POINTS = 1000
-"""Points of each of two long stretches that are compared at every place."""
-_SAME_PLACE = 0.3
-"""Matches nearer to each other than this, m and rad, are one place."""
+
+@dataclass(frozen=True, slots=True)
+class MatchingPolicy:
+    """Search for the places of candidates."""
+
+    at_once: ClassVar[int] = 32
+    """Candidates of a batch."""
+    many_places: ClassVar[int] = 20
+    """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
+    many_points: ClassVar[int] = 1000
+    """Points of each of two long stretches that are compared at every place."""
+    same_place: ClassVar[float] = 0.3
+    """Matches nearer to each other than this, m and rad, are one place."""
+    extent: ClassVar[float] = 0.95
+    """Share of the points of a cloud that its extent contains: those that are far are few."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +97,8 @@ def _batches(
     candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
     free: Sequence[FreeSpace] | None,
 ) -> Iterator[_Batch]:
-    for first in range(0, len(candidates.target), _AT_ONCE):
-        part = candidates.rows(slice(first, first + _AT_ONCE))
+    for first in range(0, len(candidates.target), MatchingPolicy.at_once):
+        part = candidates.rows(slice(first, first + MatchingPolicy.at_once))
         used, target, source = renumbered(part.target, part.source)
         spaces = None if free is None else [free[k] for k in used.tolist()]
         clouds = replace(submaps.clouds.chosen(used), work=Work())
@@ -108,7 +116,8 @@ def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     score, some = tries.share, np.flatnonzero(wide[row])
     target, source = candidates.target[row[some]], candidates.source[row[some]]
     poses = tries.pose[some]
-    score[some] = net_overlap(clouds, raster, batch.free, target, source, poses, _MANY_POINTS, config.gate, batch.spacing)
+    many, gate = MatchingPolicy.many_points, config.gate
+    score[some] = net_overlap(clouds, raster, batch.free, target, source, poses, many, gate, batch.spacing)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
     net = np.full(len(place), np.inf)
@@ -130,7 +139,9 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
         poses = candidates.guess[k : k + 1]
         if searched:
             half_width = float(candidates.spread[k])
-            search_config, places = (_coarse(batch.search), _MANY_PLACES) if candidates.long else (batch.search, config.places)
+            search_config, places = batch.search, config.places
+            if candidates.long:
+                search_config, places = _coarse(batch.search), MatchingPolicy.many_places
             turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
             target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], half_width, turn, target, source)
@@ -146,22 +157,19 @@ def _window(
     """Return centre (3,) and half-widths of the poses within a half-width of a guess, m, at which two clouds overlap."""
     ends = guess[:2] + half_width * np.array([[-1.0], [1.0]])
     if len(target.points) and len(source.points):
-        reach = np.quantile(np.hypot(*source.points.T), _MOST)
-        inside = np.quantile(target.points, [1.0 - _MOST, _MOST], axis=0) + reach * np.array([[-1.0], [1.0]])
+        most = MatchingPolicy.extent
+        reach = np.quantile(np.hypot(*source.points.T), most)
+        inside = np.quantile(target.points, [1.0 - most, most], axis=0) + reach * np.array([[-1.0], [1.0]])
         ends = np.clip(inside, *ends)
     low, high = ends
     (x, y), (wide, tall) = 0.5 * (low + high), 0.5 * (high - low)
     return np.array([x, y, guess[2]]), (float(wide), float(tall), turn)
 
 
-_MOST = 0.95
-"""Share of the points of a cloud that its extent contains: those that are far are few."""
-
-
 def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
     """Return the settings of a wide search: twice the cells, finer headings for long clouds, and many places."""
-    twice = replace(config, resolution=2.0 * config.resolution, spread=2.0 * config.spread, candidates=_MANY_PLACES)
-    return replace(twice, angle_step=config.angle_step / 1.5)
+    twice = replace(config, resolution=2.0 * config.resolution, spread=2.0 * config.spread)
+    return replace(twice, angle_step=config.angle_step / 1.5, candidates=MatchingPolicy.many_places)
 
 
 def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tuple[Ints, Floats]:
@@ -176,7 +184,7 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     tried, first = np.unique(row[order], return_index=True)
     best[tried] = order[first]
     apart = se2.between(pose[best[row]], pose)
-    other = (np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)
+    other = (np.hypot(apart[:, 0], apart[:, 1]) > MatchingPolicy.same_place) | (np.abs(apart[:, 2]) > MatchingPolicy.same_place)
     np.maximum.at(second, row[other], share[other])
     second[tried] /= np.maximum(share[best[tried]], 1e-9)
     return best, second

@@ -4,6 +4,9 @@ Doors and pillars repeat. Closures that confuse one with the next agree with eac
 the two ends of the stretch that they move. A wheel may slip once; it does not slip back by the same distance metres later.
 """
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 
 from .. import se2
@@ -11,20 +14,28 @@ from ..arrays import Bools, Floats, Ints, connected
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 
-_JUMP = 0.5
-"""m; errors of one step of the odometry that are larger than noise."""
-_TORN = 10.0
-"""The same in standard deviations."""
 NEAR = 4
 """Most keyframes that a scan edge of the same visit spans."""
-_CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
-"""Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
-_ALL = 3
-"""Directions of a pose."""
-_AGREES = 4.0
-"""Standard deviations within which a scan edge agrees with the map."""
-_MADE_GOOD = 0.3
-"""Share of a jump that may remain after the opposite jump."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlidPolicy:
+    """Jumps of the odometry, and scan edges that exclude them."""
+
+    jump: ClassVar[float] = 0.5
+    """m; errors of one step of the odometry that are larger than noise."""
+    torn: ClassVar[float] = 10.0
+    """The same in standard deviations."""
+    clear_place: ClassVar[float] = 0.05
+    """Standard deviation up to which a scan edge fixes a place, m; none does along a bare corridor."""
+    clear_heading: ClassVar[float] = 0.02
+    """The same of a heading, rad."""
+    directions: ClassVar[int] = 3
+    """Directions of a pose."""
+    agrees: ClassVar[float] = 4.0
+    """Standard deviations within which a scan edge agrees with the map."""
+    made_good: ClassVar[float] = 0.3
+    """Share of a jump that may remain after the opposite jump."""
 
 
 def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
@@ -35,8 +46,8 @@ def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
     Rows of the odometry's edges (s,), and jumps (s, 2), m, in the map frame.
     """
     away = se2.between(graph.poses[wheels.i], graph.poses[wheels.j])[:, :2] - wheels.corrected(graph)[:, :2]
-    off = np.abs(wheels.residuals(graph))[:, :2].max(axis=1, initial=0.0) > _TORN
-    rows = np.flatnonzero(off & (np.hypot(away[:, 0], away[:, 1]) > _JUMP) & (scans_fixing(graph)[wheels.i] == 0))
+    off = np.abs(wheels.residuals(graph))[:, :2].max(axis=1, initial=0.0) > SlidPolicy.torn
+    rows = np.flatnonzero(off & (np.hypot(away[:, 0], away[:, 1]) > SlidPolicy.jump) & (scans_fixing(graph)[wheels.i] == 0))
     return rows, se2.rotate(graph.poses[wheels.i[rows], 2], away[rows])
 
 
@@ -45,7 +56,7 @@ def scans_fixing(graph: Graph) -> Ints:
     count = np.zeros(len(graph.poses) + 1, dtype=np.intp)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
-            good = (np.abs(edges.i - edges.j) <= NEAR) & (_fixed(edges) == _ALL) & _agrees(edges, graph)
+            good = (np.abs(edges.i - edges.j) <= NEAR) & (_fixed(edges) == SlidPolicy.directions) & _agrees(edges, graph)
             np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
             np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
     return np.cumsum(count)[:-1]
@@ -82,13 +93,13 @@ def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools) ->
 
 def _agrees(edges: ScanEdges, graph: Graph) -> Bools:
     """Return which scan edges (e,) agree with the map."""
-    return np.asarray(np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES)
+    return np.asarray(np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < SlidPolicy.agrees)
 
 
 def _fixed(edges: ScanEdges) -> Ints:
     """Return in how many directions, 0 to 3, scan edges (e,) fix a pose."""
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
-    units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
+    units = np.array([SlidPolicy.clear_place, SlidPolicy.clear_place, SlidPolicy.clear_heading])
     # With the limits as units, an eigenvalue is above 1 where its direction has a sigma below the limit.
     return np.asarray(np.sum(np.linalg.eigvalsh(information * np.outer(units, units)) > 1.0, axis=1))
 
@@ -100,7 +111,7 @@ def slid(graph: Graph) -> list[tuple[int, int, float]]:
         rows, by = jumps(wheels, graph)
         size = np.hypot(by[:, 0], by[:, 1])
         left = np.hypot(*(by[:-1] + by[1:]).T)
-        for k in np.flatnonzero(left < _MADE_GOOD * np.maximum(size[:-1], size[1:])).tolist():
+        for k in np.flatnonzero(left < SlidPolicy.made_good * np.maximum(size[:-1], size[1:])).tolist():
             found.append((int(wheels.j[rows[k]]), int(wheels.i[rows[k + 1]]), float(size[k])))
     return found
 

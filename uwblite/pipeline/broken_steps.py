@@ -247,7 +247,5 @@ class BrokenStep:
         begin, end = (float(stamps[k - self.recording.first]) for k in (self.begin, self.end - 1))
         names = sorted({self.radios[move.radio].name for move in self.moves})
         off, turned = float(np.hypot(*self.motion[:2])), float(np.rad2deg(abs(self.motion[2])))
-        return Fact.of(
-            "path-displaced", recording=self.recording.number + 1, stretch=(begin, end), start=start, anchors=names, apart=off,
-            turned=turned,
-        )  # fmt: skip
+        where = {"recording": self.recording.number + 1, "stretch": (begin, end), "start": start}
+        return Fact.of("path-displaced", **where, anchors=names, apart=off, turned=turned)

@@ -15,10 +15,8 @@ from .. import se2
 from ..arrays import Bools, Ints
 from ..findings import Fact
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..lidar.object_likelihood import matched_by_chance
-from ..lidar.registration import Registration
-from ..lidar.scan_matching import pair_points
-from ..lidar.visibility import nearest_by_bearing
+from ..lidar.object_likelihood import ObjectLikelihood, pairs_of
+from ..lidar.scan_to_scan import TrackingConfig
 from ..odometry.slips import log_densities, with_slips
 from ..problem.solution import rough
 from . import lidar_stages, surface_adjustment
@@ -135,23 +133,21 @@ def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task
     far = _displaced(estimate, step)
     i, j = (np.concatenate([getattr(e.joint, end) for e in (estimate, other)]) for end in ("i", "j"))
     i, j = np.unique(np.stack([i, j])[:, far[i] != far[j]], axis=1)
-    points = pair_points(estimate.lidar.clouds, j, task.config.scan_to_scan.points)
-    seen = _registration(estimate, task)
+    pairs, seen = pairs_of(estimate.lidar.clouds, i, j), _likelihood(estimate)
     # The points of a cloud are the same in all of its pairs.
     share = 1.0 / np.bincount(j, minlength=len(far))[j]
     scores = []
     for graph, ranges in ((e.graph, range_evidence(e, task)) for e in (other, estimate)):
-        rays = seen.log_likelihood(i, points, se2.between(graph.poses[i], graph.poses[j]))
+        rays = seen.log_likelihood(pairs, se2.between(graph.poses[i], graph.poses[j]))
         scores.append(ranges + float(np.sum(log_densities(wheels, graph))) + float(rays @ share))
     return scores[0] - scores[1]
 
 
-def _registration(estimate: Estimate, task: Task) -> Registration:
-    """Return the likelihood of rays, with the share that matches by chance as neighbouring clouds show it."""
-    clouds, raster, config = estimate.lidar.clouds, estimate.lidar.raster, task.config.scan_to_scan
-    i, j, poses = estimate.odometry.i, estimate.odometry.j, estimate.graph.poses
-    chance = matched_by_chance(clouds, raster, i, pair_points(clouds, j, config.points), se2.between(poses[i], poses[j]))
-    return Registration(clouds, raster, nearest_by_bearing(clouds), config.sigma, chance)
+def _likelihood(estimate: Estimate) -> ObjectLikelihood:
+    """Return the likelihood of rays, with what matches by chance and what moves as neighbouring clouds show it."""
+    lidar, i, j, poses = estimate.lidar, estimate.odometry.i, estimate.odometry.j, estimate.graph.poses
+    pairs, steps = pairs_of(lidar.clouds, i, j), se2.between(poses[i], poses[j])
+    return ObjectLikelihood.of(lidar.clouds, lidar.raster, TrackingConfig.sigma, pairs, steps).learnt(pairs, steps)
 
 
 def _fact(estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task) -> Fact:

@@ -1,7 +1,8 @@
 """Rounds of loop closing: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,18 @@ from .mapping_config import MappingConfig
 from .progress import Stage, solver_figures
 
 
+@dataclass(frozen=True, slots=True)
+class RoundPolicy:
+    """Rounds of loop closing."""
+
+    per_stretch: ClassVar[int] = 3
+    """Sub-maps in half a stretch."""
+    bent: ClassVar[float] = 0.01
+    """How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
+    wide_rounds: ClassVar[int] = 12
+    """Rounds of searching among long stretches, at most; a bound on the time where no loop closes."""
+
+
 def close_loops(estimate: Estimate, task: Task) -> Estimate:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
     config, recordings, scans = task.config, task.recordings, estimate.lidar
@@ -30,7 +43,8 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     reference = submaps.references(recordings.path, recordings.of_keyframe, config.submaps.epsilon)
     first, stretches = JointCovariance(base.with_edges(found.edges), reference), None
     covariance: JointCovariance | None = first
-    if long_stretches.any_uncertain(base, first, reference[::_PER_STRETCH], recordings.of_keyframe, config.loop_closure):
+    some = reference[:: RoundPolicy.per_stretch]
+    if long_stretches.any_uncertain(base, first, some, recordings.of_keyframe, config.loop_closure):
         base, found, stretches = _with_long_stretches_tied(base, found, estimate, task)
         covariance = None
     del first
@@ -40,7 +54,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     refined = config.refinement.rounds > 0 and not estimate.rests_on_ranges
     pieces, built, dynamic = None, base.poses, 0.0
     for lap in range(config.loop_closure.rounds):
-        if pieces is None or pieces.bent(built, base.poses) > _BENT:
+        if pieces is None or pieces.bent(built, base.poses) > RoundPolicy.bent:
             pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
             (pieces, free), built = _static(pieces, base, estimate), base.poses
             dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
@@ -56,10 +70,8 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         found, before = closures.merged(found, new), base.poses
         if len(new.edges):
             base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
-        task.stages.end(
-            Stage("loop closure", lap + 1), submaps=len(pieces), candidates=len(candidates.target),
-            accepted=len(new.edges), kept=len(found.edges),
-        )  # fmt: skip
+        counts = {"candidates": len(candidates.target), "accepted": len(new.edges), "kept": len(found.edges)}
+        task.stages.end(Stage("loop closure", lap + 1), submaps=len(pieces), **counts)
         tied = len(found.edges) >= config.loop_closure.enough * len(pieces)
         tied = tied or (refined and _settled(candidates, before, base, config))
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
@@ -82,12 +94,6 @@ def _settled(candidates: Candidates, before: Floats, graph: Graph, config: Mappi
     return bool(certain.all()) and float(moved.max(initial=0.0)) < config.refinement.first_gate
 
 
-_PER_STRETCH = 3
-"""Sub-maps in half a stretch."""
-_BENT = 0.01
-"""How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
-
-
 def _with_long_stretches_tied(
     base: Graph, found: Closures, estimate: Estimate, task: Task
 ) -> tuple[Graph, Closures, Submaps | None]:
@@ -104,7 +110,7 @@ def _with_long_stretches_tied(
     pieces, free = _static(pieces, base, estimate)
     tried: set[tuple[int, int, bool]] = set()
     accepted = 0
-    for _ in range(_WIDE_ROUNDS):
+    for _ in range(RoundPolicy.wide_rounds):
         pairs = long_stretches.uncertain_pairs(
             base, covariance, pieces, recordings.of_keyframe, tried, estimate.ranges is not None, rules, rules.direct
         )
@@ -128,18 +134,15 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
     """Note stretches that may show the same place and are still too uncertain for any search."""
     recordings, rules = task.recordings, task.config.loop_closure
     covariance = JointCovariance(base.with_edges(found.edges), stretches.reference)
-    left = long_stretches.likely(long_stretches.uncertain_pairs(
+    left = long_stretches.uncertain_pairs(
         base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules, rules.search_limit
-    ))  # fmt: skip
+    )
+    left = long_stretches.likely(left)
     if not len(left.target):
         return
     a, b = (float(recordings.stamps[stretches.reference[k[0]]] - recordings.stamps[0]) for k in (left.target, left.source))
     sigma = float(left.spread[0]) / 3.0
     task.stages.note("open-loops", pairs=len(left.target), first=a, second=b, sigma=sigma)
-
-
-_WIDE_ROUNDS = 12
-"""Rounds of searching among long stretches, at most; a bound on the time where no loop closes."""
 
 
 def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Closures, Estimate]:
@@ -203,7 +206,7 @@ def _static(pieces: Submaps, graph: Graph, estimate: Estimate) -> tuple[Submaps,
 def _verified(
     candidates: Candidates, pieces: Submaps, free: Sequence[FreeSpace], rules: LoopClosureConfig, task: Task,
     report: Callable[[int, int], None] | None = None,
-) -> Closures:  # fmt: skip
+) -> Closures:
     """Match candidates and return the outcome of each."""
     found = verification.find(candidates, pieces, rules, task.config.correlative, report, free, task.executor)
     return _without_forbidden(found, task)

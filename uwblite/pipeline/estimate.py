@@ -12,8 +12,7 @@ from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.solver import Optimizer, SolverConfig, SolverSummary
-from ..lidar.cloud_rasters import CloudRasters
-from ..lidar.clouds import Clouds
+from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.surface_rays import MeasuredSurfaces
 from ..loop_closure.closures import Closures, no_closures
 from ..odometry.slips import expected
@@ -43,18 +42,6 @@ class Task:
     def allowed(self, i: Ints, j: Ints) -> Bools:
         """Return which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
         return self.given.allowed(self.recordings.clock, i, j)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanClouds:
-    """The lidar of all recordings, ready for matching."""
-
-    clouds: Clouds
-    """One per keyframe."""
-    raster: CloudRasters
-    """Of the same clouds."""
-    delay: float
-    """Offset of the lidar's clock with which the clouds were made, s."""
 
 
 @dataclass(frozen=True, slots=True)

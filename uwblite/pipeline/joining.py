@@ -12,6 +12,7 @@ under their joint covariances, with the motion of one recording into the frame o
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -30,20 +31,25 @@ from ..sensor_log.sensors import first_place, place_name
 from .estimate import Estimate
 from .recordings import Recording, Recordings
 
-_SYSTEMATIC = 0.25
-"""Standard deviation of what NLOS and biases, not yet known well, add to the distance between two first places, m."""
-_LARGEST = 5.0
-"""m; an anchor whose first place is less sure, or open, still has to lie within some metres to join in."""
-_MOVED = 20.0
-"""Decrease of chi2 without an anchor (2 degrees of freedom) from which on it was moved: 5e-5 by chance, the rest for errors
-that the covariances leave out."""
-_FREE = 1e3
-"""m; standard deviation of a rigid motion of which nothing is known."""
-_STEPS = 3
-"""Gauss-Newton steps to the best motion, from the best one without covariances."""
-
 Pairs = list[tuple[int, int]]
 """Number of an anchor in one set of places, and in the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class JoiningPolicy:
+    """Agreement of the places that recordings give to anchors."""
+
+    systematic: ClassVar[float] = 0.25
+    """Standard deviation of what NLOS and biases, not yet known well, add to the distance between two first places, m."""
+    largest: ClassVar[float] = 5.0
+    """m; an anchor whose first place is less sure, or open, still has to lie within some metres to join in."""
+    moved: ClassVar[float] = 20.0
+    """Decrease of chi2 without an anchor (2 degrees of freedom) from which on it was moved: 5e-5 by chance, the rest for
+    errors that the covariances leave out."""
+    free: ClassVar[float] = 1e3
+    """m; standard deviation of a rigid motion of which nothing is known."""
+    steps: ClassVar[int] = 3
+    """Gauss-Newton steps to the best motion, from the best one without covariances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +75,7 @@ def places_of(estimate: Estimate) -> Places:
     if len(placed) < 2:
         placed = np.flatnonzero(estimate.placed)
     values, vectors = np.linalg.eigh(anchor_covariance(estimate.graph.with_edges(*estimate.odometry_and_ranges), placed))
-    bounded = np.asarray((vectors / (1.0 / np.maximum(values, 1e-12) + _LARGEST**-2)) @ vectors.T)
+    bounded = np.asarray((vectors / (1.0 / np.maximum(values, 1e-12) + JoiningPolicy.largest**-2)) @ vectors.T)
     return Places(tuple(estimate.anchor_ids[k] for k in placed), estimate.graph.anchors[placed], bounded)
 
 
@@ -83,11 +89,11 @@ def agreement(found: Places, placed: Places) -> tuple[Floats, Pairs]:
     while len(pairs) > 2:
         less = [fitted(found, placed, pairs[:k] + pairs[k + 1 :]) for k in range(len(pairs))]
         k = int(np.argmin([left for _, left in less]))
-        if chi2 - less[k][1] < _MOVED:
+        if chi2 - less[k][1] < JoiningPolicy.moved:
             break
         motion, chi2 = less[k]
         del pairs[k]
-    return motion, pairs if chi2 < _MOVED or len(pairs) > 2 else []
+    return motion, pairs if chi2 < JoiningPolicy.moved or len(pairs) > 2 else []
 
 
 def together(placed: Places, found: Places, names: Sequence[str]) -> Places:
@@ -98,7 +104,8 @@ def together(placed: Places, found: Places, names: Sequence[str]) -> Places:
     union = (*placed.names, *(name for name in names if name not in placed.names))
     rows = _scalars(np.array([union.index(name) for name in names]))
     tangent = _tangent(found.at)
-    free = found.covariance + _FREE**2 * tangent @ tangent.T + 0.5 * _SYSTEMATIC**2 * np.eye(len(rows))
+    c = JoiningPolicy
+    free = found.covariance + c.free**2 * tangent @ tangent.T + 0.5 * c.systematic**2 * np.eye(len(rows))
     known = 2 * len(placed.names)
     information, vector = np.zeros((2 * len(union), 2 * len(union))), np.zeros(2 * len(union))
     information[:known, :known] = np.linalg.inv(placed.covariance + 1e-9 * np.eye(known))
@@ -115,9 +122,9 @@ def fitted(found: Places, placed: Places, pairs: Pairs) -> tuple[Floats, float]:
     mine, theirs = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
     here, there = found.at[mine], placed.at[theirs]
     own, others = (p.covariance[np.ix_(_scalars(k), _scalars(k))] for p, k in ((found, mine), (placed, theirs)))
-    others = others + _SYSTEMATIC**2 * np.eye(len(others))
+    others = others + JoiningPolicy.systematic**2 * np.eye(len(others))
     motion = se2.align(here, there)
-    for _ in range(_STEPS):
+    for _ in range(JoiningPolicy.steps):
         at = se2.transform(motion, here)
         factor = cho_factor(_turned(own, motion[2]) + others)
         tangent, off = _tangent(at), (at - there).ravel()

@@ -6,14 +6,14 @@ import numpy as np
 
 from ..arrays import Ints
 from ..graph.calibration import RADIO, with_free
-from ..graph.graph import Edges, Graph
+from ..graph.graph import Graph
 from ..graph.marginals import marginals
 from ..graph.solver import Optimizer
 from ..lidar import joint_refinement, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.range_errors import without_pattern
-from .estimate import Estimate, ScanClouds, Task
+from .estimate import Estimate, Task
 from .progress import solver_figures
 from .radio_stages import evidence_against, with_range_noise
 
@@ -30,33 +30,30 @@ def pairs(estimate: Estimate, graph: Graph, settings: RefinementConfig, task: Ta
     return i[kept], j[kept]
 
 
-def refine(
-    graph: Graph, edges: tuple[Edges, ...], scans: ScanClouds, i: Ints, j: Ints, settings: RefinementConfig, task: Task,
-    stage: str,
-) -> RefinementResult:
-    """Refine a graph with pairs of clouds (e,), (e,)."""
+def refine(estimate: Estimate, graph: Graph, settings: RefinementConfig, task: Task, stage: str) -> RefinementResult:
+    """Refine a graph by the estimate's odometry and ranges, and by pairs of clouds that overlap at its poses."""
     report = task.stages.reporter(stage)
     report(0, settings.rounds)
-    graph, twist, solver = graph.with_edges(*edges), task.recordings.twist, task.config.solver
-    return joint_refinement.refine(graph, scans.clouds, scans.raster, twist, i, j, settings, solver, report, scans.delay)
+    (i, j), scans = pairs(estimate, graph, settings, task), estimate.lidar
+    graph = graph.with_edges(*estimate.odometry_and_ranges)
+    unmeasured = joint_refinement.unmeasured(graph, i, j, task.recordings.twist, scans.delay)
+    return joint_refinement.refine(graph, scans, unmeasured, settings, task.config.solver, report)
 
 
 def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
     """Let all overlapping clouds constrain all poses, where there are enough; re-estimate the ranges' noise on what results."""
     if estimate.steps is not None and estimate.rests_on_ranges:
         return estimate
-    scans, config = estimate.lidar, task.config
+    config = task.config
     if estimate.ranges is not None:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
-    before, edges = estimate.graph.poses, estimate.odometry_and_ranges
-    i, j = pairs(estimate, estimate.graph, config.refinement, task)
-    refined = refine(estimate.graph, edges, scans, i, j, config.refinement, task, "joint refinement")
+    before = estimate.graph.poses
+    refined = refine(estimate, estimate.graph, config.refinement, task, "joint refinement")
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
-    task.stages.end(
-        "joint refinement", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
-        sigma=round(refined.sigma, 4), shift=round(estimate.moved_since(before), 5), **solver_figures(refined.summary),
-    )  # fmt: skip
+    counts = {"pairs": len(refined.used), "used": int(refined.used.sum()), "rounds": refined.rounds}
+    figures = {"sigma": round(refined.sigma, 4), "shift": round(estimate.moved_since(before), 5)}
+    task.stages.end("joint refinement", **counts, **figures, **solver_figures(refined.summary))
     return estimate
 
 
@@ -106,10 +103,9 @@ _STILL = 0.001
 
 def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate:
     """Match all clouds again after the poses moved by a shift, m, and solve with these matches."""
-    scans, settings = estimate.lidar, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
-    i, j = pairs(estimate, estimate.graph, settings, task)
-    refined = refine(estimate.graph, estimate.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
-    task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))
+    settings = replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
+    refined = refine(estimate, estimate.graph, settings, task, "joint refinement")
+    task.stages.end("matched once more", pairs=len(refined.used), used=int(refined.used.sum()), shift=round(shift, 5))
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     return replace(estimate, graph=graph, joint=refined.edges)
 

@@ -3,7 +3,8 @@
 Neighbours make sub-maps stiff, show the offset of the lidar's clock, and tell slips of the wheels.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,8 +22,22 @@ from ..problem.solution import rough
 from . import calibration_checks, scan_clouds
 from .estimate import Estimate, Task
 from .keyframe_changes import with_keyframes
-from .lidar_stages import pairs, refine
+from .lidar_stages import refine
 from .recordings import denser, later
+
+
+@dataclass(frozen=True, slots=True)
+class NeighbourPolicy:
+    """Times and weights of the matching of neighbours."""
+
+    likely: ClassVar[float] = 0.5
+    """Probability from which on a step slipped."""
+    cuts: ClassVar[int] = 4
+    """Keyframes added within a doubtful step, at most."""
+    retimings: ClassVar[int] = 5
+    """Most times that clouds are made again; a quarter of the error remains each time."""
+    inflation: ClassVar[float] = 10.0
+    """Factor on the ranges' standard deviations."""
 
 
 def make_clouds(estimate: Estimate, task: Task) -> Estimate:
@@ -44,17 +59,17 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     estimate, steps = _with_clock_found(make_clouds(estimate, task), task)
     task = task.following(estimate)
     # With ranges, which judge the path, slips are told later; a step that the clouds contradict is else cut at once.
-    doubtful = steps.contradicted(task.config.scan_to_scan) & (estimate.ranges is None)
+    doubtful = steps.contradicted() & (estimate.ranges is None)
     cut = _with_keyframes_where(estimate, doubtful, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    track, by_ranges = _followed(estimate, steps, task), estimate.odometry.slips
+    track, by_ranges = _followed(estimate, steps), estimate.odometry.slips
     if by_ranges is None:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
         estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
-    if estimate.ranges is None or not np.any(track.slips > _LIKELY):
+    if estimate.ranges is None or not np.any(track.slips > NeighbourPolicy.likely):
         return estimate
     return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), task.following(estimate))
 
@@ -66,7 +81,7 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
     """
     estimate, steps = _descended(estimate, task)
     corrected = np.inf
-    for _ in range(_RETIMINGS):
+    for _ in range(NeighbourPolicy.retimings):
         shown = _solved_with(steps, estimate, task)
         late = calibration_checks.late(shown, task)
         settled = late == 0.0
@@ -89,8 +104,8 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 
 def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     """Return the optimum of odometry, weakly weighted ranges and the steps that descent from the odometry measured."""
-    scans, twist, config = estimate.lidar, task.recordings.twist, task.config.scan_to_scan
-    found = scan_to_scan.descended_edges(scans.clouds, scans.raster, steps, config)
+    scans, twist = estimate.lidar, task.recordings.twist
+    found = scan_to_scan.descended_edges(scans.clouds, scans.raster, steps)
     names = scan_indices(estimate.graph.calibration)
     i, j, kernel = found.i, found.j, estimate.odometry.kernel
     edges = ScanEdges(i, j, found.T_i_j, found.sqrt_information, twist[i], twist[j], names, scans.delay, kernel)
@@ -108,11 +123,11 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     ----------
     estimate : its odometry has the noise of sound wheels, and the slips that ranges show.
     """
-    track = _followed(estimate, _steps(estimate, task), task)
-    cut = _with_keyframes_where(estimate, track.slips > _LIKELY, task)
+    track = _followed(estimate, _steps(estimate, task))
+    cut = _with_keyframes_where(estimate, track.slips > NeighbourPolicy.likely, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
-        track = _followed(estimate, _steps(estimate, task), task)
+        track = _followed(estimate, _steps(estimate, task))
     return _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
 
 
@@ -152,15 +167,15 @@ def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 
 def _steps(estimate: Estimate, task: Task) -> Steps:
     """Return the steps of the odometry as the clouds measure them from the estimate's poses."""
-    scans, poses, i, config = estimate.lidar, estimate.graph.poses, estimate.odometry.i, task.config
+    scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i
     guess = se2.between(poses[i], poses[i + 1])
-    return scan_to_scan.descend(scans.clouds, scans.raster, i, guess, config.refinement.first_gate, config.scan_to_scan)
+    return scan_to_scan.match_plainly(scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate)
 
 
-def _followed(estimate: Estimate, steps: Steps, task: Task) -> ScanOdometry:
+def _followed(estimate: Estimate, steps: Steps) -> ScanOdometry:
     """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
-    scans, config = estimate.lidar, task.config.scan_to_scan
-    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps, config)
+    scans = estimate.lidar
+    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
@@ -171,22 +186,12 @@ def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Es
     """
     before = task.recordings
     steps = estimate.odometry.i[doubtful]
-    after = denser(before, steps, _CUTS, estimate.lidar.delay)
+    after = denser(before, steps, NeighbourPolicy.cuts, estimate.lidar.delay)
     if len(after.stamps) == len(before.stamps):
         return None
     scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
     task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
     return replace(with_keyframes(estimate, before, after), scans=scans)
-
-
-_LIKELY = 0.5
-"""Probability from which on a step slipped."""
-
-
-_CUTS = 4
-"""Keyframes added within a doubtful step, at most."""
-_RETIMINGS = 5
-"""Most times that clouds are made again; a quarter of the error remains each time."""
 
 
 def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
@@ -199,33 +204,32 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
-    return _refined_neighbours(
-        estimate, graph, gate, task, searched=track.searched, rejected=int(track.rejected.sum()),
-        slipped=int(np.sum(track.slips > _LIKELY)), moving=round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
-    )  # fmt: skip
+    figures = {
+        "searched": track.searched,
+        "rejected": int(track.rejected.sum()),
+        "slipped": int(np.sum(track.slips > NeighbourPolicy.likely)),
+        "moving": round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
+    }
+    return _refined_neighbours(estimate, graph, gate, task, figures)
 
 
-def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, **figures: object) -> Estimate:
+def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, figures: dict[str, object]) -> Estimate:
     """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
     scans, rules = estimate.lidar, task.config.refinement
-    settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
-    i, j = pairs(estimate, graph, settings, task)
-    edges = _with_inflated_ranges(estimate).odometry_and_ranges
-    refined = refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
+    settings, weak = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate), _with_inflated_ranges(estimate)
+    refined = refine(weak, graph, settings, task, "scan-to-scan matching")
     ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
     poses, laid = scan_to_scan.reattached(
         scans.clouds, scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
-        rules.first_gate, task.config.scan_to_scan,
-    )  # fmt: skip
+        rules.first_gate,
+    )
     if len(laid):
         graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
         settings = replace(settings, first_gate=rules.later_gate)
-        refined = refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
+        refined = refine(weak, graph, settings, task, "scan-to-scan matching")
         figures = {**figures, "placed_again": len(laid)}
-    task.stages.end(
-        "scan-to-scan matching", pairs=len(i), used=int(refined.used.sum()), gate=round(gate, 3),
-        sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
-    )  # fmt: skip
+    own = {"gate": round(gate, 3), "sigma": round(refined.sigma, 4), "rounds": refined.rounds}
+    task.stages.end("scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), **own, **figures)
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
     return calibration_checks.with_constant_turn_scales(estimate, task)
 
@@ -233,8 +237,6 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:
     """Return the estimate with ranges that constrain the trajectory only where nothing else does."""
     ranges = estimate.ranges
-    return estimate if ranges is None else replace(estimate, ranges=replace(ranges, sigma=ranges.sigma * _INFLATION))
-
-
-_INFLATION = 10.0
-"""Factor on the ranges' standard deviations."""
+    if ranges is None:
+        return estimate
+    return replace(estimate, ranges=replace(ranges, sigma=ranges.sigma * NeighbourPolicy.inflation))

@@ -7,9 +7,9 @@ import numpy as np
 from ..arrays import Bools, Ints
 from ..graph.work import POINTS, Work
 from ..lidar import cloud_rasters, clouds
+from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.clouds import Clouds
 from ..odometry.attached import choose_scans, scan_points
-from .estimate import ScanClouds
 from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings
 

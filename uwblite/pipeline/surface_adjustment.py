@@ -29,6 +29,7 @@ from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
 from ..graph.work import RAYS
+from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
@@ -48,7 +49,7 @@ from ..lidar.surface_rays import (
 from ..lidar.walls import Pieces, find_walls, straight_pieces
 from ..odometry import floor as floors
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
-from .estimate import Estimate, ScanClouds, Task
+from .estimate import Estimate, Task
 from .recordings import Recording
 
 _AT_ONCE = 128
@@ -250,7 +251,7 @@ def _measured_again(
 ) -> ScanEdges:
     """Return the pairs, with points on walls weighted by the information that the rays leave, and hardly any on columns."""
     weight = np.array([max(1.0 - 1.0 / noise.alike[0], _LEAST), _LEAST, 1.0])[kind]
-    return measured_again(joint, graph, scans.clouds, scans.raster, task.config.refinement, weight)
+    return measured_again(joint, graph, scans, task.config.refinement, weight)
 
 
 def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> Blocks:

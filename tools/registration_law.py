@@ -1,0 +1,82 @@
+"""The law of registration: of placements that are called right with probability p, a share p is right.
+
+Pairs of clouds of one recording are registered with priors drawn about their true relative poses: most within the noise of the
+wheels, some where these slipped. Each placement has a probability; the truth says whether it is right.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from trials import table
+
+from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.clouds import Clouds
+from uwblite.lidar.object_likelihood import ObjectLikelihood, pairs_of
+from uwblite.lidar.registration import Prior, register
+
+Floats = NDArray[np.float64]
+
+SOUND, SLIPPED = np.array([0.02, 0.01, 0.02]), np.array([0.5, 0.5, 0.4])
+"""Standard deviations of the priors' means about the truth where wheels are sound, and where they slipped, m, m, rad."""
+SLIPS = 0.2
+"""Share of the pairs whose wheels slipped."""
+BINS = (0.0, 0.5, 0.9, 0.99, 1.0)
+"""Limits of the probabilities that are summed up."""
+CHI2 = 16.27
+"""Squared Mahalanobis distance from the truth up to which a placement is right: one in a thousand exceeds it by chance."""
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Placements of pairs (e,)."""
+
+    probability: Floats
+    """(e,) of being right."""
+    right: NDArray[np.bool_]
+    """(e,)."""
+
+    def lines(self, name: str) -> list[list[object]]:
+        """Return for each bin: the name, the bin, pairs, mean probability and the share that is right."""
+        of = np.clip(np.searchsorted(BINS, self.probability, "right") - 1, 0, len(BINS) - 2)
+        own = [(f"{BINS[k]:g} to {BINS[k + 1]:g}", of == k) for k in range(len(BINS) - 1) if np.any(of == k)]
+        return [[name, label, int(s.sum()), self.probability[s].mean(), self.right[s].mean()] for label, s in own]
+
+    @property
+    def log_score(self) -> float:
+        """Mean logarithm of the probability of what is the case; 0 is perfect, log(1/2) that of a coin."""
+        p = np.clip(np.where(self.right, self.probability, 1.0 - self.probability), 1e-9, 1.0)
+        return float(np.log(p).mean())
+
+
+def placements(clouds: Clouds, truth: Floats, apart: int, rng: np.random.Generator, error: float) -> Placements:
+    """Register clouds, which lie at true poses (k, 3), with those some clouds later.
+
+    Parameters
+    ----------
+    apart : number of clouds between the two of a pair. error : standard deviation of a true relative pose, m and rad.
+    """
+    i = np.arange(len(clouds) - apart)
+    step = se2.between(truth[i], truth[i + apart])
+    slips = rng.random(len(i)) < SLIPS
+    mean = step + rng.standard_normal(step.shape) * (SOUND + slips[:, None] * SLIPPED)
+    sound = np.broadcast_to(np.diag(SOUND**2), (len(i), 3, 3)).copy()
+    pairs = pairs_of(clouds, i, i + apart)
+    objects = ObjectLikelihood.of(clouds, rasterize(clouds, 0.1, 0.5), 0.02, pairs, step)
+    found = register(objects, pairs, Prior(mean, sound, sound + np.diag(SLIPPED**2)), mean)
+    posterior = found.posterior(SLIPS)
+    placed = found.chosen((posterior[1] > posterior[0]).astype(np.float64))
+    off = se2.between(step, placed.pose)
+    covariance = placed.covariance + error**2 * np.eye(3)
+    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0])
+    return Placements(posterior[:2].max(axis=0), squared < CHI2)
+
+
+def report(rows: list[tuple[str, Placements]]) -> str:
+    """Return the calibration curve of recordings by name, of all together, and the log scores."""
+    every = Placements(*(np.concatenate([getattr(p, name) for _, p in rows]) for name in ("probability", "right")))
+    lines = [line for name, each in [*rows, ("all", every)] for line in each.lines(name)]
+    scores = ", ".join(f"{name} {each.log_score:.3f}" for name, each in [*rows, ("all", every)])
+    head = ["recording", "called right with", "pairs", "mean of that", "share right"]
+    return f"{table(head, lines)}\nLog score: {scores}.\n"
