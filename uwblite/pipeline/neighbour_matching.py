@@ -204,7 +204,7 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
-    figures = {
+    figures: dict[str, object] = {
         "searched": track.searched,
         "rejected": int(track.rejected.sum()),
         "slipped": int(np.sum(track.slips > NeighbourPolicy.likely)),
