@@ -180,6 +180,18 @@ def test_of_placements_called_right_with_a_probability_that_share_is_right():
     assert registration_law.report([("walk", law)]).count("walk |") >= 2
 
 
+def test_probabilities_of_modes_are_those_of_their_evidence(room):
+    """They add up to one; the likelier mode has most, and none of them more than one pair of clouds can be trusted."""
+    truth, clouds = room
+    step = se2.between(truth[0], truth[1])
+    for slip, mode in ((np.zeros(3), 0), (np.array([0.25, 0.0, 0.2]), 1)):
+        *_, found = registered(clouds, step + slip)
+        probability = found.posterior(0.01)[:, 0]
+        assert probability.sum() == pytest.approx(1.0)
+        assert np.argmax(probability) == mode
+        assert probability[mode] == pytest.approx(1.0 - RegistrationConfig.useless, abs=0.01)
+
+
 def test_evidence_that_may_be_wrong_is_bounded_and_keeps_its_sign():
     odds = np.array([-400.0, -2.0, 0.0, 2.0, 400.0])
     bounded = of_fallible(odds, 0.05)
