@@ -261,7 +261,7 @@ def _together(at: Floats, normal: Floats, deviation: Floats, config: WallConfig)
     """Return for each place (m, 2) with a normal (m, 2) the first one of its set; places that lie on one line and face the same
     way are of one set."""
     pairs = cKDTree(at).query_pairs(config.reach, output_type="ndarray")
-    columns = [np.ascontiguousarray(column) for column in (*at.T, *normal.T, deviation)]
+    places = np.stack([*at.T, *normal.T, deviation])
     first = each = np.arange(len(at))
     # Some of the pairs link most of the places, and few others remain to be tested.
     for tested in (pairs[::_SOME], pairs):
@@ -270,7 +270,7 @@ def _together(at: Floats, normal: Floats, deviation: Floats, config: WallConfig)
             one, other = tested[begin : begin + _PAIRS_AT_ONCE].T
             apart = np.flatnonzero(first.take(one) != first.take(other))
             one, other = one[apart], other[apart]
-            links.append(np.stack([one, other])[:, _on_one_line(config, one, other, *columns)])
+            links.append(np.stack([one, other])[:, _on_one_line(config, one, other, places)])
         one, other = np.concatenate(links, axis=1)
         own = connected(one, other, len(at))
         first = np.unique(own, return_index=True)[1][own]
@@ -283,10 +283,9 @@ _PAIRS_AT_ONCE = 1 << 15
 """Pairs that are processed together, so that they fit into the processor's cache."""
 
 
-def _on_one_line(
-    config: WallConfig, one: Ints, other: Ints, x: Floats, y: Floats, ahead: Floats, left: Floats, deviation: Floats
-) -> Bools:
-    """Return which pairs (e,) of places do, with coordinates, normals and the deviations of these (m,)."""
+def _on_one_line(config: WallConfig, one: Ints, other: Ints, places: Floats) -> Bools:
+    """Return which pairs (e,) of places do, given coordinates, normals and the deviations of these, (5, m)."""
+    x, y, ahead, left, deviation = places
     across, along = x.take(other) - x.take(one), y.take(other) - y.take(one)
     (ax, ay), (bx, by) = ((ahead.take(side), left.take(side)) for side in (one, other))
     lean = config.lean + 2.0 * np.hypot(deviation.take(one), deviation.take(other))
