@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..lidar.columns import Landmarks
+from ..grid.columns import find_column
 
 REACH = 4.0
 """Distance up to which a column or a wall counts as visible, m: the reach of a URG-04LX."""
@@ -19,6 +19,17 @@ _MOST_OBSERVATIONS = 200
 """Observations used of each column, evenly spread over the path."""
 _STEP = 0.05
 """Spacing of samples on true surfaces, m: a cell of the map."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Named round columns."""
+
+    names: tuple[str, ...]
+    positions: Floats
+    """(n, 2) m; nan where a column was not found."""
+    radii: Floats
+    """(n,) m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +60,24 @@ class WallErrors:
     """Share of the occupied cells that lie within the tolerance of a true surface."""
     recall: float
     """Share of the visible true surface that has an occupied cell within the tolerance."""
+
+
+def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float = 1.0, cell: float = 0.05) -> Landmarks:
+    """Return where the columns stand in a map.
+
+    Parameters
+    ----------
+    occupied : (n, 2) m, centres of the occupied cells, in the frame of the expected places.
+    expected : where the columns should be, and their radii.
+    search_radius : m; limited to 0.45 of the distance to the nearest other column, so that columns are not confused.
+    cell : m, size of a cell.
+    """
+    gaps = np.hypot(*(expected.positions[:, None] - expected.positions[None]).transpose(2, 0, 1))
+    np.fill_diagonal(gaps, np.inf)
+    reach = np.minimum(search_radius, 0.45 * gaps.min(axis=1, initial=np.inf))
+    rows = zip(expected.positions, expected.radii, reach, strict=True)
+    places = [find_column(occupied, place, radius, limit, cell) for place, radius, limit in rows]
+    return Landmarks(expected.names, np.array(places).reshape(-1, 2), expected.radii)
 
 
 def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:

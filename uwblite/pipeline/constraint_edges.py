@@ -26,8 +26,8 @@ from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import optimize
+from ..grid.columns import find_column, fit_circle
 from ..lidar.clouds import Clouds
-from ..lidar.columns import Landmarks, find_columns, fit_circle
 from ..problem.solution import rough
 from ..se2 import align
 from . import map_frame
@@ -230,8 +230,7 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     near = np.hypot(*(points - place).T) < landmark.radius + _NEAR
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
     if landmark.radius > 0.0:
-        column = Landmarks((landmark.name,), place[None], np.array([landmark.radius]))
-        place = find_columns(points[near], column, search_radius=_NEAR, cell=0.05).positions[0]
+        place = find_column(points[near], place, landmark.radius, _NEAR, cell=0.05)
         if not np.isfinite(place).all():
             raise ConfigError(f"{where}: no column of radius {landmark.radius:g} m stands there; look up its place in the map")
     count = np.bincount(clouds.owner[near], minlength=len(poses))
