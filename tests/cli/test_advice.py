@@ -9,7 +9,7 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite.assessment.recording import diagnose
 from uwblite.cli import main
-from uwblite.cli.wording import with_options
+from uwblite.cli.options import with_options
 from uwblite.errors import DataError
 from uwblite.io.carmen import write_log
 from uwblite.io.formats import read_recording

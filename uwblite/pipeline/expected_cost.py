@@ -1,7 +1,6 @@
-"""What `uwblite map` will cost, by the size of a recording."""
+"""What a map will cost in time and memory, by the size of a recording."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,9 +8,6 @@ from .. import se2
 from ..arrays import Floats
 from ..grid.occupancy_grid import GridConfig
 from ..sensor_log import SensorLog
-
-if TYPE_CHECKING:
-    from ..pipeline.mapping_config import MappingConfig
 
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
@@ -30,6 +26,8 @@ _BYTES_AT_LEAST = 105e6
 (143), and public recordings of lidar and of ranges alone 0.9 to 1.1 times what is measured."""
 _SCANS_LOOKED_AT = 500
 """At most, for the size of the map."""
+_GRID = GridConfig()
+"""Of the defaults."""
 
 
 def work_seconds(log: SensorLog) -> float:
@@ -61,12 +59,11 @@ def seen_size(log: SensorLog) -> Floats:
     return np.asarray(np.ptp(np.concatenate(points), axis=0))
 
 
-def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict[str, float]:
+def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
     """Return the time and memory that the map of a screened recording is expected to need, and the size of the map.
 
     The time is that on the computer of docs/performance.md; a Raspberry Pi 4 takes several times as long.
     """
-    grid = GridConfig() if config is None else config.grid
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)
@@ -79,18 +76,6 @@ def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict
         "map height m": round(float(size[1]), 1) if cells else 0.0,
         "map cells": cells,
     }
-
-
-def long_wait(seconds: float) -> str | None:
-    """Return what to say beforehand of a map that takes more than ten minutes, s; None of others."""
-    if seconds <= _LONG:
-        return None
-    cure = "a part of it (uwblite convert --start --end) or a larger --set keyframes.distance=METRES takes less"
-    return f"this map will take about {seconds / 60.0:.0f} minutes of a desktop computer, more of a small one: {cure}"
-
-
-_LONG = 600.0
-"""s; a user who is not told of it takes a longer run for one that hangs."""
 
 
 def together(costs: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -6,7 +6,7 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import VERBS, console
-from uwblite.cli.wording import OPTIONS, findings_with_options, with_options
+from uwblite.cli.options import OPTIONS, findings_with_options, with_options
 from uwblite.findings import doubt
 
 
