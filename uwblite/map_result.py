@@ -8,6 +8,7 @@ import numpy as np
 from .arrays import Bools, Floats, Ints
 from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
+from .graph.calibration import HEIGHT
 from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
 
@@ -59,6 +60,11 @@ class CalibrationEstimate:
     """'estimated', or 'prior': the recording cannot show it."""
     reason: str = ""
     """Why it stayed at the prior."""
+
+    @property
+    def is_height(self) -> bool:
+        """Whether it is the square of an anchor's height above or below the tag, m^2."""
+        return self.key.kind == HEIGHT
 
     @property
     def name(self) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from typing import Any, TextIO
 
 from ..report.printable import duration, encodable, printable
-from .wording import with_options
+from .options import with_options
 
 _LOGGER = logging.getLogger("uwblite")
 
