@@ -433,7 +433,7 @@ def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monke
         asked.append(log)
         raise Cancelled("enough")
 
-    monkeypatch.setattr("uwblite.mapping.scan_selection.prepared", prepared)
+    monkeypatch.setattr("uwblite.mapping.prepared", prepared)
     for logs in (minute, [minute], (minute,)):
         with pytest.raises(Cancelled):
             build_map(logs)

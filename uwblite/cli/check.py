@@ -43,7 +43,7 @@ def examined(log: SensorLog, repaired: SensorLog | None, began: float) -> tuple[
     The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
     """
     from ..mapping import MappingConfig, build_map
-    from ..pipeline.scan_selection import thinned
+    from ..pipeline.recordings import thinned
 
     config = MappingConfig()
     try:

@@ -21,7 +21,7 @@ from ..io.results import write_result
 from ..mapping import MappingConfig, MapResult, Progress, Stage, build_map
 from ..pipeline.expected_cost import expected_cost, together
 from ..pipeline.mapping_config import preset
-from ..pipeline.scan_selection import prepared
+from ..pipeline.recordings import prepared
 from ..sensor_log import SensorLog
 from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
 from .memory import FreedMemory, Shortage, shortage

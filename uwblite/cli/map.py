@@ -15,7 +15,7 @@ from ..io.formats import format_of
 from ..io.results import check_target
 from ..mapping import Stage
 from ..pipeline.expected_cost import expected_cost, together
-from ..pipeline.scan_selection import prepared
+from ..pipeline.recordings import prepared
 from ..report.printable import anchor_line, calibration_line, duration
 from . import console
 from .inputs import name_recordings_once

@@ -2,7 +2,8 @@
 
 Each radio's ranges are explained by places and intervals (radio/place_intervals.py); broken steps of the path compete with
 moves that begin together (broken_steps.py). Where ranges alone hold the path, all is solved with the places found, and these
-are decided on the path that results, until they stay.
+are decided on the path that results, until they stay. Anchors that are new or were taken away between recordings have ranges
+in some of them, though others drove in their reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ from ..graph.solver import Optimizer
 from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain
-from ..sensor_log.sensors import place_name
+from ..sensor_log.sensors import place_name, radio_name
 from .broken_steps import BreakPolicy, without_moves_of_path
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors
@@ -93,10 +94,8 @@ def _with_places(
     unused = [k for radio in radios for k in radio.numbers if not np.any(anchor[radio.rows] == k)]
     kept = np.setdiff1d(np.arange(len(ids)), unused)
     fresh = np.array(source)[kept]
-    bootstrap = replace(
-        bootstrap, placed=bootstrap.placed[fresh], ambiguous=bootstrap.ambiguous[fresh],
-        hypotheses=tuple(hypotheses[k] for k in kept),
-    )  # fmt: skip
+    left = tuple(hypotheses[k] for k in kept)
+    bootstrap = replace(bootstrap, placed=bootstrap.placed[fresh], ambiguous=bootstrap.ambiguous[fresh], hypotheses=left)
     graph = replace(estimate.graph, anchors=np.array(anchors)[kept], fixed_anchors=estimate.graph.fixed_anchors[fresh])
     ranges = replace(ranges, anchor=np.searchsorted(kept, anchor), weights=weights)
     ids = [ids[k] for k in kept]
@@ -113,9 +112,7 @@ def _names(radio: str, place: Ints, recording: Ints) -> list[str]:
     return names
 
 
-def _moves(
-    task: Task, positions: Floats, place: Ints, names: Sequence[str], stamps: Floats, recording: Ints
-) -> Iterator[Fact]:
+def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], stamps: Floats, recording: Ints) -> Iterator[Fact]:
     """Tell of each change of a radio's place.
 
     Parameters
@@ -129,11 +126,49 @@ def _moves(
         number, way = int(recording[first]), first - last - 1
         name, now = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        figures: dict[str, Any] = {
-            "anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now,
-        }  # fmt: skip
+        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
             between = [float(stamps[row] - start) for row in (last + 1, first)]
             figures |= {"between": between, "way": way, "several": len(task.recordings) > 1}
         yield Fact("moved-anchor", figures)
+
+
+def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
+    """Warn of anchors with ranges in some recordings alone, though others drove where these have them."""
+    ranges = estimate.ranges
+    if len(task.recordings) == 1 or ranges is None:
+        return estimate
+    recording_of, number = task.recordings.of_keyframe, len(task.recordings)
+    # Where an anchor was moved, one place follows the other: the move is reported, and the anchor was present all the time.
+    names = np.array([radio_name(name) for name in estimate.anchor_ids])
+    # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
+    heard = np.flatnonzero(ranges.ranges > 0.0)
+    counts = np.zeros((len(names), number), dtype=np.intp)
+    np.add.at(counts, (ranges.anchor[heard], recording_of[ranges.pose[heard]]), 1)
+    for k in np.flatnonzero(estimate.placed).tolist():
+        present = counts[names == names[k]].sum(axis=0) > 0
+        if present.all():
+            continue
+        away = np.hypot(*(estimate.graph.poses[:, :2] - estimate.graph.anchors[k]).T)
+        own = ranges.pose[heard[ranges.anchor[heard] == k]]
+        within = away <= np.median(away[own])
+        near = np.bincount(recording_of[within], minlength=number)
+        rate = within[own].sum() / max(int(near[present].sum()), 1)
+        absent = np.flatnonzero(~present & (rate * near >= _EXPECTED))
+        first, last = np.flatnonzero(present)[[0, -1]].tolist()
+        _note_absence(task, estimate.anchor_ids[k], first, last, absent)
+    return estimate
+
+
+_EXPECTED = 10.0
+"""An anchor is absent from a recording that should have so many ranges to it, by other recordings at the same places."""
+
+
+def _note_absence(task: Task, anchor: str, first: int, last: int, absent: Ints) -> None:
+    """Tell of an anchor to which recordings before the first or after the last with ranges (0, 1, ...) should have ranges."""
+    before, after = ([int(n) + 1 for n in absent[side]] for side in (absent < first, absent > last))
+    if before:
+        task.stages.note("new-anchor", anchor=anchor, recording=first + 1, silent=before)
+    if after:
+        task.stages.note("absent-anchor", anchor=anchor, recording=last + 1, silent=after)
