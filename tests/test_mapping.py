@@ -377,7 +377,7 @@ def test_a_lidar_whose_clock_is_late_is_found_out(log, truth, result):
 
 
 def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
-    monkeypatch.setattr("uwblite.pipeline.final_stages._LARGE_GRID", 100)
+    monkeypatch.setattr("uwblite.pipeline.final_stages.FinalPolicy.large_grid", 100)
     reported = []
 
     def decline(stage, done, total):

@@ -5,6 +5,7 @@ common frames: distances are the same in all of them. The alignment only gives w
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,10 +16,18 @@ from ..grid.columns import find_column
 
 REACH = 4.0
 """Distance up to which a column or a wall counts as visible, m: the reach of a URG-04LX."""
-_MOST_OBSERVATIONS = 200
-"""Observations used of each column, evenly spread over the path."""
-_STEP = 0.05
-"""Spacing of samples on true surfaces, m: a cell of the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class VisibilityPolicy:
+    """What of a true surface can be seen, and how often it is looked at."""
+
+    observations: ClassVar[int] = 200
+    """Used of each column, evenly spread over the path."""
+    step: ClassVar[float] = 0.05
+    """m between samples on true surfaces: a cell of the map."""
+    views: ClassVar[int] = 24
+    """Nearest viewpoints tried for each point of a surface."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +115,7 @@ def landmark_errors_along(
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_MOST_OBSERVATIONS, len(seen))).astype(np.intp))]
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(VisibilityPolicy.observations, len(seen))).astype(np.intp))]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
@@ -140,7 +149,7 @@ def wall_errors(
     viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `reach` m counts for the recall.
     tolerance : m.
     """
-    surface = sample_surfaces(walls, columns, _STEP)
+    surface = sample_surfaces(walls, columns, VisibilityPolicy.step)
     if not len(occupied) or not len(surface):
         return WallErrors(tolerance, 0.0, 0.0)
     distance = cKDTree(surface).query(occupied)[0]
@@ -163,17 +172,13 @@ def sample_surfaces(walls: Floats, columns: Floats, step: float) -> Floats:
     return np.concatenate(points)
 
 
-_VIEWS = 24
-"""Nearest viewpoints tried for each point of a surface."""
-
-
 def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Floats, reach: float) -> Bools:
     """Return which points (n,) on surfaces one of the nearest viewpoints (v, 2) sees, m; surfaces hide one another."""
     if not len(viewpoints):
         return np.zeros(len(points), dtype=bool)
     # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
     coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.intp), axis=0, return_index=True)[1]]
-    count = min(_VIEWS, len(coarse))
+    count = min(VisibilityPolicy.views, len(coarse))
     distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=reach)
     point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))
     start = coarse[view.reshape(len(points), count)[point, rank]]

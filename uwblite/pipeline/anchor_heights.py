@@ -16,6 +16,7 @@ from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apa
 from ..problem.evidence import laplace_marginal_likelihood, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve
 from .estimate import Estimate, OtherHeights, Task
+from .line_sides import LinePolicy
 from .mapping_config import MappingConfig
 
 
@@ -29,8 +30,6 @@ class HeightPolicy:
     """m above the tag from which on anchors can look like another unit; lower ones lengthen short ranges only."""
     high: ClassVar[float] = 6.0
     """m above the tag; anchors in a large hall."""
-    elsewhere: ClassVar[float] = 0.4
-    """m rms between two trajectories from which on it matters which of them is true."""
 
 
 def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
@@ -99,6 +98,6 @@ def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
 def check_heights(estimate: Estimate, task: Task) -> None:
     """Note where the ranges do not decide how high the anchors are, and a map without lidar depends on it."""
     other = estimate.other_heights
-    if other is None or task.recordings.have_scans or other.apart < HeightPolicy.elsewhere:
+    if other is None or task.recordings.have_scans or other.apart < LinePolicy.elsewhere:
         return
     task.stages.note("anchor-heights", height=other.high, taken=other.taken, apart=other.apart)

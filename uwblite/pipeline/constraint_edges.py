@@ -12,7 +12,7 @@ together have the weight of the one measurement.
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,20 @@ from ..se2 import align
 from . import map_frame
 from .estimate import Estimate, Task
 from .lidar_stages import refine_jointly, solve_by_own_errors
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkPolicy:
+    """Which clouds see a landmark."""
+
+    near: ClassVar[float] = 0.4
+    """m; points count as the landmark's when they lie so near to its place, or to the rim of its column."""
+    least_points: ClassVar[int] = 3
+    """Of a cloud, that make an observation."""
+    one_visit: ClassVar[float] = 3.0
+    """m; observations belong to one visit while less than this is travelled between two."""
+    visits: ClassVar[int] = 4
+    """Visits used of a landmark, those with most points."""
 
 
 def apply_given(estimate: Estimate, task: Task) -> Estimate:
@@ -193,16 +207,6 @@ def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Ed
     return [PriorEdges("poses", np.zeros(1, dtype=np.intp), graph.poses[:1].copy(), root)]
 
 
-_NEAR = 0.4
-"""Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
-_LEAST_POINTS = 3
-"""Least number of points of a cloud that make an observation."""
-_ONE_VISIT = 3.0
-"""Observations belong to one visit while less than this is travelled between two, m."""
-_VISITS = 4
-"""Visits used of a landmark, those with most points."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """Where a landmark stands, seen from some keyframes."""
@@ -227,19 +231,20 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     """
     points = se2.transform_each(poses, clouds.owner, clouds.points)
     place = np.array(landmark.position)
-    near = np.hypot(*(points - place).T) < landmark.radius + _NEAR
+    reach = LandmarkPolicy.near
+    near = np.hypot(*(points - place).T) < landmark.radius + reach
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
     if landmark.radius > 0.0:
-        place = find_column(points[near], place, landmark.radius, _NEAR, cell=0.05)
+        place = find_column(points[near], place, landmark.radius, reach, cell=0.05)
         if not np.isfinite(place).all():
             raise ConfigError(f"{where}: no column of radius {landmark.radius:g} m stands there; look up its place in the map")
     count = np.bincount(clouds.owner[near], minlength=len(poses))
-    seen = np.flatnonzero(count >= _LEAST_POINTS)
+    seen = np.flatnonzero(count >= LandmarkPolicy.least_points)
     if not len(seen):
-        raise ConfigError(f"{where}: the lidar saw nothing within {_NEAR:g} m of it; look up its place in the map")
-    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > _ONE_VISIT]))
+        raise ConfigError(f"{where}: the lidar saw nothing within {reach:g} m of it; look up its place in the map")
+    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > LandmarkPolicy.one_visit]))
     weight = np.bincount(visit, count[seen])
-    best = np.sort(np.argsort(-weight, kind="stable")[:_VISITS])
+    best = np.sort(np.argsort(-weight, kind="stable")[: LandmarkPolicy.visits])
     best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.intp)
     position = se2.transform(se2.inverse(poses[best_view]), place)
     if landmark.radius > 0.0:
@@ -250,9 +255,9 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
     """Return where one cloud has a column (2,): the column's place in the whole map bounds the search in the cloud."""
-    near = points[np.hypot(*(points - place).T) < radius + _NEAR]
+    near = points[np.hypot(*(points - place).T) < radius + LandmarkPolicy.near]
     centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
-    return centre if np.hypot(*(centre - place)) < _NEAR else place
+    return centre if np.hypot(*(centre - place)) < LandmarkPolicy.near else place
 
 
 def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:

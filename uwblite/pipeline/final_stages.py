@@ -1,6 +1,7 @@
 """The last stages: every measurement in one graph, and the occupancy grid along its trajectory."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,8 +31,21 @@ from .radio_stages import with_range_noise
 from .recordings import Recording
 from .surface_adjustment import for_covariances
 
-_LARGE_GRID = 5_000_000
-"""Cells from which on a grid's memory is announced."""
+
+@dataclass(frozen=True, slots=True)
+class FinalPolicy:
+    """What the finished estimate states."""
+
+    large_grid: ClassVar[int] = 5_000_000
+    """Cells from which on a grid's memory is announced."""
+    along: ClassVar[int] = 60
+    """Poses along the trajectory whose joint covariance represents the whole trajectory."""
+    shortest: ClassVar[float] = 0.05
+    """s; shortest step whose variance grows in proportion to its time."""
+    none: ClassVar[float] = 1e-6
+    """Least square root of an information."""
+    fastest: ClassVar[float] = 1.0
+    """m/s and rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
@@ -53,7 +67,7 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
 def covariances_of(estimate: Estimate, task: Task) -> Covariances:
     """Return the covariances of a finished estimate, with the correlated errors of ranges in them."""
     poses = len(estimate.graph.poses)
-    along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.intp))
+    along = np.unique(np.linspace(0, poses - 1, FinalPolicy.along).round().astype(np.intp))
     graph, surfaces = with_fewer_pairs(estimate.graph), estimate.surfaces
     graph, rays = (graph, None) if surfaces is None else for_covariances(surfaces, graph, task)
     found = marginals(graph, among=along, further=rays)
@@ -63,10 +77,6 @@ def covariances_of(estimate: Estimate, task: Task) -> Covariances:
     if not task.recordings.have_scans:
         return covariances
     return replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
-
-
-_ALONG = 60
-"""Number of poses along the trajectory whose joint covariance represents the whole trajectory."""
 
 
 def _with_correlated_ranges(found: Marginals, stated: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
@@ -91,17 +101,12 @@ def _between_scan_and_keyframe(stated: Graph, task: Task) -> Floats:
             time[recording.rows] = time_to_scans(recording, task.config.keyframes)
     time[stated.fixed_poses] = 0.0
     for wheels in (e for e in stated.edges if isinstance(e, OdometryEdges)):
-        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), _NONE)
+        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), FinalPolicy.none)
         for ends in (wheels.i, wheels.j):
-            np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, _SHORTEST)[:, None])
-    variance = np.minimum(rate * time[:, None], np.square(_FASTEST * time)[:, None])
+            np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, FinalPolicy.shortest)[:, None])
+    variance = np.minimum(rate * time[:, None], np.square(FinalPolicy.fastest * time)[:, None])
     turned = se2.rotation(stated.poses[:, 2])
     return np.asarray(turned * variance[:, None] @ turned.transpose(0, 2, 1))
-
-
-_SHORTEST, _NONE, _FASTEST = 0.05, 1e-6, 1.0
-"""Shortest step whose variance grows in proportion to its time, s; least square root of an information; and speed, m/s and
-rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 
 def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
@@ -155,7 +160,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
 
     def announce(geometry: GridGeometry) -> None:
         """Report what a large grid will take; the caller may still stop."""
-        if geometry.cells >= _LARGE_GRID:
+        if geometry.cells >= FinalPolicy.large_grid:
             cells, megabytes = geometry.cells / 1e6, geometry.megabytes
             detail = f"of {cells:.0f} million cells, about {megabytes:.0f} MB"
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)

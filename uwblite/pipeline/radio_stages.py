@@ -4,7 +4,8 @@ Each recording is bootstrapped on its own, then the recordings are joined. Once 
 the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,6 +33,19 @@ from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
 from .recordings import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class LapPolicy:
+    """How ranges and path are estimated in turn."""
+
+    laps: ClassVar[int] = 4
+    """Laps of the first optimisation: each estimates noise and optimises the graph; in the last one the radio's calibration is
+    free too."""
+    most_growth: ClassVar[float] = 1.3
+    """Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
+    least_scatter: ClassVar[float] = 0.03
+    """m; scatter that is usual for radios, below which the growth is not tested."""
 
 
 def first_optimisation(task: Task) -> Estimate:
@@ -131,7 +145,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     # Recordings that were joined have their slips in their odometry.
     if len(estimate.bootstrap.slips) and not estimate.alone:
         slips = estimate.bootstrap.slips
-    optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
+    optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(LapPolicy.laps)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
         estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
@@ -148,7 +162,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     if slips.any():
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
-        task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
+        task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
     found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
     if found is not estimate:
         estimate, result = _lap(found, lap, task, optimizer)
@@ -159,17 +173,13 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
 def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
     """Estimate the ranges' noise and optimise once; the last lap chooses the radio's priors and frees its calibration."""
     config, estimate = task.config, with_range_noise(estimate, task.config)
-    if lap == _NOISE_ROUNDS - 1:
+    if lap == LapPolicy.laps - 1:
         graph = with_selected_priors(estimate, config).graph
         return replace(estimate, graph=with_free(graph, *RADIO)).solved(config.solver, optimizer)
     # A robust odometry would break where the path only begins badly.
     odometry, solver = estimate.odometry, config.solver if lap else rough(config.solver)
     estimate, result = replace(estimate, odometry=replace(odometry, kernel=SQUARED)).solved(solver, optimizer)
     return replace(estimate, odometry=odometry), result
-
-
-_NOISE_ROUNDS = 4
-"""Number of laps: each estimates noise and optimises the graph; in the last one the radio's calibration is free too."""
 
 
 def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
@@ -272,8 +282,8 @@ def _let_go(held: Estimate, weak: Estimate) -> bool:
     Noise learnt there would be the error of the poses, and would fix them where they are. Sustained outliers of one anchor
     cause residuals too, but of this anchor only.
     """
-    growth = np.array([b / max(a, _LEAST_SCATTER) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
-    return len(growth) > 0 and float(np.median(growth)) > _MOST_GROWTH
+    growth = np.array([b / max(a, LapPolicy.least_scatter) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
+    return len(growth) > 0 and float(np.median(growth)) > LapPolicy.most_growth
 
 
 def _scatter(estimate: Estimate) -> list[float]:
@@ -282,9 +292,3 @@ def _scatter(estimate: Estimate) -> list[float]:
     assert ranges is not None
     off, alive = ranges.residuals(estimate.graph)[:, 0] * ranges.sigma, ranges.alive
     return [spread(off[alive & (ranges.anchor == anchor)]) for anchor in np.unique(ranges.anchor[alive])]
-
-
-_MOST_GROWTH = 1.3
-"""Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
-_LEAST_SCATTER = 0.03
-"""Scatter that is usual for radios, m; below it the test does not apply."""

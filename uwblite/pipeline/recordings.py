@@ -7,6 +7,7 @@ slow robot that is about every fifth scan.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,12 +24,21 @@ from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .mapping_config import MappingConfig
 
-_APART = 1000.0
-"""Travelled distance assumed between the end of a recording and the start of the next, m: they are different visits."""
 
+@dataclass(frozen=True, slots=True)
+class RecordingPolicy:
+    """How recordings are told apart, and which of their scans a map needs."""
 
-_SPARSE = 0.15
-"""Time between samples of the odometry that interpolation does not bridge well, s."""
+    apart: ClassVar[float] = 1000.0
+    """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
+    sparse: ClassVar[float] = 0.15
+    """s between samples of the odometry that interpolation does not bridge well."""
+    alike: ClassVar[int] = 20
+    """Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
+    same_moment: ClassVar[float] = 1e-6
+    """s; difference of stamps that is rounding."""
+    scans_per_move: ClassVar[int] = 2
+    """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +78,7 @@ class Recording:
         after = np.searchsorted(stamps, own)
         inside = (after > 0) & (after < len(stamps))
         gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
-        return np.union1d(stamps, own[inside][gap > _SPARSE]) if (gap > _SPARSE).any() else stamps
+        return np.union1d(stamps, own[inside][gap > RecordingPolicy.sparse]) if (gap > RecordingPolicy.sparse).any() else stamps
 
     def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
         """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
@@ -153,11 +163,7 @@ def _alike(one: SensorLog, other: SensorLog) -> bool:
     _, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
     same = np.all(a.poses[i] == b.poses[j], axis=1)
     moving = np.any(a.poses[i] != a.poses[np.maximum(i - 1, 0)], axis=1)
-    return int(np.sum(same & moving)) > _ALIKE
-
-
-_ALIKE = 20
-"""Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
+    return int(np.sum(same & moving)) > RecordingPolicy.alike
 
 
 def later(recordings: Recordings, shift: float) -> Recordings:
@@ -191,13 +197,9 @@ def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -
 
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
-    first, last = np.searchsorted(stamps, (begin + _SAME_MOMENT, end - _SAME_MOMENT))
+    first, last = np.searchsorted(stamps, (begin + RecordingPolicy.same_moment, end - RecordingPolicy.same_moment))
     within = stamps[first:last]
     return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
-
-
-_SAME_MOMENT = 1e-6
-"""Difference of stamps, s, up to which it is rounding."""
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:
@@ -208,7 +210,7 @@ def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recording
     for number, (log, own) in enumerate(zip(logs, frames, strict=True)):
         each.append(Recording(number, log, own, first))
         paths.append(start + np.concatenate([[0.0], np.cumsum(own.path)]))
-        first, start = first + len(own), float(paths[-1][-1]) + _APART
+        first, start = first + len(own), float(paths[-1][-1]) + RecordingPolicy.apart
     return Recordings(
         tuple(each),
         np.repeat(np.arange(len(each)), [len(s.frames) for s in each]),
@@ -216,10 +218,6 @@ def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recording
         np.concatenate(paths),
         np.concatenate([s.frames.twist for s in each]),
     )
-
-
-_STEPS = 2
-"""Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
 
 
 def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
@@ -248,7 +246,9 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     _, near = choose_scans(scans, keyframes.of(log, frames), frames)
     base = log.odometry.at(scans.stamps)
     laser = se2.compose(base, log.mounting.T_base_laser)
-    traced = moved_scans(laser, grid.move_distance / _STEPS, grid.move_angle / _STEPS)
+    traced = moved_scans(
+        laser, grid.move_distance / RecordingPolicy.scans_per_move, grid.move_angle / RecordingPolicy.scans_per_move
+    )
     kept = np.union1d(near, traced)
     if len(kept) == len(scans.stamps):
         return log
