@@ -97,8 +97,8 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
 
 def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     """Yield the stages that follow the first optimisation, by what was recorded, given and asked for."""
-    config, given = task.config, task.given
-    if given != Constraints():
+    config, constraints = task.config, task.given
+    if constraints != Constraints():
         yield constraint_edges.apply_given
     if task.recordings.have_scans:
         yield neighbour_matching.match_scan_to_scan if config.scan_to_scan.on else neighbour_matching.make_clouds
@@ -117,7 +117,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places
-    if given.landmark_distances:
+    if constraints.landmark_distances:
         yield constraint_edges.tie_landmarks
     yield anchor_places.name_new_and_absent_anchors
     yield final_stages.final_optimisation

@@ -89,9 +89,9 @@ def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float 
     return Landmarks(expected.names, np.array(places).reshape(-1, 2), expected.radii)
 
 
-def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
+def landmark_errors(columns: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
     """Compare distances between columns found in a map with the true ones; `pairs` of names, None = all pairs."""
-    place = dict(zip(found.names, found.positions, strict=True))
+    place = dict(zip(columns.names, columns.positions, strict=True))
     missing = tuple(name for name in truth.names if name not in place or not np.isfinite(place[name]).all())
     observations = {name: place[name][None] for name in truth.names if name not in missing}
     return _distance_errors(observations, truth, pairs, missing)

@@ -211,11 +211,11 @@ def evaluate_anchors(
     T_truth_map : (3,) alignment of the trajectory.
     """
     place = {name: xy for name, xy in zip(ids, positions, strict=True) if np.all(np.isfinite(xy))}
-    found = tuple(name for name in true_ids if name in place)
+    common = tuple(name for name in true_ids if name in place)
     missing = tuple(name for name in true_ids if name not in place)
-    if not found:
+    if not common:
         return AnchorErrors((), np.empty(0), float("nan"), missing)
-    truth = np.array([true_positions[true_ids.index(name)] for name in found])
-    estimate = se2.transform(T_truth_map, np.array([place[name] for name in found]))
+    truth = np.array([true_positions[true_ids.index(name)] for name in common])
+    estimate = se2.transform(T_truth_map, np.array([place[name] for name in common]))
     distances = np.hypot(*(estimate - truth).T)
-    return AnchorErrors(found, distances, float(np.sqrt(np.mean(distances**2))), missing)
+    return AnchorErrors(common, distances, float(np.sqrt(np.mean(distances**2))), missing)

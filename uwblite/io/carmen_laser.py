@@ -262,8 +262,8 @@ class LaserMessages:
 
     def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""
-        given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
-        return layout.range_max or given or DEFAULT_REACH
+        stated = params.get("robot_front_laser_max", "laser_front_laser_max_range")
+        return layout.range_max or stated or DEFAULT_REACH
 
     def _merged(
         self, kept: Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]

@@ -29,20 +29,20 @@ def decide_places(estimate: Estimate, task: Task) -> Estimate:
     """Give every anchor the places of greatest evidence, each with a name, and tell which were moved."""
     if estimate.ranges is None or not estimate.placed.any():
         return estimate
-    before, said = estimate, list[Fact]()
+    first, facts = estimate, list[Fact]()
     for _ in range(BreakPolicy.rounds):
         radios = radio_tracks(estimate, task)
-        found, broken = without_moves_of_path(estimate, task, radios, [explain(radio.model) for radio in radios])
-        other, moves = _with_places(estimate, task, radios, found)
-        said = [*moves, *(step.fact() for step in broken)]
-        if _same(other, estimate):
+        explanations, broken = without_moves_of_path(estimate, task, radios, [explain(radio.model) for radio in radios])
+        candidate, moves = _with_places(estimate, task, radios, explanations)
+        facts = [*moves, *(step.fact() for step in broken)]
+        if _same(candidate, estimate):
             break
         if not estimate.rests_on_ranges:
-            estimate = with_range_noise(other, task.config)
+            estimate = with_range_noise(candidate, task.config)
             break
-        estimate = _reoptimised(other, task)
-    task.stages.facts.extend(said)
-    if estimate is not before:
+        estimate = _reoptimised(candidate, task)
+    task.stages.facts.extend(facts)
+    if estimate is not first:
         task.stages.end("places of anchors", places=len(estimate.anchor_ids))
     return estimate
 
@@ -63,7 +63,7 @@ def _reoptimised(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _with_places(
-    estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation]
+    estimate: Estimate, task: Task, radios: Sequence[RadioTrack], explanations: Sequence[Explanation]
 ) -> tuple[Estimate, list[Fact]]:
     """Return the estimate with the places that were found, each as an anchor, and what is said of moves.
 
@@ -75,22 +75,22 @@ def _with_places(
     recording = task.recordings.of_keyframe[ranges.pose]
     ids, anchors, anchor = list(estimate.anchor_ids), list(estimate.graph.anchors), ranges.anchor.copy()
     weights, source, hypotheses = ranges.own_weights.copy(), list(range(len(ids))), list(bootstrap.hypotheses)
-    for radio, each in zip(radios, found, strict=True):
-        if len(radio.numbers) == len(each.found) == 1:
+    for radio, explanation in zip(radios, explanations, strict=True):
+        if len(radio.numbers) == len(explanation.found) == 1:
             continue
-        place = each.place[np.searchsorted(radio.chosen, np.arange(len(radio.rows)), "right") - 1]
+        place = explanation.place[np.searchsorted(radio.chosen, np.arange(len(radio.rows)), "right") - 1]
         names = _names(radio.name, place, recording[radio.rows])
         for k, name in enumerate(names):
             if name not in ids:
                 ids.append(name)
-                anchors.append(each.found[k].position)
+                anchors.append(explanation.found[k].position)
                 source.append(radio.numbers[0])
-                hypotheses.append((each.found[k], each.found[k]))
+                hypotheses.append((explanation.found[k], explanation.found[k]))
             number = ids.index(name)
-            anchors[number] = each.found[k].position
+            anchors[number] = explanation.found[k].position
             anchor[radio.rows[place == k]] = number
         weights[radio.rows[place < 0]] = 0.0
-        moves.extend(_moves(task, each.places[place], place, names, ranges.stamps[radio.rows], recording[radio.rows]))
+        moves.extend(_moves(task, explanation.places[place], place, names, ranges.stamps[radio.rows], recording[radio.rows]))
     unused = [k for radio in radios for k in radio.numbers if not np.any(anchor[radio.rows] == k)]
     kept = np.setdiff1d(np.arange(len(ids)), unused)
     fresh = np.array(source)[kept]
@@ -124,9 +124,9 @@ def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], sta
     for k in np.flatnonzero(np.diff(place[placed])).tolist():
         last, first = int(placed[k]), int(placed[k + 1])
         number, way = int(recording[first]), first - last - 1
-        name, now = names[place[last]], names[place[first]]
+        name, next_name = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now}
+        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": next_name}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
             between = [float(stamps[row] - start) for row in (last + 1, first)]
@@ -143,18 +143,18 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
     # Where an anchor was moved, one place follows the other: the move is reported, and the anchor was present all the time.
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
     # A recording with too few ranges to an anchor to place it gives these no weight, but it has them.
-    heard = np.flatnonzero(ranges.ranges > 0.0)
+    received = np.flatnonzero(ranges.ranges > 0.0)
     counts = np.zeros((len(names), number), dtype=np.intp)
-    np.add.at(counts, (ranges.anchor[heard], recording_of[ranges.pose[heard]]), 1)
+    np.add.at(counts, (ranges.anchor[received], recording_of[ranges.pose[received]]), 1)
     for k in np.flatnonzero(estimate.placed).tolist():
         present = counts[names == names[k]].sum(axis=0) > 0
         if present.all():
             continue
         away = np.hypot(*(estimate.graph.poses[:, :2] - estimate.graph.anchors[k]).T)
-        own = ranges.pose[heard[ranges.anchor[heard] == k]]
-        within = away <= np.median(away[own])
+        keyframes = ranges.pose[received[ranges.anchor[received] == k]]
+        within = away <= np.median(away[keyframes])
         near = np.bincount(recording_of[within], minlength=number)
-        rate = within[own].sum() / max(int(near[present].sum()), 1)
+        rate = within[keyframes].sum() / max(int(near[present].sum()), 1)
         absent = np.flatnonzero(~present & (rate * near >= _EXPECTED))
         first, last = np.flatnonzero(present)[[0, -1]].tolist()
         _note_absence(task, estimate.anchor_ids[k], first, last, absent)

@@ -121,15 +121,15 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
     settings = replace(config.bootstrap, range_sigma=sigma)
     measured = Measured(estimate.odometry, ranges, path - path[0])
-    found = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
-    whose = {"recording": number + 1} if len(recordings) > 1 else {}
-    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
+    result = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
+    number_if_several = {"recording": number + 1} if len(recordings) > 1 else {}
+    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(result.placed.sum()), **number_if_several)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.
-    back = se2.compose(estimate.graph.poses[0], se2.inverse(found.graph.poses[0]))
-    graph = estimate.graph.with_estimates_of(map_frame.moved(found.graph, back))
-    graph = replace(graph, fixed_anchors=~found.placed)
-    ranges = replace(ranges, weights=(used & found.placed[ranges.anchor]).astype(np.float64))
-    return replace(estimate, graph=graph, ranges=ranges, bootstrap=found).with_hypotheses_moved(back)
+    back = se2.compose(estimate.graph.poses[0], se2.inverse(result.graph.poses[0]))
+    graph = estimate.graph.with_estimates_of(map_frame.moved(result.graph, back))
+    graph = replace(graph, fixed_anchors=~result.placed)
+    ranges = replace(ranges, weights=(used & result.placed[ranges.anchor]).astype(np.float64))
+    return replace(estimate, graph=graph, ranges=ranges, bootstrap=result).with_hypotheses_moved(back)
 
 
 def _optimised(estimate: Estimate, task: Task) -> Estimate:
@@ -163,9 +163,9 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
-    found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
-    if found is not estimate:
-        estimate, result = _lap(found, lap, task, optimizer)
+    sided = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
+    if sided is not estimate:
+        estimate, result = _lap(sided, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
     return estimate
 

@@ -183,14 +183,14 @@ def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -
     frames = []
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
-        own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
+        starts = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
         added = (
             [np.zeros(0)]
             if log.scans is None
-            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in starts.tolist()]
         )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
-        alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
+        alone = np.isin(moments, np.concatenate([stamps[starts], stamps[starts + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))
     return _joined([s.log for s in recordings.each], frames)
 
@@ -207,10 +207,10 @@ def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recording
     each: list[Recording] = []
     paths: list[Floats] = []
     first, start = 0, 0.0
-    for number, (log, own) in enumerate(zip(logs, frames, strict=True)):
-        each.append(Recording(number, log, own, first))
-        paths.append(start + np.concatenate([[0.0], np.cumsum(own.path)]))
-        first, start = first + len(own), float(paths[-1][-1]) + RecordingPolicy.apart
+    for number, (log, keyframes_of) in enumerate(zip(logs, frames, strict=True)):
+        each.append(Recording(number, log, keyframes_of, first))
+        paths.append(start + np.concatenate([[0.0], np.cumsum(keyframes_of.path)]))
+        first, start = first + len(keyframes_of), float(paths[-1][-1]) + RecordingPolicy.apart
     return Recordings(
         tuple(each),
         np.repeat(np.arange(len(each)), [len(s.frames) for s in each]),
