@@ -25,7 +25,7 @@ from ..pipeline.recordings import prepared
 from ..sensor_log import SensorLog
 from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
 from .memory import FreedMemory, Shortage, shortage
-from .options import findings_with_options, with_options
+from .options import name_options, name_options_in
 from .workers import versions
 
 
@@ -53,7 +53,7 @@ def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> Rec
     began = time.perf_counter()
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
-    worded = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
+    worded = [replace(log.notes, warnings=tuple(map(name_options, log.notes.warnings))) for log in logs]
     logs = [replace(log, notes=notes) for log, notes in zip(logs, worded, strict=True)]
     return Recordings(logs, time.perf_counter() - began)
 
@@ -90,7 +90,7 @@ def make(
     _check_cost(kept, config, args.ignore_memory, note, maps)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
-    result = replace(result, findings=findings_with_options(result.findings))
+    result = replace(result, findings=name_options_in(result.findings))
     record = RunRecord(
         command=repeat_command(args, config),
         config=config_text(config),

@@ -167,7 +167,7 @@ OPTIONS = {
 """What sets on the command line what a text of the library has in backticks, alone or with its value."""
 
 
-def with_options(text: str) -> str:
+def name_options(text: str) -> str:
     """Return a text of the library with options in place of the settings and arguments that it names."""
     return re.sub(r"`([\w.]+)(=[^`]*)?`", _option, text) if "`" in text else text
 
@@ -178,6 +178,6 @@ def _option(match: "re.Match[str]") -> str:
     return f"`{option}`" if " " in option else option or match[0]
 
 
-def findings_with_options(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":
+def name_options_in(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":
     """Return findings whose texts and cures name options."""
-    return tuple(replace(f, text=with_options(f.text), cure=with_options(f.cure)) for f in findings)
+    return tuple(replace(f, text=name_options(f.text), cure=name_options(f.cure)) for f in findings)

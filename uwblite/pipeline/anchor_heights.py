@@ -32,7 +32,7 @@ class HeightPolicy:
     """m above the tag; anchors in a large hall."""
 
 
-def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
+def choose_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
     """Return the estimate under the likelier of the two explanations, with the other one where it is not refuted.
 
     Recordings that were joined are tested alone first: only where they do not refute high anchors, all are solved together.
@@ -63,10 +63,10 @@ def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimize
         return laplace_marginal_likelihood(with_free(graph, HEIGHT))
 
     present = estimate.problem
-    return compared(present, Alternative(with_high_anchors(present, config.calibration)), solved, evidence)
+    return compared(present, Alternative(raise_anchors(present, config.calibration)), solved, evidence)
 
 
-def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
+def raise_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
 
     As the start, lengths scaled by a wrong unit are scaled back; heights that were fixed at 0 are free again.

@@ -33,7 +33,7 @@ def decide_places(estimate: Estimate, task: Task) -> Estimate:
     for _ in range(BreakPolicy.rounds):
         radios = radio_tracks(estimate, task)
         explanations, broken = without_moves_of_path(estimate, task, radios, [explain(radio.model) for radio in radios])
-        candidate, moves = _with_places(estimate, task, radios, explanations)
+        candidate, moves = _apply_places(estimate, task, radios, explanations)
         facts = [*moves, *(step.fact() for step in broken)]
         if _same(candidate, estimate):
             break
@@ -62,7 +62,7 @@ def _reoptimised(estimate: Estimate, task: Task) -> Estimate:
     return with_selected_priors(with_range_noise(estimate, config), config).solved(config.solver, optimizer)[0]
 
 
-def _with_places(
+def _apply_places(
     estimate: Estimate, task: Task, radios: Sequence[RadioTrack], explanations: Sequence[Explanation]
 ) -> tuple[Estimate, list[Fact]]:
     """Return the estimate with the places that were found, each as an anchor, and what is said of moves.

@@ -73,13 +73,13 @@ def covariances_of(estimate: Estimate, task: Task) -> Covariances:
     result = marginals(graph, among=along, further=rays)
     covariances = result.covariances
     if estimate.ranges is not None:
-        covariances = _with_correlated_ranges(result, graph, estimate, task.config.ranges)
+        covariances = _add_correlated_ranges(result, graph, estimate, task.config.ranges)
     if not task.recordings.have_scans:
         return covariances
     return replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
 
 
-def _with_correlated_ranges(result: Marginals, model: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
+def _add_correlated_ranges(result: Marginals, model: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
     """Add the correlated errors of ranges: to anchors alone where the lidar determines the poses, else to all."""
     graph, ranges = estimate.graph, estimate.ranges
     assert ranges is not None
@@ -134,7 +134,7 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     graph, at_poses = estimate.graph, at_given_poses(estimate.graph)
     if not any(free.any() for free in free_unknowns(at_poses).values()):
         return estimate
-    at_poses = _with_alike_heights(with_free(at_poses, HEIGHT), estimate, task)
+    at_poses = _tie_heights(with_free(at_poses, HEIGHT), estimate, task)
     done = replace(estimate, graph=at_poses).solved(task.config.solver)[0].graph
     # What the search itself has fixed are heights put back to 0.
     heights = graph.calibration.of_kinds(HEIGHT)
@@ -143,7 +143,7 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
 
 
-def _with_alike_heights(at_poses: Graph, estimate: Estimate, task: Task) -> Graph:
+def _tie_heights(at_poses: Graph, estimate: Estimate, task: Task) -> Graph:
     """Return a graph of anchors and their ranges at given poses with priors of heights by what all of them show."""
     if estimate.ranges is None:
         return at_poses

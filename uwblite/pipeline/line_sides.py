@@ -37,7 +37,7 @@ class LinePolicy:
     """m rms between two trajectories from which on it matters which of them is true."""
 
 
-def with_likeliest_side(estimate: Estimate, task: Task) -> Estimate:
+def choose_side(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
     best, *others = sides(estimate.problem, estimate.placed, task.config.solver)
     return replace(estimate.with_estimates_of(best.graph), other_side=others[0].graph) if others else estimate

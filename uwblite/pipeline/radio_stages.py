@@ -57,9 +57,9 @@ def first_optimisation(task: Task) -> Estimate:
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
-        return anchor_heights.with_likelier_heights(estimates[0], task.config)
+        return anchor_heights.choose_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
-    return anchor_heights.with_likelier_heights(joined, task.config)
+    return anchor_heights.choose_heights(joined, task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | None = None) -> Estimate:
@@ -163,7 +163,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
-    sided = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
+    sided = estimate if have_scans or estimate.alone else line_sides.choose_side(estimate, task)
     if sided is not estimate:
         estimate, result = _lap(sided, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
@@ -256,8 +256,8 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None:
         return estimate
     if estimate.steps is None or not estimate.rests_on_ranges:
-        weak = _with_learnt_ranges(estimate, task, steady=True)
-        estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
+        weak = _learn_ranges(estimate, task, steady=True)
+        estimate = _learn_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
     return with_selected_priors(estimate, task.config)
 
 
@@ -267,7 +267,7 @@ def with_selected_priors(estimate: Estimate, config: MappingConfig) -> Estimate:
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, measured, config.calibration))
 
 
-def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
+def _learn_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
     """Return the optimum with ranges whose noise was learnt there; steady: see range_measurements.learn_noise."""
     optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
