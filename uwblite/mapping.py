@@ -97,7 +97,7 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
 
 def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     """Yield the stages that follow the first optimisation, by what was recorded, given and asked for."""
-    config, constraints = task.config, task.given
+    config, constraints = task.config, task.constraints
     if constraints != Constraints():
         yield constraint_edges.apply_given
     if task.recordings.have_scans:

@@ -56,7 +56,7 @@ def apply_given(estimate: Estimate, task: Task) -> Estimate:
     ------
     ConfigError : an anchor is not in the recording, a stamp lies outside it, or places are given together with `align`.
     """
-    constraints, config = task.given, task.config
+    constraints, config = task.constraints, task.config
     if constraints.places and config.align != "odometry":
         raise ConfigError("given places say where the map lies; leave out align, or the places")
     applied = apply(constraints, estimate.graph, estimate.anchor_ids, estimate.placed, task.recordings.clock)
@@ -267,11 +267,11 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
     ------
     ConfigError : there is no lidar, or see ties.
     """
-    given, config, scans = task.given, task.config, estimate.scans
+    constraints, config, scans = task.constraints, task.config, estimate.scans
     if scans is None:
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
     motion = map_frame.alignment_of(estimate, task)
-    tied = ties(given, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
+    tied = ties(constraints, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
     optimum = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
     estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(optimum)
     if estimate.joint is not None:
@@ -319,7 +319,7 @@ def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
     """Return the distances in the map, ready for a report; note those that differ from the measured ones."""
     lengths = tied.edges.lengths(graph)
     figures: list[dict[str, object]] = []
-    for number, given in enumerate(task.given.landmark_distances):
+    for number, given in enumerate(task.constraints.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))
         names = " - ".join(given.landmarks)
         figures.append({"landmarks": names, "measured": given.distance, "map": round(length, 4)})

@@ -42,7 +42,7 @@ _SCANS = 500
 
 def work_seconds(log: SensorLog) -> float:
     """Return the time that the map of a recording takes on the computer of docs/lab/performance.md, s."""
-    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
+    path = float(log.odometry.travelled[-1])
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     readings = 0 if log.scans is None else log.scans.ranges.size
     rates = WITH_LIDAR if readings else RANGES_ALONE
@@ -77,7 +77,7 @@ def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)
     scans, beams = (0, 0) if log.scans is None else log.scans.ranges.shape
-    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
+    path = float(log.odometry.travelled[-1])
     return {
         "seconds": round(model_seconds(log), 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
