@@ -1,7 +1,6 @@
 """Result of mapping: estimates, their covariances, and the stages by which they came about."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
 from .graph.calibration import HEIGHT
 from .graph.graph import Graph, UnknownKey
+from .graph.work import StageSummary
 from .grid.occupancy_grid import OccupancyGrid
 
 
@@ -114,20 +114,6 @@ class LoopClosure:
     def accepted(self) -> bool:
         """Whether it constrains the map."""
         return self.outcome == "accepted"
-
-
-@documented
-@dataclass(frozen=True, slots=True, eq=False)
-class StageSummary:
-    """One stage: its input and its result."""
-
-    name: str
-    seconds: float
-    """Wall time; filled in by the caller's clock, 0 where no clock was given."""
-    figures: dict[str, Any] = field(default_factory=dict)
-    """Named counts and figures (JSON-ready)."""
-    work: dict[str, int] = field(default_factory=dict)
-    """Operations counted by kind, see graph/work.KINDS; the same on every computer."""
 
 
 @documented
