@@ -23,9 +23,7 @@ from uwblite.problem.alternatives import Explanation
 from uwblite.sensor_log import SensorLog
 
 
-@pytest.mark.parametrize(
-    ("apart", "lidar", "doubts"), [(None, False, 0), (0.39, False, 0), (0.41, False, 1), (0.41, True, 0)]
-)
+@pytest.mark.parametrize(("apart", "lidar", "doubts"), [(None, False, 0), (0.39, False, 0), (0.41, False, 1), (0.41, True, 0)])
 @pytest.mark.parametrize("taken", [False, True])
 def test_heights_that_make_another_trajectory_are_a_doubt_without_a_lidar(apart, lidar, taken, doubts):
     stages = Stages(None, None)

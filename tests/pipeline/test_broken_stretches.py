@@ -61,8 +61,9 @@ def walked_once(shift, moved):
         scans(stamps, truth, HALL, rate=4.0, sweep=0.0, range_max=6.0, noise=0.01, rng=rng),
     )  # fmt: skip
     task = Task(gather([log], KeyframeConfig()), MappingConfig(), Constraints(), Stages(None, None))
-    estimate, true = dead_reckoning(task.recordings.each[0], task.config), se2.interpolate_trajectory(
-        stamps, truth, task.recordings.stamps
+    estimate, true = (
+        dead_reckoning(task.recordings.each[0], task.config),
+        se2.interpolate_trajectory(stamps, truth, task.recordings.stamps),
     )
     graph = replace(estimate.graph, poses=true, anchors=ANCHORS.copy())
     yes = np.ones(4, dtype=bool)
