@@ -187,7 +187,7 @@ class BrokenStep:
         return np.asarray(se2.compose(se2.compose(origin, self.motion), se2.inverse(origin)))
 
     def _evidence(self, radios: Sequence[int], worth: Sequence[Floats]) -> float:
-        """Return the evidence of the ranges of some radios along the path with the stretch moved, the places at their likeliest.
+        """Return the evidence of the ranges of some radios along the path with the stretch moved, places at their likeliest.
 
         Parameters
         ----------
