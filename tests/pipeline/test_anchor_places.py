@@ -1,7 +1,6 @@
 """Where anchors stood and when: planted moves are found and told, sound anchors of a torn path are not."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -210,5 +209,6 @@ def test_names_say_which_place_of_which_recording():
 
 
 def test_an_estimate_without_ranges_stays():
-    estimate = SimpleNamespace(ranges=None)
-    assert decide_places(estimate, None) is estimate
+    estimate, task = planted(metres=5.0)
+    estimate = replace(estimate, ranges=None)
+    assert decide_places(estimate, task) is estimate
