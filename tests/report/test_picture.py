@@ -68,8 +68,7 @@ def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
     assert share(image[: rows.max()], PATH, 60) == 0
 
 
-@pytest.mark.parametrize("size", [240, 300, 2000])
-@pytest.mark.parametrize("resolution", [0.01, 0.05, 0.3])
+@pytest.mark.parametrize(("size", "resolution"), [(240, 0.01), (240, 0.3), (300, 0.05), (2000, 0.05)])
 def test_thin_walls_survive_every_scale(size, resolution):
     image = draw_map(room(200, 300, resolution), PATH_IN_ROOM[:1], size=size)
     image = image[: -foot_height(image.shape[1], KEYS)]
