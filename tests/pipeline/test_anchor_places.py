@@ -173,9 +173,6 @@ def test_what_other_visits_saw_says_that_the_path_is_whole():
     """All anchors are moved as one: the path was broken, but for the scans that see the same walls before and after."""
     together = [(0, k, (2.0, -1.0), 80.0, 80.0) for k in range(4)]
     estimate, task = planted(moves=together)
-    assert decide_places(estimate, task).anchor_ids == NAMES
-    assert [doubt.kind for doubt in doubted(task.stages)] == ["path-displaced"]
-    estimate, task = planted(moves=together)
     found = decide_places(torn(estimate, task, 80.0, np.zeros(3), visits=True), task)
     assert found.anchor_ids == (*NAMES, *(f"{name}@2" for name in NAMES))
     assert doubted(task.stages) == []
