@@ -59,7 +59,7 @@ def test_scans_are_gone_through_at_most_thirteen_times_in_ten(mapped):
 
 
 def test_workers_count_as_one_process_does(log):
-    log = log.crop(0.0, 60.0)
+    log = log.crop(0.0, 20.0)
     with ThreadPoolExecutor(2) as executor:
         assert total(build_map(log, executor=executor)) == total(build_map(log))
 

@@ -202,7 +202,7 @@ class PlaceModel:
             mixture = replace(fit(error[own], min(max(track.sigma, MovePolicy.finest), most), most), width=self.width)
             mode, relative = mixture.mode(), mixture.centre - (clear[0] if behind else 0.0)
             pulled[own] = error[own] - mode
-            weight[own] = shares[own] * mixture.weights(error[own]) / mixture.sigma**2
+            weight[own] = shares[own] * mixture.weights_about(mode, error[own]) / mixture.sigma**2
             # Of the other four parameters only the number of ranges counts (G. Schwarz 1978), of the constant error its prior.
             count = max(float(shares[own].sum()), 1.0)
             evidence += float(shares[own] @ mixture.log_density(error[own])) - 2.0 * np.log(count)
