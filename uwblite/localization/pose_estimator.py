@@ -268,17 +268,20 @@ class PoseEstimator:
         pose = self._bank.poses[best].copy()
         certain = verdict.needed(fitting, proven)
         undecided = verdict.undecided(self._bank, best, found.complete, certain)
-        agreed = self._agreed(None if undecided else pose)
+        # Agreement from before the part that is used speaks of a place from which the robot was carried away.
+        agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
         fit = float(found.fit[best])
         # Rays that end beyond the map say nothing about it.
         rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
         odds = verdict.map_odds(fit, known, rays, fitting, agreed)
         self._reason = (
             undecided
+            or verdict.imprecise(self._bank.pose_covariances[best])
             or verdict.nowhere(odds, fitting)
             or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
         )
-        if not self._reason and odds.total < certain:
+        # That the robot was carried within the window is as unlikely as what counts as certain.
+        if not self._reason and odds.total < certain + verdict.CERTAIN * (self._parts > 1):
             self._reason = "found; a little more driving will confirm it"
         self._trim(bool(verdict.nowhere(odds, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)

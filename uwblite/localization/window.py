@@ -96,6 +96,10 @@ class Window:
         stamps = [r.stamp for r in self.ranges] + [k.stamp for k in self.looks]
         return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
 
+    def length(self, way: float) -> float:
+        """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
+        return way - min((entry.way for entry in (*self.ranges[:1], *self.looks[:1])), default=way)
+
     def forget(self, way: float) -> None:
         """Remove measurements from more than LENGTH before, m by the odometer."""
         self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
