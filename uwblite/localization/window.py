@@ -98,7 +98,7 @@ class Window:
 
     def length(self, way: float) -> float:
         """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
-        return way - min((entry.way for entry in (*self.ranges[:1], *self.looks[:1])), default=way)
+        return way - min([way, *(r.way for r in self.ranges[:1]), *(k.way for k in self.looks[:1])])
 
     def forget(self, way: float) -> None:
         """Remove measurements from more than LENGTH before, m by the odometer."""
