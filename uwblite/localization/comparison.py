@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, concatenated
-from . import hypotheses, likelihood_field, range_likelihood, search, verdict
+from . import hypotheses, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .sensing import TRACK_RAYS
@@ -71,7 +71,7 @@ class PlaceSearch:
 
     def __init__(self, known: KnownMap) -> None:
         self.walls, self._biases = known.walls, known.anchors.bias_sigma
-        self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
+        self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
         self._odom = np.zeros(3)
         self._present = np.zeros((0, 3))
