@@ -106,7 +106,7 @@ def test_a_few_points_of_walls_give_the_heading_where_ranges_fix_the_place(room)
     points = seen_from(pose, 9)
     rays = Rays(points, np.zeros_like(points), np.ones(len(points), bool))
     ranges = ranges_at(pose, np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 4.0], [5.0, 4.0]]), (0.05, 0.0))
-    assert search._FEWEST_BESIDE <= len(search._thinned(rays)) < search._FEWEST_POINTS
+    assert search.FEW_BESIDE <= len(search._thinned(rays)) < search.FEW_ENDS
     off = se2.between(pose, finished(search.places(room, rays, ranges, BOUNDS)).poses)
     near = np.hypot(off[:, 0], off[:, 1]) < 0.2
     assert np.abs(off[near, 2]).min() < 0.1

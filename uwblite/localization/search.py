@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .range_likelihood import PER_RANGE, range_likelihood, refined_by_ranges
+from .verdict import FEW_BESIDE, FEW_ENDS
 from .walls import Rays, Walls
 from .window import Ranges
 
@@ -93,8 +94,6 @@ _MOST_NODES = 60_000
 """Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
-_FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
-"""Least number of points of walls for matching; the second where ranges to three anchors determine the place."""
 MOST_PLACES = 32
 """Poses that are returned."""
 
@@ -132,9 +131,9 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
     anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
-    if field is not None and len(seen) >= (_FEWEST_POINTS if anchors < 3 else _FEWEST_BESIDE):
+    if field is not None and len(seen) >= (FEW_ENDS if anchors < 3 else FEW_BESIDE):
         found = yield from _by_scans(field, seen, float(rays.hit.mean()), ranges)
-        if len(seen) >= _FEWEST_POINTS and (len(found.poses) or not len(ranges)):
+        if len(seen) >= FEW_ENDS and (len(found.poses) or not len(ranges)):
             return found
     if anchors < 2:
         return Places(np.zeros((0, 3)), False)
@@ -359,4 +358,4 @@ def _distinct(poses: Floats, complete: bool) -> Steps:
 
 
 _SAME = (0.4, 0.2)
-"""m and rad; poses that are closer are one place."""
+"""m and rad; poses that are closer are one place, closer than hypotheses.apart: they are not refined yet."""
