@@ -11,7 +11,7 @@ The functions are generators that pause after every unit of work and yield its o
 a caller that must keep pace with a lidar does a few units between two scans.
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +116,12 @@ _PER_POINT, _PER_PLACE = 3, 10
 """Operations for a point of a scan at a place, and for a range to a place."""
 
 
+def units(count: int, each: int) -> Iterator[slice]:
+    """Yield parts of so many items, of a unit of work at most, where an item takes so many operations."""
+    step = max(1, UNIT // max(each, 1))
+    return (slice(start, start + step) for start in range(0, count, step))
+
+
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Search the map.
 
@@ -194,8 +200,7 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     """
     tried, few = poses[:_MOST_RIVALS], _some(ranges)
     weight = _PER_SCORE * scores[: len(tried)]
-    for start in range(0, len(tried), _RANGED_AT_ONCE):
-        part = slice(start, start + _RANGED_AT_ONCE)
+    for part in units(len(tried), PER_RANGE * len(few)):
         weight[part] += range_likelihood(tried[part], few, wider=0.5 * CELL)
         yield PER_RANGE * len(few) * len(tried[part])
     order = np.argsort(-weight, kind="stable")
@@ -226,17 +231,12 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
     """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
-    for start in range(0, len(nodes), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for part in units(len(nodes), _PER_POINT * offsets.shape[1]):
         heading, row, col = nodes[part].T.astype(np.intp)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
         scores[part] = values.sum(axis=1, dtype=np.intp) / (255.0 * offsets.shape[1])
         yield _PER_POINT * values.size
     return scores
-
-
-_AT_ONCE = 4096
-"""Nodes scored at once, a unit of work of 2 ms, so that they fit into the processor's cache."""
 
 
 def _dive(
@@ -261,8 +261,6 @@ def _pause(count: int) -> Generator[int, None, None]:
         yield count
 
 
-_CENTRES_AT_ONCE = UNIT // _PER_PLACE
-"""Places times ranges that are compared at once."""
 _MANY = 20_000
 """Nodes or poses that take a millisecond or so to make, to compare or to sort."""
 
@@ -290,15 +288,15 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[int, None
     if not len(ranges) or not len(centre):
         return np.ones(len(centre), bool)
     cost, moved = np.zeros(len(centre)), np.hypot(*ranges.tags.T)
-    at_once = max(1, _CENTRES_AT_ONCE // len(centre))
-    for k in range(len(ranges)):
-        x, y = (centre - ranges.places[k]).T
-        off = ranges.values[k] - np.sqrt(x * x + y * y)
-        beyond = np.abs(off) - moved[k] - 1.5 * half - 4.0 * ranges.sigma[k]
-        # A range that is one metre off counts like one that is ten metres off.
-        cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
-        if k % at_once == at_once - 1:
-            yield _PER_PLACE * at_once * len(centre)
+    for part in units(len(ranges), _PER_PLACE * len(centre)):
+        some = ranges.rows(np.arange(len(ranges))[part])
+        for place, value, way, sigma in zip(some.places, some.values, moved[part], some.sigma, strict=True):
+            x, y = (centre - place).T
+            off = value - np.sqrt(x * x + y * y)
+            beyond = np.abs(off) - way - 1.5 * half - 4.0 * sigma
+            # A range that is one metre off counts like one that is ten metres off.
+            cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
+        yield _PER_PLACE * len(some) * len(centre)
     return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
 
 
@@ -313,15 +311,13 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
         return Places(np.zeros((0, 3)), False)
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
     few, cost = _some(ranges), np.empty(len(poses))
-    for start in range(0, len(poses), _RANGED_AT_ONCE):
-        part = slice(start, start + _RANGED_AT_ONCE)
+    for part in units(len(poses), PER_RANGE * len(few)):
         cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
         yield PER_RANGE * len(few) * len(cost[part])
     order = np.flatnonzero(cost <= cost.min(initial=np.inf) + _RANGE_RIVAL)
     order = order[np.argsort(cost[order], kind="stable")]
     tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
-    for start in range(0, len(tried), _REFINED_AT_ONCE):
-        part = slice(start, start + _REFINED_AT_ONCE)
+    for part in units(len(tried), _PER_REFINED * len(ranges)):
         tried[part] = refined_by_ranges(tried[part], ranges)
         yield _PER_REFINED * len(tried[part]) * len(ranges)
     return (yield from _distinct(tried, 0 < len(order) <= _MOST_RIVALS))
@@ -334,10 +330,10 @@ def _some(ranges: Ranges) -> Ranges:
 
 _PER_SCORE = 30.0
 """Log-likelihood by which a score of 1 is better than one of 0: of fifteen rays, each about ten times likelier on a wall."""
-_RANGED_AT_ONCE, _MOST_RIVALS = 1024, 4096
-"""Poses that are tried at once, and that may be as good before the search is not complete."""
-_REFINED_AT_ONCE, _PER_REFINED = 8, 8 * 60
-"""Poses that are refined at once, and operations for a range in eight iterations of that."""
+_MOST_RIVALS = 4096
+"""Poses that may be as good before the search is not complete."""
+_PER_REFINED = 8 * 60
+"""Operations for a range in eight iterations of a refinement."""
 _RANGE_RIVAL = 12.0
 """Log-likelihood by which a place may be worse than the best one before it is refined."""
 
