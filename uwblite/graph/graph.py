@@ -227,7 +227,11 @@ class Graph:
 
     def updated(self, poses: Floats, anchors: Floats, calibration: Floats) -> "Graph":
         """Return the graph with new estimates."""
-        return replace(self, poses=poses, anchors=anchors, calibration=replace(self.calibration, values=calibration))
+        values = replace(self.calibration, values=calibration)
+        new = replace(self, poses=poses, anchors=anchors, calibration=values, edges=())
+        # There are as many unknowns as before, which is all that is required of edges.
+        object.__setattr__(new, "edges", self.edges)
+        return new
 
     def with_estimates_of(self, solved: "Graph") -> "Graph":
         """Return the graph with the estimates of another, its own edges kept."""
