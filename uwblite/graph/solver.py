@@ -25,7 +25,7 @@ path of hundreds of metres is corrected in five steps instead of hundreds. (Rela
 J. Leonard, S. Teller, Fast iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
 Near the minimum H hardly changes: a step after one of little effect uses the factor of that one. Where its predicted decrease
-is negligible, it is the last, and its cost is the predicted one.
+is negligible and there are no robust kernels, it is the last, and its cost is the predicted one.
 
 The search ends, and reports the reason, when the remaining decrease is a negligible fraction of F, when every component of
 the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up, or the
@@ -180,8 +180,8 @@ class _Descent:
         self.decreases: list[float] = []
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
-        robust = any(edges.kernel.name != "none" for edges in graph.edges)
-        self.to_come = as_much_again if robust else extrapolated
+        self.robust = any(edges.kernel.name != "none" for edges in graph.edges)
+        self.to_come = as_much_again if self.robust else extrapolated
 
     def prepare(self) -> str:
         """Bring the normal equations to the estimate; return why the search ends here, "" where it goes on."""
@@ -209,7 +209,7 @@ class _Descent:
         self.graph.work[ENTRIES] += int(steps)
         self.work += steps if reused else steps + self.normal.work
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING
-        if reused and 0 < promised <= negligible:
+        if reused and not self.robust and 0 < promised <= negligible:
             self.graph, self.chi2 = moved(self.graph, self.normal.unknowns, step), self.chi2 - promised
             self.history.append(self.chi2)
             return NO_DECREASE
