@@ -113,9 +113,8 @@ def dense_jacobian(graph):
 
 
 @pytest.mark.parametrize(("table", "count"), [(0, 40), (1, 8)], ids=["odometry", "robust closures"])
-def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(monkeypatch, table, count):
+def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(table, count):
     """Against the dense normal equations with the errors among the unknowns. The last edge has none."""
-    monkeypatch.setattr("uwblite.graph.marginals._MET_AT_ONCE", 11)
     graph, _ = calibrated_loop(n=40)
     graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
     edges, rng = graph.edges[table], np.random.default_rng(0)

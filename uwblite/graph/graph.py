@@ -89,6 +89,14 @@ class EdgeTable:
             arrays["weights"] = np.concatenate([t.own_weights for t in tables])
         return replace(self, **arrays)  # type: ignore[type-var]
 
+    def linearize(self, graph: "Graph") -> Linearization:
+        """Return whitened residuals and Jacobians."""
+        raise NotImplementedError
+
+    def residuals(self, graph: "Graph") -> Floats:
+        """Return whitened residuals (e, d)."""
+        return self.linearize(graph).residuals
+
     def by_edge(self) -> dict[str, Any]:
         """Return the arrays with a row per edge by their names; those that are left out are empty."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from .eliminated import Blocks, WithBlocks
+from .eliminated import Blocks, WithBlocks, rows_of
 from .factorization import counted
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
@@ -80,8 +80,6 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
     return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
 
 
-_MET_AT_ONCE = 1 << 14
-"""Rows of a table of common errors in memory at once."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
 
@@ -99,6 +97,14 @@ class CommonErrors:
     """(m, d) change of the edge's whitened residual by that error."""
     kind: Ints
     """(k,) kind of each error: errors of one kind have one variance, with 1 as the first guess."""
+
+    def table(self, graph: Graph) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+        """Return the changes of the residuals S (e d, k), and the same times the edges' weights, W S."""
+        d, weights = self.shift.shape[1], edge_weights(self.edges, graph)
+        places = (self.edge[:, None] * d + np.arange(d)).ravel(), np.repeat(self.error, d)
+        shape = len(self.edges) * d, int(self.error.max(initial=-1)) + 1
+        shifts = sparse.csr_matrix((self.shift.ravel(), places), shape=shape)
+        return shifts, sparse.csr_matrix(sparse.diags(np.repeat(weights, d)) @ shifts)
 
 
 class Marginals:
@@ -130,40 +136,19 @@ class Marginals:
         variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r (best linear unbiased prediction:
         C. R. Henderson, Biometrics 31, 1975).
         """
-        slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
+        slopes, (shifts, weighted), kind = self.slopes(common), common.table(self._graph), common.kind
         moves = self._factor.solve(slopes.toarray())
-        seen, products = seen - moves.T @ self._gradient, products - slopes.T @ moves
+        seen = weighted.T @ common.edges.residuals(self._graph).ravel() - moves.T @ self._gradient
+        products = (weighted.T @ shifts).toarray() - slopes.T @ moves
         # With products of roots of G: a variance near 0 has no inverse.
         root = np.sqrt(variances_of_kinds(seen, products, kind)[kind])
         inside = root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root))
         return np.asarray(-root * np.linalg.solve(inside, root * seen))
 
-    def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
-        """Return S^T W r (k,) and S^T W S (k, k)."""
-        edge, d = common.edge, common.shift.shape[1]
-        weights = edge_weights(common.edges, self._graph)
-        shape = (len(common.edges) * d, int(common.error.max(initial=-1)) + 1)
-        rows, columns = (edge[:, None] * d + np.arange(d)).ravel(), np.repeat(common.error, d)
-        shifts = sparse.csc_matrix((common.shift.ravel(), (rows, columns)), shape=shape)
-        weighted = shifts.multiply(np.repeat(weights, d)[:, None]).tocsc()
-        residuals = common.edges.residuals(self._graph).ravel()
-        return np.asarray(weighted.T @ residuals), np.asarray((weighted.T @ shifts).todense())
-
     def slopes(self, common: CommonErrors) -> sparse.csc_matrix:
         """Return J^T W s of each error as a column (unknowns, k)."""
-        size, count = self.unknowns.size, int(common.error.max(initial=-1)) + 1
-        weights, right = edge_weights(common.edges, self._graph), sparse.csc_matrix((size, count))
-        blocks = common.edges.linearize(self._graph).blocks
-        for first in range(0, len(common.edge), _MET_AT_ONCE):
-            part = slice(first, first + _MET_AT_ONCE)
-            edge = common.edge[part]
-            row = np.concatenate([self.unknowns.number[name][index[edge]] for name, index, _ in blocks], axis=1)
-            jacobian = np.concatenate([own[edge] for *_, own in blocks], axis=2)
-            slope = np.einsum("mdk,md->mk", jacobian, common.shift[part] * weights[edge, None])
-            error = np.broadcast_to(common.error[part, None], row.shape)
-            free = row >= 0
-            right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
-        return right
+        jacobian = rows_of(common.edges.linearize(self._graph), self.unknowns)
+        return sparse.csc_matrix(jacobian.T @ common.table(self._graph)[1])
 
     def _block_diagonal(self) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -246,12 +231,7 @@ def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, F
     """
     normal = filled(graph, subtrees=True)
     lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
-    right = np.zeros((normal.unknowns.size, len(shifts)))
-    for name, index, jacobian in lin.blocks:
-        number = normal.unknowns.number[name][index]
-        free = number >= 0
-        for k, shift in enumerate(weighted):
-            np.add.at(right[:, k], number[free], np.einsum("edk,ed->ek", jacobian, shift)[free])
+    right = np.asarray(rows_of(lin, normal.unknowns).T @ weighted.reshape(len(shifts), -1).T)
     solved = factor_of(normal).solve(right)
     total = np.einsum("ked,ked->k", shifts, weighted)
     left = total - np.einsum("nk,nk->k", right, solved)

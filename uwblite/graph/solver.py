@@ -131,9 +131,7 @@ def optimize(
     ------
     SolverError : nothing is free, there is no edge, or estimates or measurements are not finite.
     """
-    check(graph)
-    linearized = linearize(graph)
-    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress, allowed)
+    return Optimizer().optimize(graph, config, progress, allowed)
 
 
 def minimise(
@@ -351,10 +349,12 @@ class Optimizer:
     def __init__(self) -> None:
         self._normal: NormalEquations | None = None
 
-    def optimize(self, graph: Graph, config: SolverConfig) -> tuple[Graph, SolverSummary]:
+    def optimize(
+        self, graph: Graph, config: SolverConfig, progress: Progress | None = None, allowed: float = np.inf
+    ) -> tuple[Graph, SolverSummary]:
         """Return the graph at the nearest minimum of its cost, and how the search went; see solver.optimize."""
         check(graph)
         linearized = linearize(graph)
         if self._normal is None or not self._normal.suits(graph, linearized):
             self._normal = NormalEquations(graph, linearized)
-        return minimise(graph, linearized, self._normal, config)
+        return minimise(graph, linearized, self._normal, config, progress, allowed)

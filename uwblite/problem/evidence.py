@@ -68,17 +68,17 @@ def prior_sigma(graph: Graph) -> Floats:
     return sigma
 
 
-def with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
-    """Return the graph with other prior standard deviations (c,) of its calibration values."""
-
-    def changed(edges: object) -> bool:
-        return isinstance(edges, PriorEdges) and edges.block == "calibration"
-
-    edges = tuple(
-        replace(e, sqrt_information=(1.0 / sigma[e.index])[:, None, None]) if changed(e) else e  # type: ignore[attr-defined,type-var]
-        for e in graph.edges
-    )
-    return replace(graph, edges=edges)
+def with_prior_sigma(graph: Graph, sigma: Floats, mean: Floats | None = None) -> Graph:
+    """Return the graph with other prior standard deviations (c,) of its calibration values, and other means (c,), nan = as
+    they are."""
+    mean = np.full(len(sigma), np.nan) if mean is None else mean
+    edges = []
+    for e in graph.edges:
+        if isinstance(e, PriorEdges) and e.block == "calibration":
+            value, root = mean[e.index][:, None], (1.0 / sigma[e.index])[:, None, None]
+            e = replace(e, value=np.where(np.isnan(value), e.value, value), sqrt_information=root)
+        edges.append(e)
+    return replace(graph, edges=tuple(edges))
 
 
 _SCATTERS = 60

@@ -20,7 +20,7 @@ With the posterior N(a, P) found under the prior N(0, D), the marginal likelihoo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +28,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
-from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.graph import Edges, Graph
 from ..graph.joint_covariance import calibration_covariance
 from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
@@ -208,11 +208,11 @@ def with_alike_heights(graph: Graph) -> Graph:
         covariance = calibration_covariance(graph)
     except SolverError:
         return graph
-    about = np.zeros(len(sigma))
+    about = np.full(len(sigma), np.nan)
     for group in groups:
         mean, width = _common(graph.calibration.values[group], covariance[np.ix_(group, group)], sigma[group])
         about[group], sigma[group] = mean, width
-    return _with_priors(graph, np.concatenate(groups), about, sigma)
+    return with_prior_sigma(graph, sigma, about)
 
 
 def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, float]:
@@ -241,19 +241,3 @@ def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, f
     # A square cannot be below 0.
     middle = max(float(weight @ mean), 0.0)
     return middle, float(np.sqrt(weight @ (variance + (mean - middle) ** 2) + np.exp(2.0 * weight @ np.log(spread))))
-
-
-def _with_priors(graph: Graph, which: Ints, about: Floats, sigma: Floats) -> Graph:
-    """Return the graph with other priors of some calibration values: about (c,), with standard deviations sigma (c,)."""
-    edges = []
-    for e in graph.edges:
-        if isinstance(e, PriorEdges) and e.block == "calibration":
-            own = np.isin(e.index, which)[:, None]
-            root = (1.0 / sigma[e.index])[:, None, None]
-            e = replace(
-                e,
-                value=np.where(own, about[e.index][:, None], e.value),
-                sqrt_information=np.where(own[:, None], root, e.sqrt_information),
-            )
-        edges.append(e)
-    return replace(graph, edges=tuple(edges))
