@@ -21,7 +21,6 @@ from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
-from .variance_components import variances_of_kinds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,31 +79,10 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
     return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
 
 
+_VARIANCES = np.geomspace(1e-4, 4.0, 12)[:, None]
+"""Variances of common errors, from a hundredth to twice the size that is expected."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CommonErrors:
-    """Independent errors of unit variance, each common to many edges of one kind."""
-
-    edges: Edges
-    edge: Ints
-    """(m,) edge."""
-    error: Ints
-    """(m,) number of the error that affects it."""
-    shift: Floats
-    """(m, d) change of the edge's whitened residual by that error."""
-    kind: Ints
-    """(k,) kind of each error: errors of one kind have one variance, with 1 as the first guess."""
-
-    def table(self, graph: Graph) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Return the changes of the residuals S (e d, k), and the same times the edges' weights, W S."""
-        d, weights = self.shift.shape[1], edge_weights(self.edges, graph)
-        places = (self.edge[:, None] * d + np.arange(d)).ravel(), np.repeat(self.error, d)
-        shape = len(self.edges) * d, int(self.error.max(initial=-1)) + 1
-        shifts = sparse.csr_matrix((self.shift.ravel(), places), shape=shape)
-        return shifts, sparse.csr_matrix(sparse.diags(np.repeat(weights, d)) @ shifts)
 
 
 class Marginals:
@@ -129,26 +107,36 @@ class Marginals:
         among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
         return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among)
 
-    def estimated(self, common: CommonErrors) -> Floats:
+    def estimated(self, edges: Edges, shifts: sparse.csr_matrix) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
 
-        The errors u are unknowns with the prior N(0, G); the variance of each kind is learnt from the residuals, see
-        variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r (best linear unbiased prediction:
-        C. R. Henderson, Biometrics 31, 1975).
-        """
-        slopes, (shifts, weighted), kind = self.slopes(common), common.table(self._graph), common.kind
-        moves = self._factor.solve(slopes.toarray())
-        seen = weighted.T @ common.edges.residuals(self._graph).ravel() - moves.T @ self._gradient
-        products = (weighted.T @ shifts).toarray() - slopes.T @ moves
-        # With products of roots of G: a variance near 0 has no inverse.
-        root = np.sqrt(variances_of_kinds(seen, products, kind)[kind])
-        inside = root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root))
-        return np.asarray(-root * np.linalg.solve(inside, root * seen))
+        The errors u are unknowns with the prior N(0, g): u = -(A + 1 / g)^-1 S^T P r, where P = W - W J (J^T W J)^-1 J^T W and
+        A = S^T P S (best linear unbiased prediction: C. R. Henderson, Biometrics 31, 1975), in the mean over g by marginal
+        likelihood.
 
-    def slopes(self, common: CommonErrors) -> sparse.csc_matrix:
-        """Return J^T W s of each error as a column (unknowns, k)."""
-        jacobian = rows_of(common.edges.linearize(self._graph), self.unknowns)
-        return sparse.csc_matrix(jacobian.T @ common.table(self._graph)[1])
+        Parameters
+        ----------
+        shifts : S (e d, k), change of their whitened residuals by each error of the size that is expected.
+        """
+        weighted, slopes = self._weighted(edges, shifts), self.slopes(edges, shifts)
+        moves = self._factor.solve(slopes.toarray())
+        seen = weighted.T @ edges.residuals(self._graph).ravel() - moves.T @ self._gradient
+        products = (weighted.T @ shifts).toarray() - slopes.T @ moves
+        values, vectors = np.linalg.eigh(0.5 * (products + products.T))
+        inside, z = 1.0 + _VARIANCES * np.maximum(values, 0.0), vectors.T @ seen
+        worth = 0.5 * np.sum(_VARIANCES * z**2 / inside - np.log(inside), axis=1)
+        likely = np.exp(worth - worth.max())
+        return np.asarray(-vectors @ (likely @ (_VARIANCES / inside) / likely.sum() * z))
+
+    def slopes(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csc_matrix:
+        """Return J^T W S (unknowns, k) of errors of edges; see estimated."""
+        jacobian = rows_of(edges.linearize(self._graph), self.unknowns)
+        return sparse.csc_matrix(jacobian.T @ self._weighted(edges, shifts))
+
+    def _weighted(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csr_matrix:
+        """Return W S."""
+        weights = edge_weights(edges, self._graph)
+        return sparse.csr_matrix(sparse.diags(np.repeat(weights, shifts.shape[0] // len(weights))) @ shifts)
 
     def _block_diagonal(self) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
