@@ -1,16 +1,13 @@
 """Symbolic elimination of sparse, symmetric matrices: order, elimination tree and work, from the pattern alone.
 
-Poses measured against a few anchors are a sparse matrix with a border: anchors and calibration, which touch nearly every
-pose, are eliminated last by a Schur complement. Inside, a chain whose closures reach back a few poses is a narrow
-band: reverse Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and
-minimum degree with SuperLU in its symmetric mode needs fewer operations. Many anchors are no border any more, but the
-last rows of the sparse matrix. The order is found on the graph of poses, a third of the matrix's size, and used for
-every factorisation.
+Anchors and calibration, which touch nearly every pose, are a border that is eliminated last by a Schur complement; many of them
+are the last rows of the sparse matrix instead. A chain whose closures reach back a few poses is a narrow band: reverse
+Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and minimum degree with
+SuperLU in its symmetric mode needs fewer operations. The order is found on the graph of poses, a third of the matrix's size.
 
-The parent of a column in the elimination tree is the first row below its diagonal in the factor. The nonzeros of a computed
-factor do not show it reliably: an entry that cancels, or that underflows along a ring of a hundred poses, would cut
-the tree. So the tree is found from the pattern, and with it the number of entries of each column (J. Gilbert, E. Ng, B. Peyton,
-An efficient algorithm to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
+The elimination tree is found from the pattern: entries of a computed factor that cancel, or underflow along a ring of a hundred
+poses, would cut it. With it the number of entries of each column is known (J. Gilbert, E. Ng, B. Peyton, An efficient algorithm
+to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
 """Normal equations of a graph: the place of every product of Jacobians is analysed once, the values are filled often.
 
-A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
-H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration
-values share edges with many poses and are therefore not ordered: they come last. Scalars are numbered in the order of
-elimination, so that vectors need no permutation.
+A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of H = J^T W J is
+kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration values share edges
+with many poses and are therefore not ordered: they come last. Scalars are numbered in the order of elimination, so that vectors
+need no permutation.
 """
 
 from collections.abc import Iterator, Sequence
@@ -94,7 +94,7 @@ class NormalEquations:
             self._layout: Layout = IterativeLayout(blocks, pieces)
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
-        self.work = pieces.work if ordering.iterative else ordering.work
+        self.work = pieces.work(0, 0) if ordering.iterative else ordering.work
         """Multiplications of a factorisation, where they are many enough to be counted."""
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)

@@ -9,30 +9,27 @@ is omitted, so H stays positive semi-definite for every kernel. The step solves
 
     (H + lambda D) h = -g,    D = largest diag(H) so far (1 where an unknown is measured by nothing),
 
-which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
-keeps the matrix positive definite where the measurements leave a direction undetermined (an anchor without ranges, a closure
-whose information is singular): such a direction does not change. D never shrinks (J. J. More, The Levenberg-Marquardt
-algorithm, 1978): an anchor that comes into line with the poses with ranges to it loses all curvature across that line, and with
-a D that shrank with it, lambda would have to grow until it damped all other directions. The model predicts the decrease
-h^T (lambda D h - g); the ratio of the real decrease of F to the predicted one decides. A step that decreases F is taken, and
-lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
-nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
-O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
+Marquardt's scaling: lambda is a pure number, the same for metres, radians and scale factors, and the matrix is positive
+definite where the measurements leave a direction undetermined, which then does not change. D never shrinks (J. J. More, The
+Levenberg-Marquardt algorithm, 1978): an anchor that comes into line with its poses loses all curvature across that line, and
+lambda would have to grow until it damped all other directions. The model predicts the decrease h^T (lambda D h - g). A step
+that decreases F is taken, and lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3), with the ratio of the real decrease to the
+predicted one; otherwise it is multiplied by 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method,
+IMM-REP-1999-05; K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
-Where a step turns poses by much and misses its prediction, it is tried in two ways that agree to first order, each pose on
-its own and link by link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a
-path of hundreds of metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson,
-J. Leonard, S. Teller, Fast iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
+Where a step turns poses by much and misses its prediction, it is tried in two ways that agree to first order, each pose on its
+own and link by link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a path
+of hundreds of metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard,
+S. Teller, Fast iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
 Near the minimum H hardly changes: a step after one of little effect uses the factor of that one. Where its predicted decrease
 is negligible and there are no robust kernels, it is the last, and its cost is the predicted one.
 
-The search ends, and reports the reason, when the remaining decrease is a negligible fraction of F, when every component of
-the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up, or the
-work that the caller allows: it is counted, not timed, so that the same graph gives the same result.
-Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
-convergence is linear, conservative where it is quadratic, and it saves the last one or two iterations, which would
-change nothing. With robust kernels, reweighting converges linearly at an unknown rate, and the last decrease itself is used.
+The search ends where the remaining decrease is a negligible fraction of F or every component of the gradient is negligible in
+units of its own curvature, where no step helps, or where the iterations or the work allowed are used up: work is counted, not
+timed, so that the same graph gives the same result. Without robust kernels the decrease to come is extrapolated from the last
+two as a geometric series: exact where convergence is linear, conservative where it is quadratic. With robust kernels,
+reweighting converges linearly at an unknown rate, and the last decrease itself is used.
 """
 
 from collections.abc import Callable

@@ -44,6 +44,10 @@ def log_density(graph: Graph) -> float:
 def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
     """Return the logarithm of the marginal likelihood of other prior standard deviations, relative to those in use.
 
+    With the posterior N(a, P) under the prior N(0, D), that of N(0, D') is, relative to it,
+
+        2 log Z = h^T J^-1 h - a^T P^-1 a - log|J| - log|P| - log|D'| + log|D|,   J = P^-1 + D'^-1 - D^-1,   h = P^-1 a.
+
     Parameters
     ----------
     mean, covariance : (n,) and (n, n) posterior of the unknowns.

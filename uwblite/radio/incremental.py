@@ -1,16 +1,11 @@
 """Incremental optimisation of a graph whose initial values are only locally right: poses are added in time.
 
-Dead reckoning over kilometres drifts so far that no descent from it finds the minimum: with anchors trilaterated on a
-bent path, the start is outside the basin of convergence after a few thousand poses. But the guess of the next hundred poses,
-appended to the estimate so far, is always near. So poses are added in pieces. Each time the last few hundred are optimised
-with older ones fixed; the whole is optimised again when it is longer by half, or when the last part does not fit.
-
-An anchor is added when the ranges so far place it, and removed again when later ranges contradict it: the mirror
-image of an anchor passed on one side is often found, and is recognised only after a turn.
-
-A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, each of
-sqrt(2 / dof). A part that does not fit is tried, in this order, without the anchors that were added last, without
-the anchors most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
+Dead reckoning over kilometres drifts so far that no descent from it finds the minimum, but the guess of the next hundred poses,
+appended to the estimate so far, is always near. Each time the last few hundred are optimised with older ones fixed; the whole
+is optimised again when it is longer by half, or when the last part does not fit: when its chi2 per degree of freedom exceeds
+the usual by five standard deviations, each of sqrt(2 / dof). Such a part is tried, in this order, without the anchors that were
+added last, without those most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
+(The mirror image of an anchor passed on one side is often found, and is recognised only after a turn.)
 """
 
 from collections.abc import Iterator

@@ -1,22 +1,14 @@
 """Widths of the priors of the radios' errors and of the units of length, chosen by marginal likelihood of the recording.
 
-Most radios are calibrated: their clocks are right to parts of a million and the maker calibrated the antennas to a few
-centimetres. Some are not: scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those
-leaves the others' anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path.
-So the priors' standard deviations are chosen by marginal likelihood, the probability of all measurements with the unknowns
-integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
+Most radios are calibrated: their clocks are right to parts of a million and their antennas to a few centimetres. Some are not:
+scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those leaves the others' anchors and
+the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by marginal
+likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-Units of length: a radio measures times of flight and cannot be wrong by much; a wheel's radius is a setting and can be
-wrong by any factor. For the wheels' unit there are two hypotheses: the likelier one, by posterior odds, is taken, and
-without contradiction this is that all units are right. The scale of the radios and their biases can be wrong by little or much:
-several widths, from calibrated to uncalibrated radios, are tried, and their mean (of the logarithms), weighted by
-marginal likelihood, is taken. A scale that is clearly off gets the widest prior. So a scale stays at its nominal value as long
-as the recording does not show it, is corrected in part where it is uncertain, and is free where the posterior odds are clear.
-Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
-
-With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
-
-    2 log Z = h^T J^-1 h - a^T P^-1 a - log|J| - log|P| - log|D'| + log|D|,   J = P^-1 + D'^-1 - D^-1,   h = P^-1 a.
+A wheel's radius is a setting and can be wrong by any factor: of two hypotheses about the wheels' unit the likelier one is
+taken, without contradiction that all units are right. The scale and the biases of radios can be wrong by little or much: of
+several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the widest where a scale is clearly
+off. Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
 """
 
 from collections.abc import Sequence
