@@ -7,7 +7,7 @@ from pathlib import Path
 WHEELS = (
     "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-steps", "odometry-unit", "drift",
     "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
-    "unusual-calibration", "scales", "laser-turned-over", "path-displaced",
+    "unusual-calibration", "scales", "laser-turned-over", "path-displaced", "wheels-against-ranges",
 )  # fmt: skip
 LIDAR = (
     "laser-turned-over", "laser-turned-away", "scans-do-not-match", "wheels-against-lidar", "free-space-violation",
@@ -17,7 +17,7 @@ LIDAR = (
 RADIO = (
     "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
     "anchor-mirror-ambiguous", "moved-anchor", "shared-name", "repeated-ranges", "marked-ranges", "sustained-outliers",
-    "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales",
+    "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales", "exchanged-names",
 )  # fmt: skip
 CLOCKS = (
     "clock-set-back", "clock-jump", "stamps-in-bursts", "stamps-of-receipt", "made-up-stamps", "late-scans", "late-ranges",
