@@ -105,7 +105,7 @@ def wheels_against_ranges(begin: float, at: float, end: float, what: str, value:
         "ways": f"from t = {begin:.0f} to {end:.0f} s the wheels count {value:.2f} times the way that they count otherwise",
         "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
         "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
-        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say",
+        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
         "turns": f"about t = {at:.0f} s no path that the wheels count fits: one of them, or the heading, is stuck or slips",
     }[what]
     return replace(warning("wheels-against-ranges", f"{text}, by the ranges to the anchors in reach"), sensor="odometry")

@@ -51,14 +51,14 @@ class RangePolicy:
     """Readings of an anchor in a stretch: three give its place and its error."""
     factors: Floats = field(default_factory=lambda: np.geomspace(0.5, 2.0, 15))
     """Ways of the robot / ways by the wheels that are compared."""
-    usual_turn: float = 0.3
-    """Turn that sound wheels miss over twice such a way, rad: the map takes it up."""
+    usual_motion: float = 0.3
+    """Motion that sound wheels miss over twice such a way, m and rad: the map takes it up."""
     turn: float = 0.05
     """Between the turns that are compared, rad."""
 
 
-_SAME, _TURN = np.zeros(3), np.array([0.0, 0.0, 1.0])
-"""The motion that changes nothing, and a turn of 1 rad."""
+_SAME = np.zeros(3)
+"""The motion that changes nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ def _over_stretches(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy
                 continue
             shifted = log.odometry.at((trace.stamps + offsets[:, None]).ravel())[:, :2].reshape(len(offsets), -1, 2)
             paths = np.concatenate([policy.factors[:, None, None] * trace.places, shifted])
-            one = _best_place(paths, trace.ranges, policy)[0]
+            one = _best_place(paths, trace.ranges, policy)
             sound[:, :, number] += one
             each = np.concatenate([each, one[:, None, count:]], axis=1)
     scaled, late = sound[:, :count], sound[:, count:].sum(axis=2)
@@ -187,7 +187,7 @@ def _at_moments(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy) ->
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment.
     """
-    odometry, half, every = log.odometry, policy.stretch, 0.125 * policy.stretch
+    odometry, half, every = log.odometry, policy.stretch, 0.25 * policy.stretch
     longest, found = max(float(trace.ranges.max(initial=0.0)) for trace in traces), list[Explanation]()
     for at in np.arange(half, float(odometry.travelled[-1]) - half, every):
         origin = se2.inverse(odometry.at(np.array([np.interp(at, odometry.travelled, odometry.stamps)]))[0])
@@ -211,8 +211,6 @@ class Moment:
     """(2, a, g) the same where only the way is known."""
     nothing: Floats
     """(2, a) the same where ranges are no distances."""
-    places: Floats
-    """(2, a, 2) these, m."""
     policy: RangePolicy
 
     @staticmethod
@@ -221,11 +219,10 @@ class Moment:
         if not sides:
             return None
         before, after = (list(side) for side in zip(*sides, strict=True))
-        fits = [[_best_place(trace.places[None], trace.ranges, policy) for trace in side] for side in (before, after)]
-        likely, places = (np.array([[fit[k] for fit in side] for side in fits]) for k in (0, 1))
+        likely = [[_best_place(trace.places[None], trace.ranges, policy)[:, 0] for trace in side] for side in (before, after)]
         driven = np.array([[_by_way(trace, longest, policy) for trace in side] for side in (before, after)])
         nothing = np.array([[_no_distances(trace, longest) for trace in side] for side in (before, after)])
-        return Moment(before, after, likely[..., 0], driven, nothing, places[:, :, 0], policy)
+        return Moment(before, after, np.array(likely), driven, nothing, policy)
 
     @property
     def alone(self) -> Floats:
@@ -242,39 +239,47 @@ class Moment:
         one, two = self.before[k], self.after[other]
         moved = se2.transform(motions[:, None], two.places * np.array([1.0, sign]))
         paths = np.concatenate([np.broadcast_to(one.places, (len(motions), *one.places.shape)), moved], axis=1)
-        likely = _best_place(paths, np.concatenate([one.ranges, two.ranges]), self.policy)[0]
+        likely = _best_place(paths, np.concatenate([one.ranges, two.ranges]), self.policy)
         return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + self.alone[k][:, None]))
+
+    def refined(self, motions: Floats, size: float, sign: float = 1.0) -> tuple[Floats, float]:
+        """Return the best motion (3,) about the best of some (m, 3), within a size, m, coarse to fine; its log likelihood."""
+        best = motions[np.argmax(self.likely(motions, sign))]
+        around = np.stack(np.meshgrid(*3 * [np.array([-0.5, 0.0, 0.5])]), axis=-1).reshape(-1, 3)
+        for reach in size * 0.5 ** np.arange(np.log2(size / self.policy.usual_motion) + 3.0):
+            tried = best + around * reach
+            likely = self.likely(tried, sign)
+            best = tried[np.argmax(likely)]
+        return best, float(likely.max())
 
     def rows(self) -> Iterator[Explanation]:
         """Yield what explains a change; nothing where nothing could: with all anchors at any place the path is no likelier."""
-        policy, count = self.policy, len(self.before)
+        policy, count, turn = self.policy, len(self.before), np.array([0.0, 0.0, 1.0])
         turns = np.arange(-np.pi, np.pi, policy.turn)
-        usual = np.abs(turns) < policy.usual_turn
-        small = turns[usual, None] * _TURN
-        sound = self.likely(small)
-        null = float(sound.max())
+        usual = np.abs(turns) < policy.usual_motion
+        small, any_turn = turns[usual, None] * turn, turns[:: len(turns) // 12, None] * turn
+        still, null = self.refined(small, policy.usual_motion)
         if float(self.alone.sum(axis=0).max()) - null < EvidencePolicy.very_strong:
             return
-        large = self.likely(turns[~usual, None] * _TURN)
+        large = self.likely(turns[~usual, None] * turn)
         turned = float(np.logaddexp.reduce(large)) - np.log(len(large))
         rows = [("turned", turned, float(np.degrees(turns[~usual][np.argmax(large)])))]
-        rows += [("mirrored", float(self.likely(small, -1.0).max()), 0.0)]
         unknown = (self.driven[:1] + self.sides[1:], self.sides[:1] + self.driven[1:], self.driven.sum(axis=0)[None])
         rows += [("turns", float(np.concatenate(unknown).sum(axis=1).max()), 0.0)]
-        if count > 1:
-            free = 1.5 * np.log(sum(len(trace.ranges) for trace in self.before + self.after))
-            for what, sign in (("elsewhere", 1.0), ("mirrored", -1.0)):
-                motion = se2.align(self.places[1] * np.array([1.0, sign]), self.places[0])
-                rows.append((what, float(self.likely(motion[None], sign)[0]) - free, 0.0))
+        rows += [("mirrored", float(self.likely(small, -1.0).max()), 0.0)]
+        free = 1.5 * np.log(sum(len(trace.ranges) for trace in self.before + self.after))
+        rows += [("elsewhere", self.refined(any_turn, policy.stretch)[1] - free, 0.0)]
+        rows += [("mirrored", self.refined(any_turn, policy.stretch, -1.0)[1] - free, 0.0)]
         for what, gain, value in rows:
             prior = policy.exchanged if what == "mirrored" else policy.wheels
             figures = {"what": what, "value": value}
             yield Explanation(gain - null + float(np.log(prior)), "wheels-against-ranges", figures)
-        still = small[np.argmax(sound)][None]
-        pairs = np.array([[self.same(k, other, still)[:, 0] for other in range(count)] for k in range(count)])
+        pairs = np.array([[self.same(k, other, still[None])[:, 0] for other in range(count)] for k in range(count)])
         to = linear_sum_assignment(-pairs.max(axis=2))[1]
         changed = [trace.anchor for k, trace in zip(to, self.before, strict=True) if self.after[k].anchor != trace.anchor]
-        gain = float(pairs[np.arange(count), to].sum(axis=0).max()) - float(gammaln(count + 1.0))
+        # The number of cycles of so many of the anchors.
+        cycles = gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
+        gain = float(pairs[np.arange(count), to].sum(axis=0).max() - cycles)
         unordered = (self.nothing[:1, :, None] + self.sides[1:], self.sides[:1] + self.nothing[1:, :, None])
         nowhere = float(np.concatenate(unordered).sum(axis=1).max())
         for what, odds in (("exchanged", gain if changed else -np.inf), ("no distances", nowhere)):
@@ -291,8 +296,8 @@ def _best_stretch(gains: Floats) -> tuple[float, int, int]:
     return float(sums[end] - sums[begin]), begin, end
 
 
-def _best_place(paths: Floats, ranges: Floats, policy: RangePolicy) -> tuple[Floats, Floats]:
-    """Return log likelihoods (g, d) of ranges (n,) along paths (d, n, 2) to one place each, for g scales of errors; the places.
+def _best_place(paths: Floats, ranges: Floats, policy: RangePolicy) -> Floats:
+    """Return log likelihoods (g, d) of ranges (n,) along paths (d, n, 2) to one place each, for g scales of errors.
 
     Squares of ranges are linear in the place and the square of its distance from the middle of the path.
     """
@@ -306,8 +311,7 @@ def _best_place(paths: Floats, ranges: Floats, policy: RangePolicy) -> tuple[Flo
         found = np.linalg.solve(normal, np.sum(scaled * squares[..., None], axis=1)[..., None])
         errors = ((columns @ found)[..., 0] - squares) / (2.0 * ranges)
         weights = 1.0 / (1.0 + (errors / _USUAL) ** 2)
-    likely = -np.sum(np.log(np.pi * scales * (1.0 + (errors / scales) ** 2)), axis=2) - 1.5 * np.log(len(ranges))
-    return likely, middle[:, 0] + found[:, :2, 0]
+    return np.asarray(-np.sum(np.log(np.pi * scales * (1.0 + (errors / scales) ** 2)), axis=2) - 1.5 * np.log(len(ranges)))
 
 
 _ROUNDS, _RIDGE, _USUAL = 5, 1e-6, 0.2
