@@ -46,7 +46,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
         "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
-        "exchanged-names": _of(_BY_RANGES, "worse-than-parts odometry-steps"),
+        "exchanged-names": _of(_BY_RANGES, "worse-than-parts odometry-steps untied-parts"),
         "wheels-against-ranges": _BY_RANGES,
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
         "made-up-stamps": _TIMES,

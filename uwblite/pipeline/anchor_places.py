@@ -129,11 +129,9 @@ def _moves(
         number, way = int(recording[first]), first - last - 1
         name, now = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        figures: dict[str, Any] = {
-            "anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now,
-        }  # fmt: skip
+        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": now}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
-            between = [float(stamps[row] - start) for row in (last + 1, first)]
-            figures |= {"between": between, "way": way, "several": len(task.recordings) > 1}
+            between = [*(float(stamps[row] - start) for row in (last + 1, first)), way]
+            figures |= {"between": between, "several": len(task.recordings) > 1}
         yield Fact("moved-anchor", figures)
