@@ -185,7 +185,7 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
     each, stages = [SimpleNamespace(name=f"{n}.log", number=n, has_scans=False) for n in range(len(errors))], Stages(None, None)
     recordings = type("Recordings", (), {"each": each, "__len__": lambda self: len(each)})()
     estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=None)
-    task = SimpleNamespace(recordings=recordings, config=None, stages=stages, given=Constraints())
+    task = SimpleNamespace(recordings=recordings, config=None, stages=stages, constraints=Constraints())
     assert odometry_unit_factors(estimate, task).tolist() == factors
     wrong = [n for n, factor in enumerate(factors) if factor != 1.0]
     assert [w.figures for w in warned(stages)] == [{"recording": n + 1, "factor": factors[n]} for n in wrong]
@@ -224,7 +224,7 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
     recording = SimpleNamespace(name="run.log", number=0, has_scans=lidar is not None, log=log)
     recordings = Recordings((recording,), *(np.zeros(0),) * 4)
     given = Constraints(anchors=tuple(GivenAnchor(name, (0.0, 0.0)) for name in "AB"[:given]))
-    task = SimpleNamespace(stages=stages, recordings=recordings, given=given, config=None)
+    task = SimpleNamespace(stages=stages, recordings=recordings, constraints=given, config=None)
     other = None if height is None else OtherHeights(height, taken=False, apart=1.0)
     estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=other)
     factors = odometry_unit_factors(estimate, task)

@@ -228,7 +228,7 @@ def test_a_distance_off_by_more_than_three_sigma_is_a_warning(length, named):
     edges = PointDistanceEdges(*(np.array([k]) for k in (0, 1)), *np.zeros((2, 1, 2)), np.array([3.0]), np.array([0.1]))
     stages = Stages(None, None)
     distance = GivenLandmarkDistance(("a", "b"), 3.0, 0.1)
-    task = SimpleNamespace(given=Constraints(landmark_distances=(distance,)), stages=stages)
+    task = SimpleNamespace(constraints=Constraints(landmark_distances=(distance,)), stages=stages)
     graph = Graph(np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]))
     (figures,) = outcome(task, SimpleNamespace(edges=edges, measured=np.array([0])), graph)
     assert figures == {"landmarks": "a - b", "measured": 3.0, "map": length}
