@@ -10,13 +10,14 @@ where the sum is that of object_likelihood. Two clouds may also show nothing of 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
+from ..odometry.slips import FalseMotions
 from . import correlative_matching
 from .cloud_rasters import rasterize
 from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy
@@ -138,10 +139,40 @@ class Placement:
     """Where the odometry holds."""
     slipped: Placed
     """Where the wheels slipped."""
-    log_odds: Floats
-    """(e,) log of the evidence for a slip by that against it; 0 where the clouds say nothing."""
+    bound: Floats
+    """(e,) most that the log of the evidence for a slip by that against it can be, for pairs for which none was sought."""
     searched: Ints
     """Pairs (s,) for which a slip was sought."""
+
+    def log_odds(self, more: Floats | float = 0.0) -> Floats:
+        """Return the log of the evidence (e,) for a slip by that against it; 0 where the clouds say nothing.
+
+        Parameters
+        ----------
+        more : (e,) what adds to the evidence of a slip over each.
+        """
+        none, rows, odds = np.log(RegistrationConfig.useless), self.searched, self.bound.copy()
+        more = np.broadcast_to(more, odds.shape)[rows]
+        slipped, sound = self.slipped.evidence[rows] + more, self.sound.evidence[rows]
+        odds[rows] = np.logaddexp(slipped, none) - np.logaddexp(sound, none)
+        return of_fallible(odds, RegistrationConfig.useless)
+
+    def false_motions(self, prior: Prior, variance: float) -> FalseMotions:
+        """Return what the matches show of the wheels' false motions; nothing of pairs that were not searched.
+
+        Parameters
+        ----------
+        prior : with which they were placed. variance : of a match, m^2.
+        """
+        own, slipped = prior.rows(self.searched), self.slipped.rows(self.searched)
+        motions = FalseMotions(np.zeros_like(prior.mean), np.zeros_like(prior.slipped))
+        sigma = np.sqrt(np.einsum("eii->ei", own.slipped))
+        hessian = slipped.factors.hessian / (variance * ObjectPolicy.correlation)
+        # Matches and prior hold the pose in balance.
+        pull = np.einsum("eij,ej->ei", hessian + np.linalg.inv(own.slipped), _difference(slipped.pose, own.mean))
+        motions.vector[self.searched] = sigma * pull
+        motions.matrix[self.searched] = sigma[:, :, None] * hessian * sigma[:, None, :]
+        return motions
 
     def posterior(self, slips: float) -> Floats:
         """Return the probabilities (3, e) that pairs lie at the sound mode, at that of a slip if that is another place, and at
@@ -155,7 +186,7 @@ class Placement:
         parts = np.stack([
             np.log((1.0 - useless) * (1.0 - slips)) + self.sound.evidence,
             np.log((1.0 - useless) * slips) + self.slipped.evidence,
-            np.full(len(self.log_odds), np.log(useless)),
+            np.full(len(self.bound), np.log(useless)),
         ])
         # Any of them may be favoured falsely, however much.
         likely = np.exp(parts - np.logaddexp.reduce(parts, axis=0))
@@ -191,10 +222,27 @@ def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: 
         poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
         found = _from_best(objects, some.rows(poor), wide.rows(poor), starts)
         slipped = slipped.replaced(poor, found, found.evidence > slipped.evidence[poor])
-    none = np.log(c.useless)
-    log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
     slipped = sound.replaced(rows, slipped, np.ones(len(rows), dtype=bool))
-    return Placement(sound, slipped, of_fallible(log_odds, c.useless), rows)
+    return Placement(sound, slipped, log_odds, rows)
+
+
+def placed_again(
+    objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, prior: Prior, expected: FalseMotions
+) -> Placement:
+    """Return a placement whose slipped pairs are placed with what their neighbours show of the wheels' false motions.
+
+    Parameters
+    ----------
+    pairs, prior : see register. found : of these. expected : see FalseMotions.by_neighbours.
+    """
+    rows = found.searched
+    own, sigma = prior.rows(rows), np.sqrt(np.einsum("eii->ei", prior.slipped[rows]))
+    spread = np.linalg.inv(expected.matrix[rows])
+    mean = own.mean + sigma * np.einsum("eij,ej->ei", spread, expected.vector[rows])
+    wide = Gaussian(mean, sigma[:, :, None] * spread * sigma[:, None, :] + own.covariance)
+    one, other = (descend(objects, pairs.rows(rows), start, wide) for start in (found.slipped.pose[rows], mean))
+    slipped = one.replaced(np.arange(len(rows)), other, other.evidence > one.evidence)
+    return replace(found, slipped=found.slipped.replaced(rows, slipped, np.ones(len(rows), dtype=bool)))
 
 
 def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:

@@ -22,7 +22,7 @@ from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood, ObjectPolicy, pairs_of
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, RegistrationConfig, of_fallible, register
+from .registration import Placed, Prior, RegistrationConfig, of_fallible, placed_again, register
 from .scan_matching import match, measured, pair_points
 from .step_search import StepSearch
 
@@ -55,6 +55,8 @@ class TrackingConfig:
     """Share of matching points from which on descent from the odometry's guess measures a step."""
     most_through: ClassVar[float] = 0.04
     """Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
+    laps: ClassVar[int] = 3
+    """Times that steps with slips tell their neighbours."""
     steps_back: ClassVar[int] = 4
     """Steps over which objects that move are sought: a second or two."""
     longest_run: ClassVar[int] = 3
@@ -143,14 +145,21 @@ def follow(
     objects = ObjectLikelihood.of(clouds, raster, sigma, pairs, mean)
     objects = objects.learnt(pairs.rows(steps.enough), steps.pose[steps.enough])
     usual, wide = covariance_of(noise, graph), slip_sigma(noise)[:, :, None] ** 2 * np.eye(3)
-    found = register(objects, pairs, Prior(mean, usual, usual + wide), steps.pose)
+    prior = Prior(mean, usual, usual + wide)
+    found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
     prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
-    slips = posterior(found.log_odds + prior_odds, wheels.duration)
+    log_odds, motions = found.log_odds(), found.false_motions(prior, sigma**2)
+    chain = posterior(log_odds + prior_odds, wheels.duration)
+    for _ in range(TrackingConfig.laps):
+        expected = motions.by_neighbours(chain, wheels.duration)
+        chain = posterior(found.log_odds(motions.log_marginal(expected)) + prior_odds, wheels.duration)
+    slips = chain.probability
+    found = placed_again(objects, pairs, found, prior, expected)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain)
     # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.
-    rejected = _contradicted(edges, noise, graph) & (found.log_odds < 0.0)
+    rejected = _contradicted(edges, noise, graph) & (log_odds < 0.0)
     edges = edges.rows(np.flatnonzero(~rejected[np.searchsorted(i, edges.i)]))
     learnt = with_uncounted_ways(noise, edges, graph)
     seen, steady = np.flatnonzero((slips > 0.5) & _shown(placed)), ~np.isin(edges.i, i[slips > 0.5])
