@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from uwblite import build_map, se2
 from uwblite.constraints import Constraints, GivenLandmark, GivenLandmarkDistance
 from uwblite.errors import ConfigError
-from uwblite.graph.distance_edges import PointDistanceEdges
 from uwblite.graph.graph import Graph
+from uwblite.graph.point_edges import PointDistanceEdges
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
