@@ -372,7 +372,7 @@ def test_a_lidar_whose_clock_is_late_is_found_out(log, truth, result):
 
 
 def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
-    monkeypatch.setattr("uwblite.pipeline.final_stages._LARGE_GRID", 100)
+    monkeypatch.setattr("uwblite.pipeline.final_stages.FinalPolicy.large_grid", 100)
     reported = []
 
     def decline(stage, done, total):
@@ -428,7 +428,7 @@ def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monke
         asked.append(log)
         raise Cancelled("enough")
 
-    monkeypatch.setattr("uwblite.mapping.scan_selection.prepared", prepared)
+    monkeypatch.setattr("uwblite.mapping.prepared", prepared)
     for logs in (minute, [minute], (minute,)):
         with pytest.raises(Cancelled):
             build_map(logs)

@@ -117,9 +117,9 @@ INGREDIENTS: dict[str, LeftOut] = {
     "broken stretches": _stage("broken_stretches.replace_broken_stretches"),
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
-    "new and absent anchors": _stage("anchor_presence.name_new_and_absent_anchors"),
+    "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),
     "mirror images": _stage("mirror_images.find_mirror_images"),
-    "sides of a line of anchors": _stage("line_sides.with_likeliest_side"),
+    "sides of a line of anchors": _stage("line_sides.choose_side"),
     "priors of ranges selected": _stage("radio_stages.select_range_priors"),
     "tag pattern": _stage("lidar_stages._without_pattern"),
     "marginal likelihood of the radio's priors": LeftOut(

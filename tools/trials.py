@@ -22,13 +22,12 @@ from simulation.recording import Recording, Settings, simulate
 
 from uwblite import se2
 from uwblite.cli.evaluate import read_landmarks
-from uwblite.evaluation.map import LandmarkErrors, landmark_errors, landmark_errors_along
+from uwblite.evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
 from uwblite.evaluation.relations import Relations, evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_relations, read_tum
-from uwblite.lidar.columns import Landmarks, find_columns
 from uwblite.map_result import MapResult
 from uwblite.sensor_log import SensorLog
 
@@ -166,9 +165,7 @@ def true_path(folder: Path, log: SensorLog) -> tuple[Floats, Floats]:
     return log.scans.stamps[rows[:, 0].astype(int)], rows[:, 2:5]
 
 
-def real_error(
-    folder: Path, log: SensorLog, result: MapResult, truth: tuple[Floats, Floats] | None = None
-) -> float:
+def real_error(folder: Path, log: SensorLog, result: MapResult, truth: tuple[Floats, Floats] | None = None) -> float:
     """Return the error of the map of a recording of others, m: the mean over relations, where there are any, else the ATE.
 
     truth : stamps and poses of the reference; None = those of the folder, whose steps count all scans.

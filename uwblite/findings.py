@@ -41,6 +41,18 @@ class Finding:
     def __str__(self) -> str:
         return self.text
 
+    def record(self) -> dict[str, Any]:
+        """Return it as report.json has it: without severity, sensor and anchor, which its list and figures tell."""
+        return {
+            "kind": self.kind,
+            "text": self.text,
+            "cure": self.cure,
+            "recording": self.recording,
+            "stretches": list(self.stretches),
+            "explained_by": list(self.explained_by),
+            "figures": self.figures,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Fact:

@@ -1,14 +1,15 @@
 """Result of mapping: estimates, their covariances, and the stages by which they came about."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from .arrays import Bools, Floats, Ints
 from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
+from .graph.calibration import HEIGHT
 from .graph.graph import Graph, UnknownKey
+from .graph.work import StageSummary
 from .grid.occupancy_grid import OccupancyGrid
 
 
@@ -61,6 +62,11 @@ class CalibrationEstimate:
     """Why it stayed at the prior."""
 
     @property
+    def is_height(self) -> bool:
+        """Whether it is the square of an anchor's height above or below the tag, m^2."""
+        return self.key.kind == HEIGHT
+
+    @property
     def name(self) -> str:
         """The key as text, such as ``bias:5C0B``."""
         return self.key.label
@@ -108,20 +114,6 @@ class LoopClosure:
     def accepted(self) -> bool:
         """Whether it constrains the map."""
         return self.outcome == "accepted"
-
-
-@documented
-@dataclass(frozen=True, slots=True, eq=False)
-class StageSummary:
-    """One stage: its input and its result."""
-
-    name: str
-    seconds: float
-    """Wall time; filled in by the caller's clock, 0 where no clock was given."""
-    figures: dict[str, Any] = field(default_factory=dict)
-    """Named counts and figures (JSON-ready)."""
-    work: dict[str, int] = field(default_factory=dict)
-    """Operations counted by kind, see graph/work.KINDS; the same on every computer."""
 
 
 @documented

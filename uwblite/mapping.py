@@ -18,7 +18,6 @@ from .map_result import MapResult
 from .pipeline import (
     anchor_heights,
     anchor_places,
-    anchor_presence,
     broken_stretches,
     calibration_checks,
     closure_rounds,
@@ -29,13 +28,12 @@ from .pipeline import (
     mirror_images,
     neighbour_matching,
     radio_stages,
-    scan_selection,
     surface_adjustment,
 )
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stage, Stages
-from .pipeline.recordings import check_distinct, gather, require_types
+from .pipeline.recordings import check_distinct, gather, prepared, require_types
 from .sensor_log import SensorLog
 
 __all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
@@ -71,7 +69,7 @@ def build_map(
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
-    logs = [scan_selection.prepared(log, config) for log in logs]
+    logs = [prepared(log, config) for log in logs]
     config = calibration_checks.with_given_mounting_and_clock(calibration_checks.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task = _in_sound_units(task, logs)
@@ -99,8 +97,8 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
 
 def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     """Yield the stages that follow the first optimisation, by what was recorded, given and asked for."""
-    config, given = task.config, task.given
-    if given != Constraints():
+    config, constraints = task.config, task.constraints
+    if constraints != Constraints():
         yield constraint_edges.apply_given
     if task.recordings.have_scans:
         yield neighbour_matching.match_scan_to_scan if config.scan_to_scan.on else neighbour_matching.make_clouds
@@ -119,9 +117,9 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places
-    if given.landmark_distances:
+    if constraints.landmark_distances:
         yield constraint_edges.tie_landmarks
-    yield anchor_presence.name_new_and_absent_anchors
+    yield anchor_places.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images
     yield map_frame.align_axes

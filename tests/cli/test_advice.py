@@ -9,7 +9,7 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite.assessment.recording import diagnose
 from uwblite.cli import main
-from uwblite.cli.wording import with_options
+from uwblite.cli.options import name_options
 from uwblite.errors import DataError
 from uwblite.io.carmen import write_log
 from uwblite.io.formats import read_recording
@@ -56,7 +56,7 @@ def test_a_unit_that_is_named_is_the_one_that_mends_the_recording(tmp_path, soun
         spoiled = spoiled.without(lidar=True)
     with pytest.raises(DataError) as refused:
         screen(spoiled)
-    command = re.search(r"uwblite convert (--[a-z]+-unit)=(\S+?)`", with_options(str(refused.value)))
+    command = re.search(r"uwblite convert (--[a-z]+-unit)=(\S+?)`", name_options(str(refused.value)))
     assert command, str(refused.value)
     write_log(tmp_path / "spoiled.log", spoiled)
     assert main(["convert", str(tmp_path / "spoiled.log"), str(tmp_path / "mended.log"), *command.groups(), "-q"]) == 0

@@ -7,7 +7,8 @@ import sys
 import pytest
 from conftest import ROOT
 
-from uwblite.cli import cost, main, memory
+from uwblite.cli import main, making, memory
+from uwblite.pipeline import expected_cost as cost
 
 resource = pytest.importorskip("resource")
 
@@ -148,8 +149,7 @@ def test_of_several_recordings_the_program_counts_once(log):
 
 
 def test_a_map_that_takes_long_says_so_beforehand(short_log, monkeypatch, capsys):
-    assert cost.long_wait(599.0) is None
-    monkeypatch.setattr(cost, "_LONG", 0.1)
+    monkeypatch.setattr(making, "_LONG", 0.1)
     assert main(["map", str(short_log), "--dry-run"]) == 0
     said = capsys.readouterr().err
     assert "minutes of a desktop computer" in said

@@ -36,6 +36,15 @@ def test_places_go_to_a_table_and_a_picture(mapped, capsys):
     assert len(figures["anchors"]) == 2
 
 
+def test_the_map_alone_is_planned_for_as_if_there_were_no_anchors(mapped, capsys):
+    plans = []
+    for words in (["--map", str(mapped / "map" / "map.yaml")], ["--map", str(mapped / "map"), "--from-nothing"]):
+        assert main(["plan-anchors", *words, "--out", str(mapped / "alone"), "--force", "--json"]) == 0
+        plans.append(json.loads(capsys.readouterr().out))
+    assert plans[0]["today"]["anchors"] == 0
+    assert plans[0]["anchors"] == plans[1]["anchors"]
+
+
 def test_a_map_without_a_grid_and_no_map_at_all(mapped, capsys):
     (mapped / "map" / "map.yaml").unlink()
     assert main(["plan-anchors", "--map", str(mapped / "map")]) == 1

@@ -8,7 +8,7 @@ from helpers.driver_harness import feed_whole
 
 from uwblite.drivers.events import Corrupt, LaserScan
 from uwblite.drivers.ldlidar import READINGS, LdLidarDriver, LdLidarProtocol, crc8
-from uwblite.drivers.sweep import Samples
+from uwblite.drivers.spinning import Samples
 
 MANUAL = bytes.fromhex(
     "542c6808ab7e e000e4 dc00e2 d900e5 d500e3 d300e4 d000e9 cd00e4 ca00e2 c700e9 c500e5 c200e5 c000e5 be823a1a50"

@@ -7,7 +7,7 @@ from helpers.driver_harness import feed_whole
 
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.lds01 import TRUST, Lds01Protocol
-from uwblite.drivers.sweep import Samples
+from uwblite.drivers.spinning import Samples
 
 
 def packet(number, rule, mm=1500):

@@ -10,7 +10,7 @@ from helpers.lidar_bench import LIDARS, SPECS, LaserScan, emulator, frames, of_k
 
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Lost, Note, Param, Reopen
-from uwblite.drivers.sweep import Samples
+from uwblite.drivers.spinning import Samples
 
 RNG = random.Random(11)
 NOISES = [b"", b"\x00", b"\xa5", b"\xa5\x5a", b"\xaa\x55", b"\xaa\x55\x00\x50", b"\x54\x2c", b"\xfa\xa0", b"\xfa\xdb\x00",

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from uwblite.drivers.sweep import Fan, Samples, SweepAssembler
+from uwblite.drivers.spinning import Fan, Samples, SweepAssembler
 
 FAN = Fan(360, 0.1, 12.0)
 

@@ -8,7 +8,7 @@ from helpers.driver_harness import feed_whole, good
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.slamtec import Reply
-from uwblite.drivers.sweep import Samples
+from uwblite.drivers.spinning import Samples
 from uwblite.drivers.ydlidar import YdLidarProtocol, _correction
 
 MANUAL = bytes.fromhex("aa55010153ae53aeab540000")

@@ -5,14 +5,15 @@ import pytest
 
 from uwblite import se2
 from uwblite.evaluation.map import (
+    Landmarks,
     _blocked,
+    find_columns,
     landmark_errors,
     landmark_errors_along,
     sample_surfaces,
     visible_from,
     wall_errors,
 )
-from uwblite.lidar.columns import Landmarks, find_columns
 
 CELL = 0.05
 COLUMNS = Landmarks(("a", "b", "c"), np.array([[2.0, 2.0], [5.0, 2.5], [3.0, 5.5]]), np.array([0.35, 0.25, 0.2]))

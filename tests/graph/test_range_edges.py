@@ -38,3 +38,4 @@ def test_the_tag_is_on_the_base_as_it_stood_at_the_range():
         e = edges()
         base = se2.compose(poses[e.pose[row]], [*e.lever_arm[row], e.turn[row]])
         np.testing.assert_allclose(where, se2.transform(base, e.tag))
+        np.testing.assert_allclose(e.headings(poses)[row], base[2])

@@ -11,11 +11,12 @@ from uwblite.findings import doubt, warning
 from uwblite.graph.graph import Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.work import StageSummary
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
-from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, StageSummary
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 FILES = {

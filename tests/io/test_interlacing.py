@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.io.interlacing import beams_lie_between
+from uwblite.io.readings import beams_lie_between
 
 BEAMS, STEP = 180, np.radians(1.0)
 

@@ -75,7 +75,7 @@ def test_anchors_that_hang_high_are_told_from_wheels_in_another_unit(height, uni
 def test_without_heights_to_find_nothing_is_compared():
     graph = loop()[0]
     estimate = Estimate(graph, graph.edges[0], None, ())
-    assert anchor_heights.with_likelier_heights(estimate, MappingConfig()) is estimate
+    assert anchor_heights.choose_heights(estimate, MappingConfig()) is estimate
 
 
 @cache

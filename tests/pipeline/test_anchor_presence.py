@@ -9,7 +9,7 @@ from helpers.told import warned
 
 from uwblite.graph.graph import Graph
 from uwblite.graph.range_edges import RangeEdges
-from uwblite.pipeline.anchor_presence import name_new_and_absent_anchors
+from uwblite.pipeline.anchor_places import name_new_and_absent_anchors
 
 STEPS = 40
 """Keyframes of each recording, 0.3 m apart along x."""

@@ -14,7 +14,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
 from uwblite.pipeline.calibration_checks import with_given_mounting_and_clock
-from uwblite.pipeline.scan_selection import prepared, thinned
+from uwblite.pipeline.recordings import prepared, thinned
 from uwblite.sensor_log import Odometry, SensorLog
 
 FRAMES, GRID = KeyframeConfig(), GridConfig()

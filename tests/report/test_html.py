@@ -13,9 +13,10 @@ import pytest
 from helpers.results import EVIL, small_result
 
 from uwblite.graph.graph import UnknownKey
+from uwblite.graph.work import StageSummary
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
-from uwblite.map_result import OUTCOMES, CalibrationEstimate, StageSummary
+from uwblite.map_result import OUTCOMES, CalibrationEstimate
 from uwblite.report import svg_map
 from uwblite.report.html import Heading, render
 

@@ -81,6 +81,14 @@ def diagnose(
     return Diagnosis(explained(ranked(found)), view.figures)
 
 
+def screened(log: SensorLog) -> SensorLog | None:
+    """Return a recording screened; None where a map refuses it."""
+    try:
+        return screen(log)
+    except DataError:
+        return None
+
+
 def _view(log: SensorLog, result: MapResult | None, refused: str, repaired: SensorLog | None) -> RecordingView:
     try:
         repaired = repaired or screen(log)

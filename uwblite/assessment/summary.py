@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
@@ -111,7 +110,7 @@ def _range_table(
         "agrees": agrees.astype(np.float64),
         "x": x,
         "y": y,
-        "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
+        "theta": ranges.headings(graph.poses),
         "recording": recordings.of_keyframe[ranges.pose].astype(np.float64),
     }
 

@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     name = next((word for word in words if not word.startswith("-")), None)
     if name is None:
-        return _without_verb(words)
+        return _answer_without_verb(words)
     if name not in VERBS:
         near = get_close_matches(name, VERBS, n=1)
         return _usage_error(f"unknown command {name!r}{f'; did you mean {near[0]!r}?' if near else ''}")
@@ -85,7 +85,7 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
-def _without_verb(words: list[str]) -> int:
+def _answer_without_verb(words: list[str]) -> int:
     if "--version" in words:
         console.say(f"uwblite {__version__}")
         return _flushed(0)

@@ -5,26 +5,21 @@ import dataclasses
 import time
 from typing import Any
 
-from ..assessment.recording import Diagnosis, diagnose
-from ..errors import DataError, UwbliteError
+from ..assessment.recording import Diagnosis, diagnose, screened
+from ..errors import UwbliteError
 from ..findings import folded
-from ..report.printable import duration
-from ..screening.screen import screen
+from ..pipeline.expected_cost import SECONDS_AT_LEAST, expected_cost, model_seconds
+from ..report.printable import calibration_text, duration, signed
 from ..sensor_log import SensorLog
 from . import console
-from .cost import SECONDS_AT_LEAST, expected_cost, model_seconds
 from .inputs import recording
-from .wording import calibration_text, signed
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     log = recording(args, args.log)
     began = time.perf_counter()
-    try:
-        repaired = screen(log)
-    except DataError:  # a map refuses it
-        repaired = None
+    repaired = screened(log)
     if args.map:
         diagnosis, seconds = examined(log, repaired, began)
     else:
@@ -48,7 +43,7 @@ def examined(log: SensorLog, repaired: SensorLog | None, began: float) -> tuple[
     The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
     """
     from ..mapping import MappingConfig, build_map
-    from ..pipeline.scan_selection import thinned
+    from ..pipeline.recordings import thinned
 
     config = MappingConfig()
     try:

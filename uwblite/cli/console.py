@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from typing import Any, TextIO
 
 from ..report.printable import duration, encodable, printable
-from .wording import with_options
+from .options import name_options
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -45,7 +45,7 @@ def set_up(*, quiet: bool = False, verbose: int = 0) -> None:
 
 def say(text: str = "") -> None:
     """Write one line of the result to stdout."""
-    say_lines(printable(with_options(text)))
+    say_lines(printable(name_options(text)))
 
 
 def say_lines(text: str) -> None:
@@ -67,7 +67,7 @@ def note(text: str) -> None:
     """Write one line beside the result to stderr; --quiet drops it."""
     if not _CONSOLE.quiet:
         _clear_bar()
-        write(sys.stderr, printable(with_options(text)) + "\n")
+        write(sys.stderr, printable(name_options(text)) + "\n")
 
 
 def note_of(name: str, warnings: Iterable[str]) -> None:
@@ -82,7 +82,7 @@ def fail(text: str, code: int, *, trace: bool = False) -> int:
     if trace:
         write(sys.stderr, traceback.format_exc())
     head = "uwblite: " if code == 130 else "uwblite: error: "
-    write(sys.stderr, head + printable(with_options(" ".join(text.split()))) + "\n")
+    write(sys.stderr, head + printable(name_options(" ".join(text.split()))) + "\n")
     return code
 
 
@@ -232,7 +232,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, str):
-        return encodable(with_options(value))
+        return encodable(name_options(value))
     if isinstance(value, float):
         return value if abs(value) < float("inf") else None
     return value

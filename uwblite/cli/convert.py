@@ -5,10 +5,10 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
 from ..errors import ConfigError
 from ..io.carmen import write_log
 from ..io.corrected_log import write_graph_with_scans
@@ -94,7 +94,7 @@ def _convert_map(args: argparse.Namespace, to: str) -> int:
     if to in ("tum", "kitti"):
         if len(result.trajectories) > 1:
             console.note(f"uwblite: {args.source} holds {len(result.trajectories)} trajectories; this is the first of them")
-        return _write_trajectory(args, to, *result.trajectories[0])
+        return _write_trajectory(args, to, result.trajectories[0])
     logs = [recording(args, name) for name in args.recording]
     if to == "g2o":
         scans = write_graph_with_scans(args.target, result, logs)
@@ -122,16 +122,16 @@ def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
     refuse_existing(args.force, args.target)
     stamps, poses = read_tum(args.source)
     if to in ("tum", "kitti"):
-        return _write_trajectory(args, to, stamps, poses)
+        return _write_trajectory(args, to, (stamps, poses))
 
     order = np.argsort(stamps, kind="stable")
     _write(args, to, SensorLog(Odometry(stamps[order], poses[order])))
     return _say(args, {"odometry readings": len(poses)}, note="ranges.csv and scans.csv may be added" if to == "csv" else "")
 
 
-def _write_trajectory(args: argparse.Namespace, to: str, stamps: Floats, poses: Floats) -> int:
-    write_trajectory(args.target, to, stamps, poses)
-    return _say(args, {"poses": len(poses)})
+def _write_trajectory(args: argparse.Namespace, to: str, trajectory: tuple[Any, Any]) -> int:
+    write_trajectory(args.target, to, *trajectory)
+    return _say(args, {"poses": len(trajectory[0])})
 
 
 def _say(args: argparse.Namespace, counts: dict[str, int], *, note: str = "", warnings: Sequence[str] = ()) -> int:

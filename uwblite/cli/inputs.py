@@ -39,12 +39,12 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     from ..pipeline.mapping_config import MappingConfig, preset  # a check of a recording does without the pipeline
 
     # The user's mounting of the laser overrides what the scans show.
-    given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
+    implied = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
     text = read_settings(args.config) if args.config else ""
     try:
         config = preset(args.preset) if args.preset else MappingConfig()
         config = merge(config, parse_toml(text, args.config))
-        return override(config, [*given, *args.set])
+        return override(config, [*implied, *args.set])
     except ConfigError as error:
         raise UsageError(str(error)) from None
 

@@ -11,16 +11,16 @@ from ..io.files import write_text
 from ..io.folders import replacing_folder
 from ..io.formats import refuse_existing
 from ..io.png import write_png
-from ..io.result_text import covariance_csv, json_lines, notices
+from ..io.result_text import covariance_csv, json_lines
 from ..io.stored_result import read_result
 from ..io.tum import write_tum
 from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
 from ..report.picture import Overlay, PictureAnchor, draw_map
+from ..report.printable import signed
 from . import console
 from .inputs import effective_config, recording
 from .live import run_live, tell_doubts
-from .wording import signed
 
 
 def run(args: argparse.Namespace) -> int:
@@ -101,8 +101,8 @@ def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
         "poses": len(localization.stamps),
         "localized": localization.localized,
         "overlap": localization.overlap if localization.overlap == localization.overlap else None,
-        "warnings": notices(localization.warnings),
-        "doubts": notices(localization.doubts),
+        "warnings": [finding.record() for finding in localization.warnings],
+        "doubts": [finding.record() for finding in localization.doubts],
         "exit_code": 3 if localization.doubts else 0,
     }
 

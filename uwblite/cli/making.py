@@ -18,15 +18,14 @@ from ..io.files import sha256_of
 from ..io.formats import read_recording
 from ..io.result_text import RunRecord, base_name
 from ..io.results import write_result
-from ..map_result import MapResult
-from ..mapping import MappingConfig, Progress, Stage, build_map
+from ..mapping import MappingConfig, MapResult, Progress, Stage, build_map
+from ..pipeline.expected_cost import expected_cost, together
 from ..pipeline.mapping_config import preset
-from ..pipeline.scan_selection import prepared
+from ..pipeline.recordings import prepared
 from ..sensor_log import SensorLog
-from .cost import expected_cost, long_wait, together
 from .inputs import apply_mounting, bag_choices, effective_config, mounting_words
-from .memory import FreedMemory, shortage
-from .wording import findings_with_options, with_options
+from .memory import FreedMemory, Shortage, shortage
+from .options import name_options, name_options_in
 from .workers import versions
 
 
@@ -54,7 +53,7 @@ def read_logs(args: argparse.Namespace, executor: Executor | None = None) -> Rec
     began = time.perf_counter()
     read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
     logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
-    worded = [replace(log.notes, warnings=tuple(map(with_options, log.notes.warnings))) for log in logs]
+    worded = [replace(log.notes, warnings=tuple(map(name_options, log.notes.warnings))) for log in logs]
     logs = [replace(log, notes=notes) for log, notes in zip(logs, worded, strict=True)]
     return Recordings(logs, time.perf_counter() - began)
 
@@ -91,7 +90,7 @@ def make(
     _check_cost(kept, config, args.ignore_memory, note, maps)
     log = kept[0] if len(kept) == 1 else kept
     result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
-    result = replace(result, findings=findings_with_options(result.findings))
+    result = replace(result, findings=name_options_in(result.findings))
     record = RunRecord(
         command=repeat_command(args, config),
         config=config_text(config),
@@ -113,13 +112,27 @@ def _check_cost(
     logs: list[SensorLog], config: MappingConfig, ignore: bool, note: Callable[[str], None] | None, maps: int
 ) -> None:
     """Refuse a map that will not fit in memory; note what may not, and what will take long."""
-    whole = together([expected_cost(log, config) for log in logs])
+    whole = together([expected_cost(log, config.grid) for log in logs])
     lack = shortage(whole["megabytes"], maps)
     if lack is not None and lack.hopeless and not ignore:
         raise ConfigError(f"{lack.text}; --ignore-memory tries all the same")
-    for text in (lack and lack.text, long_wait(whole["seconds"])):
-        if text and note is not None:
-            note(f"uwblite: {text}")
+    if note is not None:
+        note_cost(lack, whole["seconds"], note)
+
+
+def note_cost(lack: Shortage | None, seconds: float, note: Callable[[str], None]) -> None:
+    """Tell beforehand of memory that will be short, and of a map that takes more than ten minutes."""
+    if lack is not None:
+        note(f"uwblite: {lack.text}")
+    if seconds > _LONG:
+        cure = "a part of it (uwblite convert --start --end) or a larger --set keyframes.distance=METRES takes less"
+        note(
+            f"uwblite: this map will take about {seconds / 60.0:.0f} minutes of a desktop computer, more of a small one: {cure}"
+        )
+
+
+_LONG = 600.0
+"""s; a user who is not told of it takes a longer run for one that hangs."""
 
 
 def config_text(config: MappingConfig) -> str:

@@ -12,17 +12,15 @@ from ..findings import DOUBT, folded
 from ..io.corrected_log import poses_of_scans, write_corrected_log
 from ..io.folders import sole_writer
 from ..io.formats import format_of
-from ..io.result_text import notices
 from ..io.results import check_target
 from ..mapping import Stage
-from ..report.printable import duration
-from ..screening.screen import screen
+from ..pipeline.expected_cost import expected_cost, together
+from ..pipeline.recordings import prepared
+from ..report.printable import anchor_line, calibration_line, duration
 from . import console
-from .cost import expected_cost, long_wait, together
 from .inputs import name_recordings_once
-from .making import Made, Recordings, make, peak_memory, read_logs, settings
+from .making import Made, Recordings, make, note_cost, peak_memory, read_logs, settings
 from .memory import shortage
-from .wording import anchor_line, calibration_line
 from .workers import workers
 
 
@@ -95,16 +93,13 @@ def _make_shown(args: argparse.Namespace, recordings: Recordings) -> Made:
 
 def _dry_run(args: argparse.Namespace) -> int:
     config = settings(args)
-    costs = [expected_cost(screen(log, config.detect_laser_flip), config) for log in _read(args).logs]
+    costs = [expected_cost(prepared(log, config), config.grid) for log in _read(args).logs]
     rows = [{"log": name, "expected cost of map": each} for name, each in zip(args.logs, costs, strict=True)]
     whole = together(costs)
     summary = {"recordings": rows, "expected cost of map": whole, "exit_code": 0}
     lines = [_cost_line(log, cost) for log, cost in zip(args.logs, costs, strict=True)]
     console.report(args.json, summary, [*lines, _cost_line("all together", whole)] if len(lines) > 1 else lines)
-    lack = shortage(whole["megabytes"])
-    for text in (lack and lack.text, long_wait(whole["seconds"])):
-        if text:
-            console.note(f"uwblite: {text}")
+    note_cost(shortage(whole["megabytes"]), whole["seconds"], console.note)
     return 0
 
 
@@ -120,8 +115,8 @@ def summary_json(args: argparse.Namespace, made: Made) -> dict[str, Any]:
         "out": args.out,
         "files": [os.path.join(args.out, name) for name in made.names],
         "trusted": not result.doubts,
-        "doubts": notices(result.doubts),
-        "warnings": notices(result.warnings),
+        "doubts": [finding.record() for finding in result.doubts],
+        "warnings": [finding.record() for finding in result.warnings],
         "anchors": {
             a.id: {"x": a.position[0], "y": a.position[1], "bias": a.bias, "ranges": a.ranges, "status": a.status}
             for a in result.anchors

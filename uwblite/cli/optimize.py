@@ -112,12 +112,12 @@ class _Search:
 
     def _solution(self, start: Start) -> "_Solution":
         if self.args.robust:
-            return self._without_outliers(start)
+            return self._reject_outliers(start)
         if self.args.incremental:
             return _Solution(*optimize_incrementally(start.graph, self.config, self.progress, self.left), {}, start)
         return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
 
-    def _without_outliers(self, start: Start) -> "_Solution":
+    def _reject_outliers(self, start: Start) -> "_Solution":
         graph = start.graph
         solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), self.config, self.progress, self.left)
         outliers = Counter[str]()

@@ -1,9 +1,15 @@
-"""What the rows of verbs.py are made of: options and readers of their values, and the groups that several verbs share."""
+"""What the rows of verbs.py are made of: options, readers of their values, groups that several verbs share; and the options
+in place of the settings and arguments that the library names."""
 
 import argparse
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from ..findings import Finding
 
 Add = Callable[[Any], object]
 """Declares options in a parser or a group of its options."""
@@ -138,3 +144,40 @@ BAG = group(
     option("--uwb-mapping FILE.toml", "where ranges stand in messages: docs/formats.md", place),
     option("--base-frame FRAME", "frame of the robot (the odometry's child frame)", default=""),
 )
+
+
+OPTIONS = {
+    **{name: f"--{name}" for name in ("append", "crop", "force")},
+    **{f"{unit}_unit": f"uwblite convert --{unit}-unit" for unit in ("range", "odometry", "laser", "time", "angle")},
+    **{f"topics.{topic}": f"--{topic}-topic" for topic in ("odometry", "scan", "imu")},
+    "to": "--to",
+    "topics.base_frame": "--base-frame",
+    "mappings": "--uwb-mapping",
+    "mounting.laser_flipped": "--laser-flipped",
+    "mounting.T_base_laser": "--laser-pose",
+    "mounting.tag_position": "--tag",
+    "mounting.anchor_height": "--anchor-height",
+    "use_lidar=false": "--without lidar",
+    "start": "uwblite convert run.log after.log --start",
+    "end": "uwblite convert run.log before.log --end",
+    "folder": "--out",
+    "steps": "--lidar-steps",
+    "shell": "--uwb shell:PORT",
+}
+"""What sets on the command line what a text of the library has in backticks, alone or with its value."""
+
+
+def name_options(text: str) -> str:
+    """Return a text of the library with options in place of the settings and arguments that it names."""
+    return re.sub(r"`([\w.]+)(=[^`]*)?`", _option, text) if "`" in text else text
+
+
+def _option(match: "re.Match[str]") -> str:
+    name, value = match[1], match[2] or ""
+    option = OPTIONS.get(name + value) or (OPTIONS[name] + value if name in OPTIONS else "")
+    return f"`{option}`" if " " in option else option or match[0]
+
+
+def name_options_in(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":
+    """Return findings whose texts and cures name options."""
+    return tuple(replace(f, text=name_options(f.text), cure=name_options(f.cure)) for f in findings)

@@ -1,19 +1,15 @@
 """`uwblite plan`: a path through a map."""
 
 import argparse
-import os
 from typing import Any
 
 import numpy as np
 
-from ..errors import ConfigError
-from ..grid.occupancy_grid import OccupancyGrid
 from ..io.files import write_text
 from ..io.folders import refuse_foreign_picture
 from ..io.formats import refuse_existing
-from ..io.map_server import read_map
 from ..io.png import write_png
-from ..io.stored_result import StoredAnchor, read_result
+from ..io.stored_result import read_space
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.picture import Overlay, PictureAnchor, draw_map
 from . import console
@@ -27,7 +23,9 @@ def run(args: argparse.Namespace) -> int:
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
-    grid, anchors = _read(args.map)
+    warnings = list[str]()
+    grid, anchors = read_space(args.map, warnings)
+    console.note_of(args.map, warnings)
     try:
         planner = make_planner(grid, args.radius, unknown=args.unknown)
         path = planner.plan(np.array(args.start), [np.array(p) for p in (*args.via, args.goal)], step=args.step)
@@ -48,19 +46,6 @@ def run(args: argparse.Namespace) -> int:
         console.say(f"warning: the start is {where}; the first {leaving:.2f} m leave it")
     console.say(f"files: {table} {picture}")
     return 0
-
-
-def _read(folder: str) -> tuple[OccupancyGrid, tuple[StoredAnchor, ...]]:
-    """Return the grid of a result or of a map.yaml, and the anchors where they are known."""
-    if not os.path.isdir(folder):
-        warnings = list[str]()
-        grid = read_map(folder, warnings)
-        console.note_of(folder, warnings)
-        return grid, ()
-    result = read_result(folder)
-    if result.grid is None:
-        raise ConfigError(f"{folder} has no map.yaml: without a map there is no free space to plan in")
-    return result.grid, result.anchors
 
 
 def _leaving(path: PlannedPath, radius: float) -> float:

@@ -5,17 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConfigError
 from ..io.files import write_text
 from ..io.folders import refuse_foreign_picture
 from ..io.formats import refuse_existing
 from ..io.png import write_png
-from ..io.stored_result import StoredResult, read_result
+from ..io.stored_result import read_space
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
 from ..report.error_map import draw_errors, side_by_side
 from ..report.picture import PictureAnchor
+from ..report.printable import signed
 from . import console
-from .wording import signed
 
 _HEAD = "id,x,y,mean_error,error_95"
 """Of the table."""
@@ -26,14 +25,18 @@ def run(args: argparse.Namespace) -> int:
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
-    result = read_result(args.map)
-    if result.grid is None:
-        raise ConfigError(f"{args.map} has no map.yaml: without a map there is no free space to plan for")
-    placed = [a.position for a in result.anchors if np.isfinite(a.position).all() and not args.from_nothing]
-    plan = plan_anchors(result.grid, np.array(placed).reshape(-1, 2), args.count, reach=args.reach)
+    warnings = list[str]()
+    grid, anchors = read_space(args.map, warnings)
+    console.note_of(args.map, warnings)
+    placed = [PictureAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
+    plan = plan_anchors(grid, np.array([a.position for a in placed]).reshape(-1, 2), args.count, reach=args.reach)
     figures = _figures(args, plan, len(placed))
     write_text(table, _table(figures))
-    write_png(picture, _picture(result, plan, args.from_nothing))
+    new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]
+    about = "Expected error of a position"
+    today = plan.errors[0], placed, f"{about}, {len(placed)} anchors"
+    then = plan.errors[-1], [*placed, *new], f"{about}, {len(new)} more"
+    write_png(picture, side_by_side([draw_errors(grid, plan.points, *panel) for panel in (today, then)]))
     if args.json:
         console.say_json({**figures, "files": [table, picture]})
         return 0
@@ -65,16 +68,3 @@ def _table(figures: dict[str, Any]) -> str:
     lines = [_HEAD]
     lines += [f"{a['id']},{a['x']:.3f},{a['y']:.3f},{a['mean_error']:.3f},{a['error_95']:.3f}" for a in figures["anchors"]]
     return "\n".join(lines) + "\n"
-
-
-def _picture(result: StoredResult, plan: AnchorPlan, from_nothing: bool) -> Any:
-    """Return the map today and with the new anchors, side by side, coloured by the expected error."""
-    assert result.grid is not None
-    standing = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
-    new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]
-    about = "Expected error of a position"
-    shown = [
-        (plan.errors[0], standing, f"{about}, {len(standing)} anchors"),
-        (plan.errors[-1], [*standing, *new], f"{about}, {len(new)} more"),
-    ]
-    return side_by_side([draw_errors(result.grid, plan.points, *panel) for panel in shown])

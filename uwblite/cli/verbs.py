@@ -409,7 +409,7 @@ The error at a place is that of a position from one range to each anchor within 
 through walls. Anchors are put half a metre from walls; where that cannot be done, the picture shows what is nearly as good.
 """,
     (
-        option("--map DIR", "folder that uwblite map wrote: map.yaml, anchors.csv", required=True),
+        option("--map DIR", "folder that uwblite map wrote, or the map.yaml of any map", required=True),
         option("--count N", "how many anchors (1)", COUNT, 1),
         option("--reach M", "m up to which a radio reaches (25)", ABOVE_ZERO, 25.0),
         option("--from-nothing", "leave out the anchors that are there"),

@@ -112,7 +112,7 @@ class DeviceKind:
     options: Mapping[str, Option] = field(default_factory=dict)
     """By name."""
 
-    def driver(self, given: Mapping[str, str], setup: Setup) -> Driver:
+    def driver(self, texts: Mapping[str, str], setup: Setup) -> Driver:
         """Return the driver with the options that were given.
 
         Raises
@@ -120,11 +120,11 @@ class DeviceKind:
         ConfigError : an option that it does not have, or a value that the option cannot have.
         """
         where = f"--{self.sensor} {self.name}"
-        if unknown := [name for name in given if name not in self.options]:
+        if unknown := [name for name in texts if name not in self.options]:
             known = f"known are {', '.join(self.options)}" if self.options else "it has none"
             raise ConfigError(f"{where}: unknown option {unknown[0]!r}; {known}")
         values = {name: option.default for name, option in self.options.items()}
-        values |= {name: self.options[name].read(text, f"{where}: {name}") for name, text in given.items()}
+        values |= {name: self.options[name].read(text, f"{where}: {name}") for name, text in texts.items()}
         return self.make(values, setup)
 
     def options_text(self) -> str:
@@ -346,14 +346,14 @@ def open_device(
     port, _, query = rest.partition("?")
     try:
         # The command line hands over bytes that are no text as surrogates, which no URL takes.
-        given = dict(parse_qsl(query.encode().decode(), keep_blank_values=True))
+        texts = dict(parse_qsl(query.encode().decode(), keep_blank_values=True))
     except UnicodeError as error:
         raise ConfigError(f"--{sensor} {spec}: its options are no text in UTF-8") from error
     if "://" in port:
         # What the device does not know may be meant for the port: rfc2217://host:port?ign_set_control
-        of_port = {name: given.pop(name) for name in list(given) if name not in kind.options}
+        of_port = {name: texts.pop(name) for name in list(texts) if name not in kind.options}
         port += "?" + urlencode(of_port) if of_port else ""
-    driver = kind.driver({**more, **given}, setup)
+    driver = kind.driver({**more, **texts}, setup)
     if not port:
         raise ConfigError(f"--{sensor} {spec}: it names no port, as {kind.name}:/dev/ttyUSB0 does")
     return Session(driver), port

@@ -16,8 +16,7 @@ from ..clocks.device_clock import DeviceClock
 from .continuity import Continuity, device_time
 from .events import Action
 from .framing import FixedPackets
-from .spinning import SpinningDriver
-from .sweep import Fan, Samples
+from .spinning import Fan, Samples, SpinningDriver
 
 BAUD = 230400
 SIZE, READINGS = 47, 12

@@ -16,8 +16,7 @@ import struct
 from .events import Action, Corrupt, Send, corrupt
 from .framing import FixedPackets
 from .session import Script
-from .spinning import SpinningDriver
-from .sweep import Fan, Samples
+from .spinning import Fan, Samples, SpinningDriver
 
 BAUD = 230400
 START, STOP = b"b", b"e"

@@ -32,7 +32,7 @@ from .slamtec import (
     reply_size,
     request,
 )
-from .sweep import Fan, Samples
+from .spinning import Fan, Samples
 
 BAUDS = (115200, 256000)
 STOP, STANDARD, INFO, HEALTH, PERIODS = (request(command) for command in (0x25, 0x20, 0x50, 0x52, 0x59))

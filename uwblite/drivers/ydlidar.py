@@ -19,8 +19,7 @@ from .events import Action, Send
 from .framing import PacketReader, to_next
 from .session import Script
 from .slamtec import DESCRIPTOR, SYNC, Reply, SlamtecDriver, answers, decode_reply, reply_size, request
-from .spinning import SpinningDriver
-from .sweep import Fan, Samples
+from .spinning import Fan, Samples, SpinningDriver
 
 BAUD_X4, BAUD_X2 = 128000, 115200
 START, STOP, INFO, HEALTH = request(0x60), request(0x65), request(0x90), request(0x91)

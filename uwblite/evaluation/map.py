@@ -5,20 +5,40 @@ common frames: distances are the same in all of them. The alignment only gives w
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..lidar.columns import Landmarks
+from ..grid.columns import find_column
 
 REACH = 4.0
 """Distance up to which a column or a wall counts as visible, m: the reach of a URG-04LX."""
-_MOST_OBSERVATIONS = 200
-"""Observations used of each column, evenly spread over the path."""
-_STEP = 0.05
-"""Spacing of samples on true surfaces, m: a cell of the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class VisibilityPolicy:
+    """What of a true surface can be seen, and how often it is looked at."""
+
+    observations: ClassVar[int] = 200
+    """Used of each column, evenly spread over the path."""
+    step: ClassVar[float] = 0.05
+    """m between samples on true surfaces: a cell of the map."""
+    views: ClassVar[int] = 24
+    """Nearest viewpoints tried for each point of a surface."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Named round columns."""
+
+    names: tuple[str, ...]
+    positions: Floats
+    """(n, 2) m; nan where a column was not found."""
+    radii: Floats
+    """(n,) m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +71,27 @@ class WallErrors:
     """Share of the visible true surface that has an occupied cell within the tolerance."""
 
 
-def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
+def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float = 1.0, cell: float = 0.05) -> Landmarks:
+    """Return where the columns stand in a map.
+
+    Parameters
+    ----------
+    occupied : (n, 2) m, centres of the occupied cells, in the frame of the expected places.
+    expected : where the columns should be, and their radii.
+    search_radius : m; limited to 0.45 of the distance to the nearest other column, so that columns are not confused.
+    cell : m, size of a cell.
+    """
+    gaps = np.hypot(*(expected.positions[:, None] - expected.positions[None]).transpose(2, 0, 1))
+    np.fill_diagonal(gaps, np.inf)
+    reach = np.minimum(search_radius, 0.45 * gaps.min(axis=1, initial=np.inf))
+    rows = zip(expected.positions, expected.radii, reach, strict=True)
+    places = [find_column(occupied, place, radius, limit, cell) for place, radius, limit in rows]
+    return Landmarks(expected.names, np.array(places).reshape(-1, 2), expected.radii)
+
+
+def landmark_errors(columns: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
     """Compare distances between columns found in a map with the true ones; `pairs` of names, None = all pairs."""
-    place = dict(zip(found.names, found.positions, strict=True))
+    place = dict(zip(columns.names, columns.positions, strict=True))
     missing = tuple(name for name in truth.names if name not in place or not np.isfinite(place[name]).all())
     observations = {name: place[name][None] for name in truth.names if name not in missing}
     return _distance_errors(observations, truth, pairs, missing)
@@ -77,7 +115,7 @@ def landmark_errors_along(
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_MOST_OBSERVATIONS, len(seen))).astype(np.intp))]
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(VisibilityPolicy.observations, len(seen))).astype(np.intp))]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
@@ -111,7 +149,7 @@ def wall_errors(
     viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `reach` m counts for the recall.
     tolerance : m.
     """
-    surface = sample_surfaces(walls, columns, _STEP)
+    surface = sample_surfaces(walls, columns, VisibilityPolicy.step)
     if not len(occupied) or not len(surface):
         return WallErrors(tolerance, 0.0, 0.0)
     distance = cKDTree(surface).query(occupied)[0]
@@ -134,17 +172,13 @@ def sample_surfaces(walls: Floats, columns: Floats, step: float) -> Floats:
     return np.concatenate(points)
 
 
-_VIEWS = 24
-"""Nearest viewpoints tried for each point of a surface."""
-
-
 def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Floats, reach: float) -> Bools:
     """Return which points (n,) on surfaces one of the nearest viewpoints (v, 2) sees, m; surfaces hide one another."""
     if not len(viewpoints):
         return np.zeros(len(points), dtype=bool)
     # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
     coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.intp), axis=0, return_index=True)[1]]
-    count = min(_VIEWS, len(coarse))
+    count = min(VisibilityPolicy.views, len(coarse))
     distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=reach)
     point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))
     start = coarse[view.reshape(len(points), count)[point, rank]]

@@ -5,7 +5,9 @@ The estimate's frame is arbitrary: it is first aligned with the truth by the rig
 read at the stamps of the truth; where it has no pose within `max_gap`, that stamp of the truth is left out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +15,50 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import DataError
 from ..se2 import align
+
+_PAUSE = 1e6
+"""s between two recordings that are compared as one: more than any gap that is bridged."""
+
+
+class Paired(NamedTuple):
+    """A trajectory and the true one."""
+
+    stamps: Floats
+    """(n,) s, ascending."""
+    poses: Floats
+    """(n, 3) T_map_base."""
+    true_stamps: Floats
+    """(k,) s, ascending."""
+    true_poses: Floats
+    """(k, 3) T_truth_base."""
+
+    @staticmethod
+    def of(estimate: tuple[Floats, Floats], truth: tuple[Floats, Floats]) -> "Paired":
+        """Return stamps and poses of a file each in the order of time."""
+        return Paired(*in_order(*estimate), *in_order(*truth))
+
+    @staticmethod
+    def one_after_another(recordings: "Sequence[Paired]") -> "Paired":
+        """Return all recordings as one; stamps are moved apart, for they may be of the same hour or of clocks set again."""
+        if len(recordings) == 1:
+            return recordings[0]
+        moved, free = list[Paired](), 0.0
+        for one in recordings:
+            begin = free - min(one.stamps[0], one.true_stamps[0])
+            moved.append(one._replace(stamps=one.stamps + begin, true_stamps=one.true_stamps + begin))
+            free = max(moved[-1].stamps[-1], moved[-1].true_stamps[-1]) + _PAUSE
+        return Paired(*(np.concatenate(column) for column in zip(*moved, strict=True)))
+
+    def compared(self, errors: "TrajectoryErrors") -> tuple[Floats, Floats]:
+        """Return the estimated and the true poses (m, 3) at the stamps that were compared."""
+        estimate = se2.interpolate_trajectory(self.stamps, self.poses, self.true_stamps[errors.matched])
+        return estimate, self.true_poses[errors.matched]
+
+
+def in_order(stamps: Floats, poses: Floats) -> tuple[Floats, Floats]:
+    """Return a trajectory with its stamps (n,) in order."""
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], poses[order]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +94,10 @@ class TrajectoryErrors:
     rpe_heading: ErrorStatistics | None
     """rad per stretch; None likewise."""
 
+    def in_truth(self, points: Floats) -> Floats:
+        """Return points (p, 2) of the map in the frame of the truth."""
+        return se2.transform(self.T_truth_map, points)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorErrors:
@@ -77,9 +127,8 @@ def evaluate_trajectory(
     *,
     max_gap: float = 1.0,
     rpe_delta: float = 1.0,
-    truth_has_heading: bool | None = None,
 ) -> TrajectoryErrors:
-    """Compare a trajectory with the truth.
+    """Compare a trajectory with the truth; true headings that are all equal are none (files of positions write the identity).
 
     Parameters
     ----------
@@ -87,7 +136,6 @@ def evaluate_trajectory(
     true_stamps, true_poses : (k,) s and (k, 3) T_truth_base.
     max_gap : s; a true stamp between estimated poses farther apart, or outside them by more, is left out.
     rpe_delta : m of true path per stretch of the relative pose error; stretches follow one another without overlap.
-    truth_has_heading : None = it has unless all true headings are equal (files of positions write the identity).
 
     Raises
     ------
@@ -104,10 +152,8 @@ def evaluate_trajectory(
     T_truth_map = align(estimate[:, :2], truth[:, :2])
     estimate = se2.compose(T_truth_map, estimate)
     position = np.hypot(*(estimate[:, :2] - truth[:, :2]).T)
-    if truth_has_heading is None:
-        truth_has_heading = bool(np.ptp(true_poses[:, 2]) > 0)
     heading = rpe_position = rpe_heading = None
-    if truth_has_heading:
+    if np.ptp(true_poses[:, 2]) > 0:
         heading = statistics(np.abs(se2.wrap_angle(estimate[:, 2] - truth[:, 2])))
         rpe_position, rpe_heading = _relative_errors(estimate, truth, rpe_delta)
     return TrajectoryErrors(T_truth_map, matched, position, statistics(position), heading, rpe_delta, rpe_position, rpe_heading)
@@ -165,11 +211,11 @@ def evaluate_anchors(
     T_truth_map : (3,) alignment of the trajectory.
     """
     place = {name: xy for name, xy in zip(ids, positions, strict=True) if np.all(np.isfinite(xy))}
-    found = tuple(name for name in true_ids if name in place)
+    common = tuple(name for name in true_ids if name in place)
     missing = tuple(name for name in true_ids if name not in place)
-    if not found:
+    if not common:
         return AnchorErrors((), np.empty(0), float("nan"), missing)
-    truth = np.array([true_positions[true_ids.index(name)] for name in found])
-    estimate = se2.transform(T_truth_map, np.array([place[name] for name in found]))
+    truth = np.array([true_positions[true_ids.index(name)] for name in common])
+    estimate = se2.transform(T_truth_map, np.array([place[name] for name in common]))
     distances = np.hypot(*(estimate - truth).T)
-    return AnchorErrors(found, distances, float(np.sqrt(np.mean(distances**2))), missing)
+    return AnchorErrors(common, distances, float(np.sqrt(np.mean(distances**2))), missing)

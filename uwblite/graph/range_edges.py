@@ -67,6 +67,10 @@ class RangeEdges(EdgeTable):
         arm = self.lever_arm + se2.rotate(self.turn, np.broadcast_to(self.tag, (len(self), 2)))
         return se2.transform(poses[self.pose], arm)
 
+    def headings(self, poses: Floats) -> Floats:
+        """Return the heading of the base at each range (e,), map frame, rad."""
+        return se2.wrap_angle(poses[self.pose, 2] + self.turn)
+
     @property
     def corrected(self) -> Floats:
         """The ranges (e,) without their known delays, m."""

@@ -180,7 +180,7 @@ class OpenBag:
         self.connections = [c for reader in readers for c in reader.connections]
         self.unreadable: dict[str, str] = {}
         """Types whose definition cannot be read, and why."""
-        self._store = self._with_types()
+        self._store = self._read_types()
 
     def topics(self) -> tuple[BagTopic, ...]:
         """Return the topics by name."""
@@ -223,7 +223,7 @@ class OpenBag:
         span = max((r.end_time for r in readers), default=0) - min((r.start_time for r in readers), default=0)
         return float(span) / 1e9
 
-    def _with_types(self) -> Any:
+    def _read_types(self) -> Any:
         from rosbags.interfaces import MessageDefinitionFormat
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -233,7 +233,7 @@ class OpenBag:
         for kind in sorted({c.msgtype for c in self.connections}):
             try:
                 if (definition := stated.get(kind)) is None:
-                    types = {name: known.fielddefs[name] for name in _with_parts(kind, known.fielddefs)}
+                    types = {name: known.fielddefs[name] for name in _parts_of_type(kind, known.fielddefs)}
                 elif definition.format == MessageDefinitionFormat.MSG:
                     types = get_types_from_msg(definition.data, kind)
                 else:
@@ -250,7 +250,7 @@ class OpenBag:
         return store
 
 
-def _with_parts(kind: str, fielddefs: Any) -> list[str]:
+def _parts_of_type(kind: str, fielddefs: Any) -> list[str]:
     """Return a type and those that its fields are of; raise KeyError where one is not known."""
     parts, left = list[str](), [kind]
     while left:

@@ -14,8 +14,7 @@ from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
 from .carmen_stamps import LineClock, time_order
 from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
-from .interlacing import beams_lie_between
-from .readings import DEFAULT_REACH, ScanGeometry, clean, resampled, resampling_warning
+from .readings import DEFAULT_REACH, ScanGeometry, beams_lie_between, clean, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; smaller readings of a scanner are error codes (URG-04LX: 0..19 mm). PARAM laser_range_min has priority."""
@@ -263,8 +262,8 @@ class LaserMessages:
 
     def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing; PARAM robot_front_laser_max where the message gives none."""
-        given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
-        return layout.range_max or given or DEFAULT_REACH
+        stated = params.get("robot_front_laser_max", "laser_front_laser_max_range")
+        return layout.range_max or stated or DEFAULT_REACH
 
     def _merged(
         self, kept: Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]

@@ -106,7 +106,7 @@ def judged(
     if corrected:
         # What moves between two laser messages is the wheels', uncorrected; a robot that stands keeps its place meanwhile.
         stands = np.append(False, np.all(np.diff(rows[:, 1:], axis=0) == 0.0, axis=1))
-        rows[:, 1:], kept = _without_leaps(rows[:, 1:], wheels), ~wheels | (stands & (not made))
+        rows[:, 1:], kept = _remove_leaps(rows[:, 1:], wheels), ~wheels | (stands & (not made))
         rows, lines = rows[kept], lines[kept]
     if made:
         still = int(np.sum((np.diff(rows[:, 0]) <= 0.0) & (np.diff(_travelled(rows)) > 0.0)))
@@ -121,7 +121,7 @@ def judged(
     return rows, LineClock(lines, rows[:, 0], _travelled(rows), made, made or corrected)
 
 
-def _without_leaps(poses: Floats, wheels: Bools) -> Floats:
+def _remove_leaps(poses: Floats, wheels: Bools) -> Floats:
     """Return the poses (n, 3) of a corrected log without leaps; some (n,) are the odometry's own, the others of laser messages.
 
     Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose

@@ -191,14 +191,16 @@ class Params:
         tags : how many tags the robot has.
         laser_is_base : the laser messages give the laser and the robot one pose, see SensorMounting.
         """
-        given = self._numbers
+        values = self._numbers
         if T_base_laser is None:
             offsets = ("robot_frontlaser_offset", "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset")
-            T_base_laser = np.array([given.get(name, 0.0) for name in offsets])
+            T_base_laser = np.array([values.get(name, 0.0) for name in offsets])
         prefixes = ("uwb_", *(f"uwb{k}_" for k in range(2, tags + 1)))
-        places = np.array([[given.get(prefix + name, 0.0) for name in _TAG] for prefix in prefixes])
-        heights = {name.removeprefix(_ANCHOR_HEIGHT): z for name, z in sorted(given.items()) if name.startswith(_ANCHOR_HEIGHT)}
-        height, is_base = given.get("uwb_anchor_height"), laser_is_base or self._laser_is_base
+        places = np.array([[values.get(prefix + name, 0.0) for name in _TAG] for prefix in prefixes])
+        heights = {
+            name.removeprefix(_ANCHOR_HEIGHT): z for name, z in sorted(values.items()) if name.startswith(_ANCHOR_HEIGHT)
+        }
+        height, is_base = values.get("uwb_anchor_height"), laser_is_base or self._laser_is_base
         return SensorMounting(
             T_base_laser, self._flipped, places[0], height, heights, more_tags=places[1:], laser_is_base=is_base
         )

@@ -98,7 +98,7 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
     form = b" ".join([b"%.3f"] * beams)
     for start in range(0, len(scans.stamps), _SCANS_AT_A_TIME):
         part = slice(start, start + _SCANS_AT_A_TIME)
-        readings = map(form.__mod__, map(tuple, _without_signs(scans, part).tolist()))
+        readings = map(form.__mod__, map(tuple, _clear_signs(scans, part).tolist()))
         rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
         for text, l, r, stamp in rows:
             yield (
@@ -111,7 +111,7 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
             )
 
 
-def _without_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:
+def _clear_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:
     """Return readings as CARMEN writes them: 0 for invalid, the maximum range for nothing seen."""
     ranges = scans.ranges[part]
     # A reading that rounds up to the maximum range would turn into "nothing seen".

@@ -97,7 +97,7 @@ def _corrected(blocks: Iterator[bytes], poses_at: PosesAt) -> Iterator[tuple[lis
                     stamps.append(stamp)
                 except (ValueError, IndexError):
                     broken += 1
-        yield _with_poses(kept, np.array(stamps), broken, poses_at)
+        yield _correct_poses(kept, np.array(stamps), broken, poses_at)
 
 
 def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
@@ -108,7 +108,7 @@ def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
     return behind + place, stamp
 
 
-def _with_poses(
+def _correct_poses(
     kept: list[bytes | tuple[list[bytes], int]], stamps: Floats, broken: int, poses_at: PosesAt
 ) -> tuple[list[bytes], int]:
     """Return lines in which the words at the poses are corrected, and the number of scans left out."""

@@ -75,10 +75,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def sync_folder(folder: str | os.PathLike[str]) -> None:
     """Force the new name to the disk, where the file system allows it."""
     with suppress(OSError):
-        _with_handle(folder, os.fsync)
+        _use_handle(folder, os.fsync)
 
 
-def _with_handle(path: str | os.PathLike[str], work: Callable[[int], object]) -> None:
+def _use_handle(path: str | os.PathLike[str], work: Callable[[int], object]) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
         work(handle)
@@ -97,7 +97,7 @@ def sync_files(folder: str | os.PathLike[str]) -> None:
     for work in (_begin_writing, os.fsync):
         # One at a time: a process may have few files open.
         for file in files:
-            _with_handle(file, work)
+            _use_handle(file, work)
     sync_folder(folder)
 
 

@@ -151,11 +151,11 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     if kind == "csv":
         from .csv_folder import read_csv_folder
 
-        return _with_every_nth(read_csv_folder(path), every_nth_scan)
+        return _thin_scans(read_csv_folder(path), every_nth_scan)
     if kind == "bag":
         from .rosbag import read_bag
 
-        return _with_every_nth(read_bag(path, *(bag or ())), every_nth_scan)
+        return _thin_scans(read_bag(path, *(bag or ())), every_nth_scan)
     if os.path.isdir(path):
         what = "holds a map, and a recording is wanted" if kind == "map" else "holds no odometry.csv and no ROS 2 bag"
         raise FormatError(f"this folder {what}", path)
@@ -195,7 +195,7 @@ _NO_RECORDING = {
 """What is no recording, and the verb that takes it."""
 
 
-def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":
+def _thin_scans(log: "SensorLog", n: int) -> "SensorLog":
     return log if log.scans is None or n == 1 else replace(log, scans=log.scans.rows(np.arange(0, len(log.scans.stamps), n)))
 
 

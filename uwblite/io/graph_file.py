@@ -239,16 +239,16 @@ def along_edges(graph: Graph) -> tuple[Graph, Ints]:
     for anchor, place in priors["anchors"].items():
         anchors[anchor] = place if np.isnan(anchors[anchor, 0]) else anchors[anchor]
     chains = np.zeros(len(poses), dtype=np.intp)
-    given = bool(np.isfinite(poses[:, 0]).any() or given_anchors(graph).any())
+    anchored = bool(np.isfinite(poses[:, 0]).any() or given_anchors(graph).any())
     poses = chained_poses(poses, *steps) if steps and np.isfinite(poses[:, 0]).any() else poses
     while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
         pinned = [k for k in lost.tolist() if k in priors["poses"]]
         start = poses.copy()
         start[pinned[0] if pinned else lost[0]] = priors["poses"][pinned[0]] if pinned else 0.0
         reached = chained_poses(start, *steps) if steps else start
-        if not pinned and given:
+        if not pinned and anchored:
             chains[np.isnan(poses[:, 0]) & ~np.isnan(reached[:, 0])] = chains.max() + 1
-        poses, given = reached, True
+        poses, anchored = reached, True
     framed = replace(graph, anchors=anchors, poses=np.where((chains == 0)[:, None], poses, np.nan))
     return replace(graph, anchors=seen_anchors(framed), poses=poses), chains
 
@@ -267,9 +267,9 @@ def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
     if not known.any():
         known[0], poses = True, np.zeros((n, 3))
     # One further node represents everything known; its links are the shortest.
-    given = np.flatnonzero(known)
-    rows, cols = np.concatenate([i, np.full(len(given), n)]), np.concatenate([j, given])
-    cost = np.concatenate([np.where(np.abs(j - i) == 1, 2.0, 3.0), np.ones(len(given))])
+    sources = np.flatnonzero(known)
+    rows, cols = np.concatenate([i, np.full(len(sources), n)]), np.concatenate([j, sources])
+    cost = np.concatenate([np.where(np.abs(j - i) == 1, 2.0, 3.0), np.ones(len(sources))])
     key, link = np.unique(np.minimum(rows, cols) * (n + 1) + np.maximum(rows, cols), return_index=True)
     links = csr_matrix((cost[link], (key // (n + 1), key % (n + 1))), shape=(n + 1, n + 1))
     order, parent = breadth_first_order(minimum_spanning_tree(links), n, directed=False)
@@ -364,12 +364,12 @@ def assembled(
         PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
         PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
-    given = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
+    gauge_fixed = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
     return Graph(
         poses,
         anchors,
         tuple(e for e in edges if len(e)),
-        fixed_poses=np.isin(np.arange(len(poses)), fixed if given else [0]),
+        fixed_poses=np.isin(np.arange(len(poses)), fixed if gauge_fixed else [0]),
         fixed_anchors=np.isin(np.arange(len(anchors)), fixed_anchors),
     )
 

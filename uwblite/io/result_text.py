@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, Ints
-from ..findings import Finding
 from ..map_result import MapResult
 from ..report.printable import csv_field, encodable
 from ..sensor_log import LogNotes, SensorLog
@@ -133,11 +132,11 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "inputs": [_input_entry(log.notes) for log in logs],
         "recording": recording_figures(logs, result),
         "trusted": not result.doubts,
-        "doubts": notices(result.doubts),
+        "doubts": [finding.record() for finding in result.doubts],
         "doubted_stretches": [
             {"recording": number, "start": first, "end": last} for number, first, last in result.doubted_stretches
         ],
-        "warnings": notices(result.warnings),
+        "warnings": [finding.record() for finding in result.warnings],
         "anchors": [{name: getattr(a, name) for name in _ANCHOR_FIELDS} for a in result.anchors],
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
         "shape": {"poses": result.shape_poses, "covariances": result.shape_covariances},
@@ -155,15 +154,6 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         }
     ready: dict[str, Any] = _ready(content)
     return ready
-
-
-def notices(findings: Sequence[Finding]) -> list[dict[str, Any]]:
-    """Return warnings or doubts as JSON-ready records."""
-    values = ({name: getattr(n, name) for name in _FINDING_FIELDS} for n in findings)
-    return [{name: list(v) if isinstance(v, tuple) else v for name, v in fields.items()} for fields in values]
-
-
-_FINDING_FIELDS = ("kind", "text", "cure", "recording", "stretches", "explained_by", "figures")
 
 
 def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:

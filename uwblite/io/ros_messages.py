@@ -21,16 +21,16 @@ def made(store: Any, kind: str, values: Mapping[str, Any]) -> Any:
     return store.types[kind](**{name: _value(store, how, values.get(name)) for name, how in fields})
 
 
-def _value(store: Any, how: Any, given: Any) -> Any:
+def _value(store: Any, how: Any, value: Any) -> Any:
     node, detail = how
     if node.name == "BASE":
-        return given if given is not None else "" if detail[0] == "string" else False if detail[0] == "bool" else 0
+        return value if value is not None else "" if detail[0] == "string" else False if detail[0] == "bool" else 0
     if node.name == "NAME":
-        return made(store, detail, given or {})
+        return made(store, detail, value or {})
     (inner, name), length = detail
     if inner.name == "NAME":
-        return [made(store, name, each) for each in given or ()]
-    return given if given is not None else [] if name[0] == "string" else np.zeros(length, dtype=name[0])
+        return [made(store, name, each) for each in value or ()]
+    return value if value is not None else [] if name[0] == "string" else np.zeros(length, dtype=name[0])
 
 
 def nanoseconds(stamp: float) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..errors import FormatError
+from ..errors import ConfigError, FormatError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..sensor_log import MOST_ANCHORS
 from .csv_table import read_csv
@@ -101,6 +101,22 @@ class StoredResult:
         """Return the poses (..., 3) of a recording, counted from 1, at times of its clock, s."""
         return se2.interpolate_trajectory(*self.trajectories[recording - 1], stamps)
 
+    def trail(self, stamps: Floats, wheels: Floats, most: int) -> Floats:
+        """Return the poses (k, 3) since the last trajectory ends, by the odometry, in the map's frame.
+
+        Parameters
+        ----------
+        stamps, wheels : (n,) s and (n, 3) of the odometry; without readings of that time the last pose stands alone.
+        most : k is about this at most.
+        """
+        known, poses = self.trajectories[-1]
+        later = np.flatnonzero(stamps > known[-1])
+        if not len(later) or stamps[0] > known[-1]:
+            return poses[-1:]
+        T_map_odom = se2.compose(poses[-1], se2.inverse(se2.interpolate_trajectory(stamps, wheels, known[-1])))
+        chosen = np.union1d(later[:: max(len(later) // most, 1)], later[-1:])
+        return np.concatenate([poses[-1:], se2.compose(T_map_odom, wheels[chosen])])
+
 
 def read_result(folder: str | os.PathLike[str]) -> StoredResult:
     """Read a result.
@@ -121,6 +137,22 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
     grid = read_map(path / "map.yaml") if (path / "map.yaml").exists() else None
     result = StoredResult(path, trajectories, stamps, recordings, covariances, anchors, (), ranges, grid, report)
     return replace(result, closures=tuple(_closures(result)))
+
+
+def read_space(path: str, warnings: list[str]) -> tuple[OccupancyGrid, tuple[StoredAnchor, ...]]:
+    """Return the grid of a result, or of the map.yaml of any map, and the anchors where they are known.
+
+    Raises
+    ------
+    ConfigError : the result has no grid.
+    FormatError : as for `read_result` and `read_map`.
+    """
+    if not os.path.isdir(path):
+        return read_map(path, warnings), ()
+    result = read_result(path)
+    if result.grid is None:
+        raise ConfigError(f"{path} has no map.yaml: without a map there is no free space to plan in")
+    return result.grid, result.anchors
 
 
 def _ranges(path: Path) -> StoredRanges:

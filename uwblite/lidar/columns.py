@@ -1,4 +1,4 @@
-"""Round columns, among occupied cells and among the rays of many scans: where they stand, and how large they are."""
+"""Round columns among the rays of many scans: where they stand, and how large they are."""
 
 from dataclasses import dataclass
 
@@ -9,91 +9,6 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, connected, dots
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Landmarks:
-    """Named round columns."""
-
-    names: tuple[str, ...]
-    positions: Floats
-    """(n, 2) m; nan where a column was not found."""
-    radii: Floats
-    """(n,) m."""
-
-
-def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float = 1.0, cell: float = 0.05) -> Landmarks:
-    """Return where the columns stand in a map: the place with most cells on its circle and fewest around it.
-
-    Parameters
-    ----------
-    occupied : (n, 2) m, centres of the occupied cells, in the frame of the expected places.
-    expected : where the columns should be, and their radii.
-    search_radius : m; limited to 0.45 of the distance to the nearest other column, so that columns are not confused.
-    cell : m, size of a cell.
-    """
-    tree = cKDTree(occupied) if len(occupied) else None
-    found = np.full_like(expected.positions, np.nan)
-    for k, (place, radius) in enumerate(zip(expected.positions, expected.radii, strict=True)):
-        others = np.delete(expected.positions, k, axis=0)
-        nearest = np.hypot(*(others - place).T).min() if len(others) else np.inf
-        reach = min(search_radius, 0.45 * nearest)
-        cells = occupied[tree.query_ball_point(place, reach + radius + 0.5)] if tree is not None else occupied
-        found[k] = _find_column(cells, place, radius, reach, cell)
-    return Landmarks(expected.names, found, expected.radii)
-
-
-_LEAST_ARC = 0.35
-"""Share of the circle's cells that must be there: a column seen from one side shows about half of it."""
-
-
-def _find_column(cells: Floats, place: Floats, radius: float, reach: float, cell: float) -> Floats:
-    """Return the centre (2,) of a circle of known radius among cells (n, 2), nan where there is none."""
-    ticks = np.arange(-reach, reach + 0.5 * cell, 0.5 * cell)
-    lattice = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
-    lattice = lattice[np.hypot(*lattice.T) <= reach] + place
-    if not len(cells) or not len(lattice):
-        return np.full(2, np.nan)
-    score, arc = _scores(lattice, cells, radius, cell)
-    score = score - 0.02 * np.hypot(*(lattice - place).T) / cell
-    best = int(np.argmax(np.where(arc >= _LEAST_ARC, score, -np.inf)))
-    if arc[best] < _LEAST_ARC or score[best] <= 0.0:
-        return np.full(2, np.nan)
-    return fit_circle(cells, lattice[best], radius, 1.5 * cell)
-
-
-def _scores(centres: Floats, cells: Floats, radius: float, cell: float) -> tuple[Floats, Floats]:
-    """Return for each centre (m,) its score, and the share of the circle's directions in which a cell lies on it."""
-    tree, directions = cKDTree(cells), 24
-    angle = 2.0 * np.pi * np.arange(directions) / directions
-    rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    on_rim = tree.query((centres[:, None] + rim).reshape(-1, 2), distance_upper_bound=cell)[0]
-    arc = np.isfinite(on_rim).reshape(len(centres), directions).mean(axis=1)
-    clear = (radius + 3.0 * cell) / radius * rim
-    in_clear = tree.query((centres[:, None] + clear).reshape(-1, 2), distance_upper_bound=cell)[0]
-    spoilt = np.isfinite(in_clear).reshape(len(centres), directions).mean(axis=1)
-    offset = np.where(np.isfinite(on_rim), on_rim, cell).reshape(len(centres), directions).mean(axis=1)
-    return arc - 0.7 * spoilt - 0.5 * offset / cell, arc
-
-
-def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Floats:
-    """Return the centre (2,) after Gauss-Newton on the distances to the circle with Tukey's weights within the gate."""
-    for _ in range(20):
-        ray = cells - centre
-        distance = np.hypot(*ray.T)
-        residual = distance - radius
-        near = np.abs(residual) < gate
-        if near.sum() < 3:
-            return centre
-        weight = (1.0 - (residual[near] / gate) ** 2) ** 2
-        unit = ray[near] / np.maximum(distance[near], 1e-9)[:, None]
-        # A column seen from one side is hardly measured across the line of sight: the initial value fixes it there.
-        normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
-        step = np.linalg.solve(normal, (weight * residual[near]) @ unit)
-        centre = centre + step
-        if np.hypot(*step) < 1e-5:
-            break
-    return centre
 
 
 @dataclass(frozen=True, slots=True)

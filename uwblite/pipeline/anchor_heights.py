@@ -16,6 +16,7 @@ from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apa
 from ..problem.evidence import laplace_marginal_likelihood, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve
 from .estimate import Estimate, OtherHeights, Task
+from .line_sides import LinePolicy
 from .mapping_config import MappingConfig
 
 
@@ -29,11 +30,9 @@ class HeightPolicy:
     """m above the tag from which on anchors can look like another unit; lower ones lengthen short ranges only."""
     high: ClassVar[float] = 6.0
     """m above the tag; anchors in a large hall."""
-    elsewhere: ClassVar[float] = 0.4
-    """m rms between two trajectories from which on it matters which of them is true."""
 
 
-def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
+def choose_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
     """Return the estimate under the likelier of the two explanations, with the other one where it is not refuted.
 
     Recordings that were joined are tested alone first: only where they do not refute high anchors, all are solved together.
@@ -64,10 +63,10 @@ def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimize
         return laplace_marginal_likelihood(with_free(graph, HEIGHT))
 
     present = estimate.problem
-    return compared(present, Alternative(with_high_anchors(present, config.calibration)), solved, evidence)
+    return compared(present, Alternative(raise_anchors(present, config.calibration)), solved, evidence)
 
 
-def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
+def raise_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
 
     As the start, lengths scaled by a wrong unit are scaled back; heights that were fixed at 0 are free again.
@@ -99,6 +98,6 @@ def _refuted(alone: Sequence[Estimate], config: MappingConfig) -> bool:
 def check_heights(estimate: Estimate, task: Task) -> None:
     """Note where the ranges do not decide how high the anchors are, and a map without lidar depends on it."""
     other = estimate.other_heights
-    if other is None or task.recordings.have_scans or other.apart < HeightPolicy.elsewhere:
+    if other is None or task.recordings.have_scans or other.apart < LinePolicy.elsewhere:
         return
     task.stages.note("anchor-heights", height=other.high, taken=other.taken, apart=other.apart)

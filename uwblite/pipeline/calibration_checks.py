@@ -133,7 +133,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
                 recording=recording.number + 1,
                 name=recording.name if len(recordings) > 1 else "",
                 factor=factor,
-                checked=recording.has_scans or len(task.given.anchors) > 1 or bool(task.given.distances),
+                checked=recording.has_scans or len(task.constraints.anchors) > 1 or bool(task.constraints.distances),
                 high=other.high if other is not None and high else None,
             )
     return factors

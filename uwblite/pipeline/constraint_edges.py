@@ -12,7 +12,7 @@ together have the weight of the one measurement.
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,27 @@ from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import optimize
+from ..grid.columns import find_column, fit_circle
 from ..lidar.clouds import Clouds
-from ..lidar.columns import Landmarks, find_columns, fit_circle
 from ..problem.solution import rough
 from ..se2 import align
 from . import map_frame
 from .estimate import Estimate, Task
 from .lidar_stages import refine_jointly, solve_by_own_errors
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkPolicy:
+    """Which clouds see a landmark."""
+
+    near: ClassVar[float] = 0.4
+    """m; points count as the landmark's when they lie so near to its place, or to the rim of its column."""
+    least_points: ClassVar[int] = 3
+    """Of a cloud, that make an observation."""
+    one_visit: ClassVar[float] = 3.0
+    """m; observations belong to one visit while less than this is travelled between two."""
+    visits: ClassVar[int] = 4
+    """Visits used of a landmark, those with most points."""
 
 
 def apply_given(estimate: Estimate, task: Task) -> Estimate:
@@ -42,16 +56,16 @@ def apply_given(estimate: Estimate, task: Task) -> Estimate:
     ------
     ConfigError : an anchor is not in the recording, a stamp lies outside it, or places are given together with `align`.
     """
-    given, config = task.given, task.config
-    if given.places and config.align != "odometry":
+    constraints, config = task.constraints, task.config
+    if constraints.places and config.align != "odometry":
         raise ConfigError("given places say where the map lies; leave out align, or the places")
-    done = apply(given, estimate.graph, estimate.anchor_ids, estimate.placed, task.recordings.clock)
-    for anchor, off in done.moved.items():
+    applied = apply(constraints, estimate.graph, estimate.anchor_ids, estimate.placed, task.recordings.clock)
+    for anchor, off in applied.moved.items():
         task.stages.note("moved-anchor", anchor=anchor, distance=off)
-    solved = optimize(done.graph.with_edges(*estimate.odometry_and_ranges), config.solver)[0]
-    shift = [round(v, 4) for v in done.motion.tolist()]
-    task.stages.end("constraints", moved=sorted(done.moved), shift=shift)
-    return replace(estimate, graph=done.graph).with_estimates_of(solved).with_hypotheses_moved(done.motion)
+    solved = optimize(applied.graph.with_edges(*estimate.odometry_and_ranges), config.solver)[0]
+    shift = [round(v, 4) for v in applied.motion.tolist()]
+    task.stages.end("constraints", moved=sorted(applied.moved), shift=shift)
+    return replace(estimate, graph=applied.graph).with_estimates_of(solved).with_hypotheses_moved(applied.motion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +80,7 @@ class Applied:
     """By id, anchors that are not at their given place: their distance from it, m."""
 
 
-def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
+def apply(constraints: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
     """Bring a first estimate into the user's frame and add the prior knowledge to its edges.
 
     Parameters
@@ -80,43 +94,43 @@ def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
     ------
     ConfigError : an anchor is not in the recording, or a stamp lies outside it.
     """
-    given = _present(given, anchor_ids)
+    constraints = _present(constraints, anchor_ids)
     index = {name: k for k, name in enumerate(anchor_ids)}
-    motion, moved = _fit(given, graph, index, placed, clock)
+    motion, moved = _fit(constraints, graph, index, placed, clock)
     graph = replace(graph, poses=se2.compose(motion, graph.poses), anchors=se2.transform(motion, graph.anchors))
-    edges = [*_anchor_priors(given, index, moved), *_pose_priors(given, clock)]
-    edges += [*_distances(given, index), *_closures(given, clock)]
-    if given.places:
+    edges = [*_anchor_priors(constraints, index, moved), *_pose_priors(constraints, clock)]
+    edges += [*_distances(constraints, index), *_closures(constraints, clock)]
+    if constraints.places:
         graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
-        edges += _gauge(given, graph, moved)
+        edges += _gauge(constraints, graph, moved)
     return Applied(graph.with_edges(*edges), motion, moved)
 
 
-def _present(given: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
+def _present(constraints: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
     """Return what concerns this recording; anchors of an earlier map without ranges now are left out."""
-    wanted = {a.id for a in given.anchors if not a.movable} | {name for d in given.distances for name in d.anchors}
+    wanted = {a.id for a in constraints.anchors if not a.movable} | {name for d in constraints.distances for name in d.anchors}
     missing = sorted(wanted - set(anchor_ids))
     if missing:
         raise ConfigError(f"constraints: no ranges to anchor {missing[0]}; the recording has {', '.join(anchor_ids) or 'none'}")
-    return replace(given, anchors=tuple(a for a in given.anchors if a.id in anchor_ids))
+    return replace(constraints, anchors=tuple(a for a in constraints.anchors if a.id in anchor_ids))
 
 
 def _fit(
-    given: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
+    constraints: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
 ) -> tuple[Floats, dict[str, float]]:
     """Return the rigid motion (3,) that aligns most known places, and the anchors that disagree with it."""
-    if given.poses:
-        first = min(given.poses, key=lambda p: p.sigma)
+    if constraints.poses:
+        first = min(constraints.poses, key=lambda p: p.sigma)
         motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
-        return motion, _strayed(given, graph, index, placed, motion)
-    anchors = [a for a in given.anchors if placed[index[a.id]]]
-    here = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)
-    there = np.array([a.position for a in anchors]).reshape(-1, 2)
+        return motion, _strayed(constraints, graph, index, placed, motion)
+    anchors = [a for a in constraints.anchors if placed[index[a.id]]]
+    estimated = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)
+    surveyed = np.array([a.position for a in anchors]).reshape(-1, 2)
     if len(anchors) < 2:
-        shift = (there - here)[0] if len(anchors) else np.zeros(2)
+        shift = (surveyed - estimated)[0] if len(anchors) else np.zeros(2)
         return np.array([*shift, 0.0]), {}
-    motion = consensus(here, there, np.array([_tolerance(a) for a in anchors]))
-    return motion, _strayed(given, graph, index, placed, motion)
+    motion = consensus(estimated, surveyed, np.array([_tolerance(a) for a in anchors]))
+    return motion, _strayed(constraints, graph, index, placed, motion)
 
 
 def _tolerance(anchor: GivenAnchor) -> float:
@@ -124,22 +138,22 @@ def _tolerance(anchor: GivenAnchor) -> float:
     return 3.0 * anchor.sigma + 0.6
 
 
-def consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
+def consensus(estimated: Floats, surveyed: Floats, tolerance: Floats) -> Floats:
     """Return the motion of the pair of places that most others agree with, fitted to all of these."""
-    best: tuple[float, Bools] = (-np.inf, np.ones(len(here), dtype=bool))
-    for i, j in combinations(range(len(here)), 2):
-        motion = align(here[[i, j]], there[[i, j]])
-        error = np.hypot(*(se2.transform(motion, here) - there).T) / tolerance
+    best: tuple[float, Bools] = (-np.inf, np.ones(len(estimated), dtype=bool))
+    for i, j in combinations(range(len(estimated)), 2):
+        motion = align(estimated[[i, j]], surveyed[[i, j]])
+        error = np.hypot(*(se2.transform(motion, estimated) - surveyed).T) / tolerance
         worth = float(np.sum(np.maximum(1.0 - error**2, 0.0)))
         if worth > best[0]:
             best = (worth, error < 1.0)
-    agree = best[1] if best[1].sum() > 1 else np.ones(len(here), dtype=bool)
-    return align(here[agree], there[agree])
+    agree = best[1] if best[1].sum() > 1 else np.ones(len(estimated), dtype=bool)
+    return align(estimated[agree], surveyed[agree])
 
 
-def _strayed(given: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
+def _strayed(constraints: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
     strayed = {}
-    for a in given.anchors:
+    for a in constraints.anchors:
         if a.movable and placed[index[a.id]]:
             off = float(np.hypot(*(se2.transform(motion, graph.anchors[index[a.id]]) - np.array(a.position))))
             if off > _tolerance(a):
@@ -147,11 +161,11 @@ def _strayed(given: Constraints, graph: Graph, index: dict[str, int], placed: Bo
     return strayed
 
 
-def _anchor_priors(given: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
+def _anchor_priors(constraints: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
     """Surveyed anchors are taken as they are; those of an earlier map get a kernel that gives up a moved one."""
     edges: list[Edges] = []
     for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
-        anchors = [a for a in given.anchors if a.movable == movable and a.id not in moved]
+        anchors = [a for a in constraints.anchors if a.movable == movable and a.id not in moved]
         if anchors:
             place = np.array([index[a.id] for a in anchors], dtype=np.intp)
             value = np.array([a.position for a in anchors])
@@ -160,47 +174,37 @@ def _anchor_priors(given: Constraints, index: dict[str, int], moved: dict[str, f
     return edges
 
 
-def _pose_priors(given: Constraints, clock: Clock) -> list[Edges]:
-    if not given.poses:
+def _pose_priors(constraints: Constraints, clock: Clock) -> list[Edges]:
+    if not constraints.poses:
         return []
-    place = np.array([clock.nearest(p.stamp, p.recording) for p in given.poses], dtype=np.intp)
-    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in given.poses])
-    return [PriorEdges("poses", place, np.array([p.pose for p in given.poses]), root)]
+    place = np.array([clock.nearest(p.stamp, p.recording) for p in constraints.poses], dtype=np.intp)
+    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in constraints.poses])
+    return [PriorEdges("poses", place, np.array([p.pose for p in constraints.poses]), root)]
 
 
-def _distances(given: Constraints, index: dict[str, int]) -> list[Edges]:
-    if not given.distances:
+def _distances(constraints: Constraints, index: dict[str, int]) -> list[Edges]:
+    if not constraints.distances:
         return []
-    ends = np.array([[index[name] for name in d.anchors] for d in given.distances], dtype=np.intp)
-    values = np.array([[d.distance, d.sigma] for d in given.distances])
+    ends = np.array([[index[name] for name in d.anchors] for d in constraints.distances], dtype=np.intp)
+    values = np.array([[d.distance, d.sigma] for d in constraints.distances])
     return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
 
 
-def _closures(given: Constraints, clock: Clock) -> list[Edges]:
-    if not given.closures:
+def _closures(constraints: Constraints, clock: Clock) -> list[Edges]:
+    if not constraints.closures:
         return []
-    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in given.closures]
+    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in constraints.closures]
     i, j = np.array(ends, dtype=np.intp).T
-    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in given.closures])
-    return [RelativePoseEdges(i, j, np.array([c.pose for c in given.closures]), root)]
+    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in constraints.closures])
+    return [RelativePoseEdges(i, j, np.array([c.pose for c in constraints.closures]), root)]
 
 
-def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
+def _gauge(constraints: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
     """Fix the heading of the first pose where only one place is given, which does not determine it."""
-    if given.poses or sum(a.id not in moved for a in given.anchors) > 1:
+    if constraints.poses or sum(a.id not in moved for a in constraints.anchors) > 1:
         return []
     root = np.diag([0.0, 0.0, 1e4])[None]
     return [PriorEdges("poses", np.zeros(1, dtype=np.intp), graph.poses[:1].copy(), root)]
-
-
-_NEAR = 0.4
-"""Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
-_LEAST_POINTS = 3
-"""Least number of points of a cloud that make an observation."""
-_ONE_VISIT = 3.0
-"""Observations belong to one visit while less than this is travelled between two, m."""
-_VISITS = 4
-"""Visits used of a landmark, those with most points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,20 +231,20 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     """
     points = se2.transform_each(poses, clouds.owner, clouds.points)
     place = np.array(landmark.position)
-    near = np.hypot(*(points - place).T) < landmark.radius + _NEAR
+    reach = LandmarkPolicy.near
+    near = np.hypot(*(points - place).T) < landmark.radius + reach
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
     if landmark.radius > 0.0:
-        column = Landmarks((landmark.name,), place[None], np.array([landmark.radius]))
-        place = find_columns(points[near], column, search_radius=_NEAR, cell=0.05).positions[0]
+        place = find_column(points[near], place, landmark.radius, reach, cell=0.05)
         if not np.isfinite(place).all():
             raise ConfigError(f"{where}: no column of radius {landmark.radius:g} m stands there; look up its place in the map")
     count = np.bincount(clouds.owner[near], minlength=len(poses))
-    seen = np.flatnonzero(count >= _LEAST_POINTS)
+    seen = np.flatnonzero(count >= LandmarkPolicy.least_points)
     if not len(seen):
-        raise ConfigError(f"{where}: the lidar saw nothing within {_NEAR:g} m of it; look up its place in the map")
-    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > _ONE_VISIT]))
+        raise ConfigError(f"{where}: the lidar saw nothing within {reach:g} m of it; look up its place in the map")
+    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > LandmarkPolicy.one_visit]))
     weight = np.bincount(visit, count[seen])
-    best = np.sort(np.argsort(-weight, kind="stable")[:_VISITS])
+    best = np.sort(np.argsort(-weight, kind="stable")[: LandmarkPolicy.visits])
     best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.intp)
     position = se2.transform(se2.inverse(poses[best_view]), place)
     if landmark.radius > 0.0:
@@ -251,9 +255,9 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
     """Return where one cloud has a column (2,): the column's place in the whole map bounds the search in the cloud."""
-    near = points[np.hypot(*(points - place).T) < radius + _NEAR]
+    near = points[np.hypot(*(points - place).T) < radius + LandmarkPolicy.near]
     centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
-    return centre if np.hypot(*(centre - place)) < _NEAR else place
+    return centre if np.hypot(*(centre - place)) < LandmarkPolicy.near else place
 
 
 def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
@@ -263,11 +267,11 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
     ------
     ConfigError : there is no lidar, or see ties.
     """
-    given, config, scans = task.given, task.config, estimate.scans
+    constraints, config, scans = task.constraints, task.config, estimate.scans
     if scans is None:
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
     motion = map_frame.alignment_of(estimate, task)
-    tied = ties(given, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
+    tied = ties(constraints, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
     optimum = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
     estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(optimum)
     if estimate.joint is not None:
@@ -298,10 +302,10 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
     missing = sorted(set(wanted) - set(listed))
     if missing:
         raise ConfigError(f"constraints: [[landmark_distance]] names {missing[0]!r}, of which there is no [[landmark]]")
-    found = {name: observations(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
+    views = {name: observations(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
     rows: list[tuple[NDArray[Any], ...]] = []
     for number, given in enumerate(constraints.landmark_distances):
-        one, other = (found[name] for name in given.landmarks)
+        one, other = (views[name] for name in given.landmarks)
         a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
         flat = np.ones(len(a))
         ends = (one.keyframe[a], other.keyframe[b], one.position[a], other.position[b])
@@ -315,7 +319,7 @@ def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
     """Return the distances in the map, ready for a report; note those that differ from the measured ones."""
     lengths = tied.edges.lengths(graph)
     figures: list[dict[str, object]] = []
-    for number, given in enumerate(task.given.landmark_distances):
+    for number, given in enumerate(task.constraints.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))
         names = " - ".join(given.landmarks)
         figures.append({"landmarks": names, "measured": given.distance, "map": round(length, 4)})

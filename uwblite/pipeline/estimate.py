@@ -30,7 +30,7 @@ class Task:
 
     recordings: Recordings
     config: MappingConfig
-    given: Constraints
+    constraints: Constraints
     """Prior knowledge given by the user."""
     stages: Stages
     """Collects the stages' figures, warnings and doubts."""
@@ -42,7 +42,7 @@ class Task:
 
     def allowed(self, i: Ints, j: Ints) -> Bools:
         """Return which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
-        return self.given.allowed(self.recordings.clock, i, j)
+        return self.constraints.allowed(self.recordings.clock, i, j)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

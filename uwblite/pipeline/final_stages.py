@@ -1,6 +1,7 @@
 """The last stages: every measurement in one graph, and the occupancy grid along its trajectory."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,8 +31,21 @@ from .radio_stages import with_range_noise
 from .recordings import Recording
 from .surface_adjustment import for_covariances
 
-_LARGE_GRID = 5_000_000
-"""Cells from which on a grid's memory is announced."""
+
+@dataclass(frozen=True, slots=True)
+class FinalPolicy:
+    """What the finished estimate states."""
+
+    large_grid: ClassVar[int] = 5_000_000
+    """Cells from which on a grid's memory is announced."""
+    along: ClassVar[int] = 60
+    """Poses along the trajectory whose joint covariance represents the whole trajectory."""
+    shortest: ClassVar[float] = 0.05
+    """s; shortest step whose variance grows in proportion to its time."""
+    none: ClassVar[float] = 1e-6
+    """Least square root of an information."""
+    fastest: ClassVar[float] = 1.0
+    """m/s and rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
@@ -53,55 +67,46 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
 def covariances_of(estimate: Estimate, task: Task) -> Covariances:
     """Return the covariances of a finished estimate, with the correlated errors of ranges in them."""
     poses = len(estimate.graph.poses)
-    along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.intp))
+    along = np.unique(np.linspace(0, poses - 1, FinalPolicy.along).round().astype(np.intp))
     graph, surfaces = with_fewer_pairs(estimate.graph), estimate.surfaces
     graph, rays = (graph, None) if surfaces is None else for_covariances(surfaces, graph, task)
-    found = marginals(graph, among=along, further=rays)
-    covariances = found.covariances
+    result = marginals(graph, among=along, further=rays)
+    covariances = result.covariances
     if estimate.ranges is not None:
-        covariances = _with_correlated_ranges(found, graph, estimate, task.config.ranges)
+        covariances = _add_correlated_ranges(result, graph, estimate, task.config.ranges)
     if not task.recordings.have_scans:
         return covariances
     return replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
 
 
-_ALONG = 60
-"""Number of poses along the trajectory whose joint covariance represents the whole trajectory."""
-
-
-def _with_correlated_ranges(found: Marginals, stated: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
+def _add_correlated_ranges(result: Marginals, model: Graph, estimate: Estimate, config: RangeNoiseConfig) -> Covariances:
     """Add the correlated errors of ranges: to anchors alone where the lidar determines the poses, else to all."""
     graph, ranges = estimate.graph, estimate.ranges
     assert ranges is not None
     if estimate.rests_on_ranges:
-        return with_correlated_errors(found, stated, ranges, config)
+        return with_correlated_errors(result, model, ranges, config)
     about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
-    given, plain = at_given_poses(replace(graph, edges=about_anchors)), found.covariances
-    return replace(plain, anchors=anchors_with_correlated_errors(given, ranges, plain.anchors, config))
+    at_poses, plain = at_given_poses(replace(graph, edges=about_anchors)), result.covariances
+    return replace(plain, anchors=anchors_with_correlated_errors(at_poses, ranges, plain.anchors, config))
 
 
-def _between_scan_and_keyframe(stated: Graph, task: Task) -> Floats:
+def _between_scan_and_keyframe(graph: Graph, task: Task) -> Floats:
     """Return the covariances (k, 3, 3) of the odometry's error between the time of a keyframe and those of its scans.
 
     Scans measure the pose at their own times; nothing but the odometry measures the motion from there to the keyframe.
     """
-    time, rate = np.zeros(len(stated.poses)), np.zeros((len(stated.poses), 3))
+    time, rate = np.zeros(len(graph.poses)), np.zeros((len(graph.poses), 3))
     for recording in task.recordings.each:
         if recording.has_scans:
             time[recording.rows] = time_to_scans(recording, task.config.keyframes)
-    time[stated.fixed_poses] = 0.0
-    for wheels in (e for e in stated.edges if isinstance(e, OdometryEdges)):
-        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), _NONE)
+    time[graph.fixed_poses] = 0.0
+    for wheels in (e for e in graph.edges if isinstance(e, OdometryEdges)):
+        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), FinalPolicy.none)
         for ends in (wheels.i, wheels.j):
-            np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, _SHORTEST)[:, None])
-    variance = np.minimum(rate * time[:, None], np.square(_FASTEST * time)[:, None])
-    turned = se2.rotation(stated.poses[:, 2])
+            np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, FinalPolicy.shortest)[:, None])
+    variance = np.minimum(rate * time[:, None], np.square(FinalPolicy.fastest * time)[:, None])
+    turned = se2.rotation(graph.poses[:, 2])
     return np.asarray(turned * variance[:, None] @ turned.transpose(0, 2, 1))
-
-
-_SHORTEST, _NONE, _FASTEST = 0.05, 1e-6, 1.0
-"""Shortest step whose variance grows in proportion to its time, s; least square root of an information; and speed, m/s and
-rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 
 def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
@@ -126,24 +131,24 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     if task.config.ranges.steady == 0.0:
         return estimate
     estimate = with_range_noise(estimate, task.config, steady=True)
-    graph, given = estimate.graph, at_given_poses(estimate.graph)
-    if not any(free.any() for free in free_unknowns(given).values()):
+    graph, at_poses = estimate.graph, at_given_poses(estimate.graph)
+    if not any(free.any() for free in free_unknowns(at_poses).values()):
         return estimate
-    given = _with_alike_heights(with_free(given, HEIGHT), estimate, task)
-    done = replace(estimate, graph=given).solved(task.config.solver)[0].graph
+    at_poses = _tie_heights(with_free(at_poses, HEIGHT), estimate, task)
+    done = replace(estimate, graph=at_poses).solved(task.config.solver)[0].graph
     # What the search itself has fixed are heights put back to 0.
     heights = graph.calibration.of_kinds(HEIGHT)
     fixed = np.where(heights, done.fixed_calibration, graph.fixed_calibration)
-    graph = replace(graph, edges=given.edges)
+    graph = replace(graph, edges=at_poses.edges)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
 
 
-def _with_alike_heights(given: Graph, estimate: Estimate, task: Task) -> Graph:
+def _tie_heights(at_poses: Graph, estimate: Estimate, task: Task) -> Graph:
     """Return a graph of anchors and their ranges at given poses with priors of heights by what all of them show."""
     if estimate.ranges is None:
-        return given
-    shown = with_alike_heights(optimize(given.with_edges(estimate.ranges), task.config.solver)[0])
-    return replace(given, edges=shown.edges[: len(given.edges)])
+        return at_poses
+    optimum = with_alike_heights(optimize(at_poses.with_edges(estimate.ranges), task.config.solver)[0])
+    return replace(at_poses, edges=optimum.edges[: len(at_poses.edges)])
 
 
 def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
@@ -155,7 +160,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
 
     def announce(geometry: GridGeometry) -> None:
         """Report what a large grid will take; the caller may still stop."""
-        if geometry.cells >= _LARGE_GRID:
+        if geometry.cells >= FinalPolicy.large_grid:
             cells, megabytes = geometry.cells / 1e6, geometry.megabytes
             detail = f"of {cells:.0f} million cells, about {megabytes:.0f} MB"
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)

@@ -37,7 +37,7 @@ class LinePolicy:
     """m rms between two trajectories from which on it matters which of them is true."""
 
 
-def with_likeliest_side(estimate: Estimate, task: Task) -> Estimate:
+def choose_side(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
     best, *others = sides(estimate.problem, estimate.placed, task.config.solver)
     return replace(estimate.with_estimates_of(best.graph), other_side=others[0].graph) if others else estimate
@@ -51,9 +51,9 @@ def sides(graph: Graph, placed: Bools, config: SolverConfig, further: Graph | No
     graph : of one recording, optimised. placed : (a,) anchors that have a position. further : where to search as well.
     """
 
-    def propose(at: Graph) -> list[Alternative]:
-        starts = [further] if further is not None and at is graph else []
-        return [Alternative(start) for start in (*starts, *mirrored_tails(at, placed))]
+    def propose(explanation: Graph) -> list[Alternative]:
+        starts = [further] if further is not None and explanation is graph else []
+        return [Alternative(start) for start in (*starts, *mirrored_tails(explanation, placed))]
 
     return explanations(graph, propose, lambda start: optimize(start, config)[0], log_density)
 
@@ -87,9 +87,9 @@ def _line(anchors: Floats) -> tuple[Floats, Floats] | None:
     """Return the middle (2,) of the line on which the anchors (a, 2) stand, or all but one, and the direction across it."""
     every = np.arange(len(anchors))
     for some in [every, *(every[every != k] for k in every if len(every) >= LinePolicy.all_but_one)]:
-        own = anchors[some]
-        variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 1 else (np.ones(2), np.eye(2))
+        places = anchors[some]
+        variances, axes = np.linalg.eigh(np.cov(places.T)) if len(places) > 1 else (np.ones(2), np.eye(2))
         across, along = np.sqrt(np.maximum(variances, 0.0))
         if across < min(LinePolicy.across, LinePolicy.share * along):
-            return own.mean(axis=0), axes[:, 0]
+            return places.mean(axis=0), axes[:, 0]
     return None

@@ -38,46 +38,46 @@ class MirrorPolicy:
 
 def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with anchors ambiguous whose mirror image is not refuted, and no others."""
-    ranges, found = estimate.ranges, estimate.bootstrap
-    if ranges is None or found is None:
+    ranges, bootstrap = estimate.ranges, estimate.bootstrap
+    if ranges is None or bootstrap is None:
         return estimate
-    free = found.placed & (np.bincount(ranges.anchor[ranges.alive], minlength=len(found.placed)) > 0)
+    free = bootstrap.placed & (np.bincount(ranges.anchor[ranges.alive], minlength=len(bootstrap.placed)) > 0)
     free &= ~estimate.graph.fixed_anchors
     if not free.any():
         return estimate
     config, (mirrored, straight), second = task.config.solver, _images(estimate, ranges), _second_places(estimate)
-    here = _minimum(estimate.graph, ranges, free, estimate.graph.anchors, config)
-    pace = MirrorPolicy.pace * EvidencePolicy.very_strong / (EvidencePolicy.very_strong - log_density(here))
+    present = _minimum(estimate.graph, ranges, free, estimate.graph.anchors, config)
+    pace = MirrorPolicy.pace * EvidencePolicy.very_strong / (EvidencePolicy.very_strong - log_density(present))
     slow = replace(config, relative_decrease=max(config.relative_decrease, pace))
-    log_odds, others = np.full(len(free), -np.inf), here.anchors.copy()
+    log_odds, others = np.full(len(free), -np.inf), present.anchors.copy()
     for start in (mirrored, second):
-        there = _minimum(estimate.graph, ranges, free, start, slow)
-        odds = 0.5 * (_costs(here, ranges) - _costs(there, ranges))
-        likelier = (np.hypot(*(there.anchors - here.anchors).T) > MirrorPolicy.apart) & (odds > log_odds)
-        log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], there.anchors, others)
-    as_well, best = log_odds > -EvidencePolicy.very_strong, estimate.graph
-    twice = found.ambiguous & np.any(second != best.anchors, axis=1)
-    images = np.where(twice[:, None], second, mirrored)
-    bent = np.flatnonzero(free & ~as_well & straight & (np.hypot(*(images - best.anchors).T) > MirrorPolicy.apart))
+        image = _minimum(estimate.graph, ranges, free, start, slow)
+        odds = 0.5 * (_costs(present, ranges) - _costs(image, ranges))
+        likelier = (np.hypot(*(image.anchors - present.anchors).T) > MirrorPolicy.apart) & (odds > log_odds)
+        log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], image.anchors, others)
+    possible, best = log_odds > -EvidencePolicy.very_strong, estimate.graph
+    second_known = bootstrap.ambiguous & np.any(second != best.anchors, axis=1)
+    images = np.where(second_known[:, None], second, mirrored)
+    bent = np.flatnonzero(free & ~possible & straight & (np.hypot(*(images - best.anchors).T) > MirrorPolicy.apart))
     if len(bent) and task.recordings.have_scans:
         # Anchors were estimated last and alone, and all together may be better.
         best = optimize(best, config)[0]
     for k in bent.tolist():
         other = _along_another_path(best, ranges, k, images[k], task)
         if other is not None:
-            as_well[k], others[k] = True, other
-    if not task.recordings.have_scans and not as_well[free].all() and as_well[free].any():
+            possible[k], others[k] = True, other
+    if not task.recordings.have_scans and not possible[free].all() and possible[free].any():
         # The side of the anchor that seems clear may be that of all of them: the path and all anchors have a mirror image.
-        image = mirrored_whole(best, ranges, free, config)
-        if image is not None:
-            others = np.where((free & ~as_well)[:, None], image.anchors, others)
-            as_well = free | as_well
-    ambiguous = np.where(free, as_well, found.ambiguous)
-    hypotheses = list(found.hypotheses)
+        whole = mirrored_whole(best, ranges, free, config)
+        if whole is not None:
+            others = np.where((free & ~possible)[:, None], whole.anchors, others)
+            possible = free | possible
+    ambiguous = np.where(free, possible, bootstrap.ambiguous)
+    hypotheses = list(bootstrap.hypotheses)
     for k in np.flatnonzero(free & ambiguous).tolist():
         if hypotheses[k]:
             hypotheses[k] = (hypotheses[k][0], replace(hypotheses[k][0], position=others[k]))
-    return replace(estimate, bootstrap=replace(found, ambiguous=ambiguous, hypotheses=tuple(hypotheses)))
+    return replace(estimate, bootstrap=replace(bootstrap, ambiguous=ambiguous, hypotheses=tuple(hypotheses)))
 
 
 def mirrored_whole(graph: Graph, ranges: RangeEdges, free: Bools, config: SolverConfig) -> Graph | None:
@@ -114,11 +114,11 @@ def _along_another_path(best: Graph, ranges: RangeEdges, k: int, image: Floats, 
     other = compared(best, alternative, lambda start: optimize(start, config)[0], log_density)
     if other is None or not other.open:
         return None
-    own = ranges.pose[ranges.alive & (ranges.anchor == k)]
-    bend = np.hypot(*(other.graph.poses - best.poses)[own, :2].T).max(initial=0.0)
-    held = task.recordings.have_scans and bend < MirrorPolicy.bends
+    keyframes = ranges.pose[ranges.alive & (ranges.anchor == k)]
+    bend = np.hypot(*(other.graph.poses - best.poses)[keyframes, :2].T).max(initial=0.0)
+    stiff = task.recordings.have_scans and bend < MirrorPolicy.bends
     apart = np.hypot(*(other.graph.anchors[k] - best.anchors[k])) > MirrorPolicy.apart
-    return None if held or not apart else np.asarray(other.graph.anchors[k])
+    return None if stiff or not apart else np.asarray(other.graph.anchors[k])
 
 
 def _images(estimate: Estimate, ranges: RangeEdges) -> tuple[Floats, Bools]:
@@ -127,11 +127,11 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> tuple[Floats, Bools]:
     anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
     straight = np.zeros(len(anchors), dtype=bool)
     for k in np.flatnonzero(estimate.placed).tolist():
-        own = tags[ranges.alive & (ranges.anchor == k)]
-        variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 2 else (np.full(2, np.inf), np.zeros((2, 2)))
+        seen_from = tags[ranges.alive & (ranges.anchor == k)]
+        variances, axes = np.linalg.eigh(np.cov(seen_from.T)) if len(seen_from) > 2 else (np.full(2, np.inf), np.zeros((2, 2)))
         straight[k] = variances[0] <= MirrorPolicy.straight**2
-        if len(own) > 2:
-            anchors[k] -= 2.0 * axes[:, 0] * float(axes[:, 0] @ (anchors[k] - own.mean(axis=0)))
+        if len(seen_from) > 2:
+            anchors[k] -= 2.0 * axes[:, 0] * float(axes[:, 0] @ (anchors[k] - seen_from.mean(axis=0)))
     return anchors, straight
 
 
@@ -143,10 +143,10 @@ def _second_places(estimate: Estimate) -> Floats:
     """
     assert estimate.bootstrap is not None
     anchors = estimate.graph.anchors.copy()
-    for place, found in zip(anchors, estimate.bootstrap.hypotheses, strict=True):
-        if len(found) > 1:
+    for place, hypotheses in zip(anchors, estimate.bootstrap.hypotheses, strict=True):
+        if len(hypotheses) > 1:
             # Later measurements may have moved the anchor from the first of the two places to the second.
-            place[:] = max((each.position for each in found[:2]), key=lambda other: float(np.hypot(*(other - place))))
+            place[:] = max((each.position for each in hypotheses[:2]), key=lambda other: float(np.hypot(*(other - place))))
     return anchors
 
 

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from ..errors import Cancelled
 from ..findings import DOUBT, WARNING, Fact, Finding, of_severity
 from ..graph.solver import SolverSummary
-from ..graph.work import KINDS, Work
-from ..map_result import StageSummary
+from ..graph.work import KINDS, StageSummary, Work
 
 
 class Stage(str):

@@ -4,7 +4,8 @@ Each recording is bootstrapped on its own, then the recordings are joined. Once 
 the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -34,6 +35,19 @@ from .progress import solver_figures
 from .recordings import Recording
 
 
+@dataclass(frozen=True, slots=True)
+class LapPolicy:
+    """How ranges and path are estimated in turn."""
+
+    laps: ClassVar[int] = 4
+    """Laps of the first optimisation: each estimates noise and optimises the graph; in the last one the radio's calibration is
+    free too."""
+    most_growth: ClassVar[float] = 1.3
+    """Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
+    least_scatter: ClassVar[float] = 0.03
+    """m; scatter that is usual for radios, below which the growth is not tested."""
+
+
 def first_optimisation(task: Task) -> Estimate:
     """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
     recordings = task.recordings
@@ -43,9 +57,9 @@ def first_optimisation(task: Task) -> Estimate:
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
-        return anchor_heights.with_likelier_heights(estimates[0], task.config)
+        return anchor_heights.choose_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
-    return anchor_heights.with_likelier_heights(joined, task.config)
+    return anchor_heights.choose_heights(joined, task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | None = None) -> Estimate:
@@ -107,15 +121,15 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
     settings = replace(config.bootstrap, range_sigma=sigma)
     measured = Measured(estimate.odometry, ranges, path - path[0])
-    found = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
-    whose = {"recording": number + 1} if len(recordings) > 1 else {}
-    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
+    result = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
+    number_if_several = {"recording": number + 1} if len(recordings) > 1 else {}
+    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(result.placed.sum()), **number_if_several)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.
-    back = se2.compose(estimate.graph.poses[0], se2.inverse(found.graph.poses[0]))
-    graph = estimate.graph.with_estimates_of(map_frame.moved(found.graph, back))
-    graph = replace(graph, fixed_anchors=~found.placed)
-    ranges = replace(ranges, weights=(used & found.placed[ranges.anchor]).astype(np.float64))
-    return replace(estimate, graph=graph, ranges=ranges, bootstrap=found).with_hypotheses_moved(back)
+    back = se2.compose(estimate.graph.poses[0], se2.inverse(result.graph.poses[0]))
+    graph = estimate.graph.with_estimates_of(map_frame.moved(result.graph, back))
+    graph = replace(graph, fixed_anchors=~result.placed)
+    ranges = replace(ranges, weights=(used & result.placed[ranges.anchor]).astype(np.float64))
+    return replace(estimate, graph=graph, ranges=ranges, bootstrap=result).with_hypotheses_moved(back)
 
 
 def _optimised(estimate: Estimate, task: Task) -> Estimate:
@@ -131,7 +145,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     # Recordings that were joined have their slips in their odometry.
     if len(estimate.bootstrap.slips) and not estimate.alone:
         slips = estimate.bootstrap.slips
-    optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(_NOISE_ROUNDS)
+    optimizer, have_scans, laps = Optimizer(), task.recordings.have_scans, range(LapPolicy.laps)
     if estimate.alone:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
         estimate, result = estimate.solved(comparable(task.config.solver), optimizer)
@@ -148,10 +162,10 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     if slips.any():
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
-        task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
-    found = estimate if have_scans or estimate.alone else line_sides.with_likeliest_side(estimate, task)
-    if found is not estimate:
-        estimate, result = _lap(found, lap, task, optimizer)
+        task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
+    sided = estimate if have_scans or estimate.alone else line_sides.choose_side(estimate, task)
+    if sided is not estimate:
+        estimate, result = _lap(sided, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
     return estimate
 
@@ -159,17 +173,13 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
 def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
     """Estimate the ranges' noise and optimise once; the last lap chooses the radio's priors and frees its calibration."""
     config, estimate = task.config, with_range_noise(estimate, task.config)
-    if lap == _NOISE_ROUNDS - 1:
+    if lap == LapPolicy.laps - 1:
         graph = with_selected_priors(estimate, config).graph
         return replace(estimate, graph=with_free(graph, *RADIO)).solved(config.solver, optimizer)
     # A robust odometry would break where the path only begins badly.
     odometry, solver = estimate.odometry, config.solver if lap else rough(config.solver)
     estimate, result = replace(estimate, odometry=replace(odometry, kernel=SQUARED)).solved(solver, optimizer)
     return replace(estimate, odometry=odometry), result
-
-
-_NOISE_ROUNDS = 4
-"""Number of laps: each estimates noise and optimises the graph; in the last one the radio's calibration is free too."""
 
 
 def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
@@ -246,8 +256,8 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None:
         return estimate
     if estimate.steps is None or not estimate.rests_on_ranges:
-        weak = _with_learnt_ranges(estimate, task, steady=True)
-        estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
+        weak = _learn_ranges(estimate, task, steady=True)
+        estimate = _learn_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
     return with_selected_priors(estimate, task.config)
 
 
@@ -257,7 +267,7 @@ def with_selected_priors(estimate: Estimate, config: MappingConfig) -> Estimate:
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, measured, config.calibration))
 
 
-def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
+def _learn_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
     """Return the optimum with ranges whose noise was learnt there; steady: see range_measurements.learn_noise."""
     optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
@@ -272,8 +282,8 @@ def _let_go(held: Estimate, weak: Estimate) -> bool:
     Noise learnt there would be the error of the poses, and would fix them where they are. Sustained outliers of one anchor
     cause residuals too, but of this anchor only.
     """
-    growth = np.array([b / max(a, _LEAST_SCATTER) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
-    return len(growth) > 0 and float(np.median(growth)) > _MOST_GROWTH
+    growth = np.array([b / max(a, LapPolicy.least_scatter) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
+    return len(growth) > 0 and float(np.median(growth)) > LapPolicy.most_growth
 
 
 def _scatter(estimate: Estimate) -> list[float]:
@@ -282,9 +292,3 @@ def _scatter(estimate: Estimate) -> list[float]:
     assert ranges is not None
     off, alive = ranges.residuals(estimate.graph)[:, 0] * ranges.sigma, ranges.alive
     return [spread(off[alive & (ranges.anchor == anchor)]) for anchor in np.unique(ranges.anchor[alive])]
-
-
-_MOST_GROWTH = 1.3
-"""Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
-_LEAST_SCATTER = 0.03
-"""Scatter that is usual for radios, m; below it the test does not apply."""

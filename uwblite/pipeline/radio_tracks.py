@@ -43,8 +43,8 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
     ranges, ids, config = estimate.ranges, estimate.anchor_ids, task.config
     assert ranges is not None
     # Prior knowledge of the user refers to anchors by their present numbers.
-    given = bool(task.given.anchors or task.given.distances)
-    names = [name if given or radio_name(name) not in ids else radio_name(name) for name in ids]
+    tied = bool(task.constraints.anchors or task.constraints.distances)
+    names = [name if tied or radio_name(name) not in ids else radio_name(name) for name in ids]
     recording, positions = task.recordings.of_keyframe[ranges.pose], ranges.tag_positions(estimate.graph.poses)
     used = ranges.alive & estimate.placed[ranges.anchor]
     values = np.append(estimate.graph.calibration.values, 0.0)[ranges.calibration]
@@ -59,13 +59,13 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
         if not len(rows):
             continue
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MovePolicy.most_ranges)).round().astype(np.intp))
-        own = rows[chosen]
-        unknown = ranges.calibration[own[0], 2] >= 0
-        height = float(np.sqrt(max(values[own[0], 2], 0.0)))
+        sample = rows[chosen]
+        unknown = ranges.calibration[sample[0], 2] >= 0
+        height = float(np.sqrt(max(values[sample[0], 2], 0.0)))
         heights = (height, *(h for h in (0.0, *MovePolicy.heights) if h != height)) if unknown else (0.0,)
-        track = Track(positions[own], level[own], recording[own], sigma, heights)
+        track = Track(positions[sample], level[sample], recording[sample], sigma, heights)
         model = PlaceModel(track, config.trilateration, config.ranges)
-        radios.append(RadioTrack(name, numbers, rows, chosen, ranges.pose[own], model))
+        radios.append(RadioTrack(name, numbers, rows, chosen, ranges.pose[sample], model))
     return radios
 
 

@@ -1,25 +1,44 @@
-"""One or more recordings, their keyframes in one numbering."""
+"""One or more recordings: the part of each that is used, and their keyframes in one numbering.
+
+A map uses the scans nearest to each keyframe, and traces one whenever the laser has moved far enough. In the recording of a
+slow robot that is about every fifth scan.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints, require_type
 from ..constraints import Clock, Constraints
 from ..errors import DataError
+from ..grid.occupancy_grid import GridConfig
+from ..grid.tracing import moved_scans
 from ..odometry import keyframes
+from ..odometry.attached import choose_scans
 from ..odometry.keyframes import KeyframeConfig, Keyframes
+from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .mapping_config import MappingConfig
 
-_APART = 1000.0
-"""Travelled distance assumed between the end of a recording and the start of the next, m: they are different visits."""
 
+@dataclass(frozen=True, slots=True)
+class RecordingPolicy:
+    """How recordings are told apart, and which of their scans a map needs."""
 
-_SPARSE = 0.15
-"""Time between samples of the odometry that interpolation does not bridge well, s."""
+    apart: ClassVar[float] = 1000.0
+    """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
+    sparse: ClassVar[float] = 0.15
+    """s between samples of the odometry that interpolation does not bridge well."""
+    alike: ClassVar[int] = 20
+    """Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
+    same_moment: ClassVar[float] = 1e-6
+    """s; difference of stamps that is rounding."""
+    scans_per_move: ClassVar[int] = 2
+    """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +78,7 @@ class Recording:
         after = np.searchsorted(stamps, own)
         inside = (after > 0) & (after < len(stamps))
         gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
-        return np.union1d(stamps, own[inside][gap > _SPARSE]) if (gap > _SPARSE).any() else stamps
+        return np.union1d(stamps, own[inside][gap > RecordingPolicy.sparse]) if (gap > RecordingPolicy.sparse).any() else stamps
 
     def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
         """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
@@ -144,11 +163,7 @@ def _alike(one: SensorLog, other: SensorLog) -> bool:
     _, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
     same = np.all(a.poses[i] == b.poses[j], axis=1)
     moving = np.any(a.poses[i] != a.poses[np.maximum(i - 1, 0)], axis=1)
-    return int(np.sum(same & moving)) > _ALIKE
-
-
-_ALIKE = 20
-"""Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
+    return int(np.sum(same & moving)) > RecordingPolicy.alike
 
 
 def later(recordings: Recordings, shift: float) -> Recordings:
@@ -168,27 +183,23 @@ def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -
     frames = []
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
-        own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
+        starts = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
         added = (
             [np.zeros(0)]
             if log.scans is None
-            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in own.tolist()]
+            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in starts.tolist()]
         )
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
-        alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
+        alone = np.isin(moments, np.concatenate([stamps[starts], stamps[starts + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))
     return _joined([s.log for s in recordings.each], frames)
 
 
 def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
-    first, last = np.searchsorted(stamps, (begin + _SAME_MOMENT, end - _SAME_MOMENT))
+    first, last = np.searchsorted(stamps, (begin + RecordingPolicy.same_moment, end - RecordingPolicy.same_moment))
     within = stamps[first:last]
     return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
-
-
-_SAME_MOMENT = 1e-6
-"""Difference of stamps, s, up to which it is rounding."""
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:
@@ -196,10 +207,10 @@ def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recording
     each: list[Recording] = []
     paths: list[Floats] = []
     first, start = 0, 0.0
-    for number, (log, own) in enumerate(zip(logs, frames, strict=True)):
-        each.append(Recording(number, log, own, first))
-        paths.append(start + np.concatenate([[0.0], np.cumsum(own.path)]))
-        first, start = first + len(own), float(paths[-1][-1]) + _APART
+    for number, (log, keyframes_of) in enumerate(zip(logs, frames, strict=True)):
+        each.append(Recording(number, log, keyframes_of, first))
+        paths.append(start + np.concatenate([[0.0], np.cumsum(keyframes_of.path)]))
+        first, start = first + len(keyframes_of), float(paths[-1][-1]) + RecordingPolicy.apart
     return Recordings(
         tuple(each),
         np.repeat(np.arange(len(each)), [len(s.frames) for s in each]),
@@ -207,3 +218,39 @@ def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recording
         np.concatenate(paths),
         np.concatenate([s.frames.twist for s in each]),
     )
+
+
+def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
+    """Return a recording screened, with the sensors in use and only the scans that a map needs.
+
+    From one that was screened before, only unused sensors are removed.
+    """
+    log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
+    if log.screening is not None:
+        return log
+    return thinned(screen(log, config.detect_laser_flip), config.keyframes, config.grid)
+
+
+def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:
+    """Return the recording with the scans that a map of it may need; the notes count the others.
+
+    Thinning the result again with the same settings changes nothing.
+
+    Parameters
+    ----------
+    frames, grid : which scans make clouds and which are traced. ``grid.move_distance = 0`` keeps all.
+    """
+    scans = log.scans
+    if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:
+        return log
+    _, near = choose_scans(scans, keyframes.of(log, frames), frames)
+    base = log.odometry.at(scans.stamps)
+    laser = se2.compose(base, log.mounting.T_base_laser)
+    traced = moved_scans(
+        laser, grid.move_distance / RecordingPolicy.scans_per_move, grid.move_angle / RecordingPolicy.scans_per_move
+    )
+    kept = np.union1d(near, traced)
+    if len(kept) == len(scans.stamps):
+        return log
+    left_out = log.notes.scans_left_out + len(scans.stamps) - len(kept)
+    return replace(log, scans=scans.rows(kept), notes=replace(log.notes, scans_left_out=left_out))

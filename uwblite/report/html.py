@@ -14,7 +14,6 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..findings import DOUBT, Finding, folded
-from ..graph.calibration import HEIGHT
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .page import PAGE, SCRIPT, STYLE
 from .printable import duration, printable, sigma_text
@@ -148,7 +147,7 @@ def _calibration_table(result: MapResult) -> str:
 
 def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
     """Return meaning, value with sigma and unit, and name; ratios in per cent, heights in metres."""
-    if value.key.kind == HEIGHT:
+    if value.is_height:
         height, most = np.sqrt(np.maximum([value.value, value.value + 2.0 * value.sigma], 0.0)).tolist()
         return f"height of anchor {value.key.anchor} above or below the tag", f"{height:.2f} m, below {most:.2f} m", value.name
     scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import se2
-from ..arrays import Floats
 from ..constraints import Constraints
 from ..io.carmen_live import LogTail, Sensor
 from ..io.stored_result import StoredResult
@@ -87,7 +85,7 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
     summary += f", {tail.broken} broken lines" if tail.broken else ""
     summary += ", begun again" if tail.restarts else ""
     summary += "" if tail.is_file else "; a pipe, a device or a folder now has its name, and only a file can be followed"
-    trail = _trail(tail, result)
+    trail = None if result is None else result.trail(*tail.odometry(), _TRAIL)
     return {
         "summary": summary,
         "rounds": rounds,
@@ -106,19 +104,3 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
 def _state_of(sensor: Sensor, now: float) -> SensorState:
     """Return what came from a sensor; of a silent one the rate is the one that it had."""
     return SensorState(sensor.count, sensor.rate(sensor.last), now - sensor.last)
-
-
-def _trail(tail: LogTail, result: StoredResult | None) -> Floats | None:
-    """Return the poses (k, 3) since the latest map ends, by the odometry, in the map's frame; None without a map."""
-    if result is None:
-        return None
-    stamps, poses = result.trajectories[-1]
-    times, wheels = tail.odometry()
-    later = times > stamps[-1]
-    if not len(times) or times[0] > stamps[-1] or not later.any():
-        return poses[-1:]
-    end = se2.interpolate_trajectory(times, wheels, stamps[-1])
-    chosen = np.flatnonzero(later)[:: max(int(later.sum()) // _TRAIL, 1)]
-    chosen = np.union1d(chosen, [len(times) - 1])
-    T_map_odom = se2.compose(poses[-1], se2.inverse(end))
-    return np.concatenate([poses[-1:], se2.compose(T_map_odom, wheels[chosen])])

@@ -1,7 +1,7 @@
-"""What `uwblite map` will cost, by the size of a recording."""
+"""What a map will cost in time and memory, by the size of a recording."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,36 +10,43 @@ from ..arrays import Floats
 from ..grid.occupancy_grid import GridConfig
 from ..sensor_log import SensorLog
 
-if TYPE_CHECKING:
-    from ..pipeline.mapping_config import MappingConfig
+_GRID = GridConfig()
+"""Of the defaults."""
 
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md."""
+
+    seconds_per_metre: float
+    """Of driving: matching of clouds, graph."""
+    seconds_per_range: float
+    seconds_per_reading: float
+    """Of the laser: parsing and tracing."""
+    bytes_per_metre: float
+    bytes_per_reading: float
+    bytes_per_cell: float
+
+
+WITH_LIDAR = Rates(0.045, 1.5e-4, 2e-7, 0.2e6, 2.0, 20.0)
+RANGES_ALONE = Rates(0.0005, 8e-4, 0.0, 0.09e6, 0.0, 0.0)
+"""Ranges alone hold the trajectory, and an optimisation takes more steps."""
 SECONDS_AT_LEAST = 0.5
-"""Starting, reading settings, writing files; on the computer of docs/lab/performance.md, as the figures below."""
-_SECONDS_PER_METRE = 0.045
-"""Of driving, with lidar: matching of clouds, graph."""
-_SECONDS_PER_METRE_WITHOUT_LIDAR = 0.0005
-_SECONDS_PER_RANGE, _SECONDS_PER_RANGE_WITHOUT_LIDAR = 1.5e-4, 8e-4
-"""Without lidar ranges alone hold the trajectory, and an optimisation takes more steps."""
-_SECONDS_PER_READING = 2e-7
-"""Of the laser: parsing and tracing."""
-_BYTES_PER_READING = 2.0
-_BYTES_PER_METRE, _BYTES_PER_METRE_WITHOUT_LIDAR = 0.2e6, 0.09e6
-_BYTES_PER_CELL = 20.0
-_BYTES_AT_LEAST = 105e6
+"""Starting, reading settings, writing files."""
+BYTES_AT_LEAST = 105e6
 """Numpy, scipy, and what small recordings take. With these figures 31 min in a hall are 245 MB (223 measured), the sample 118
 (143), and public recordings of lidar and of ranges alone 0.9 to 1.1 times what is measured."""
-_SCANS_LOOKED_AT = 500
-"""At most, for the size of the map."""
+_SCANS = 500
+"""Looked at, at most, for the size of the map."""
 
 
 def work_seconds(log: SensorLog) -> float:
     """Return the time that the map of a recording takes on the computer of docs/lab/performance.md, s."""
-    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
+    path = float(log.odometry.travelled[-1])
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     readings = 0 if log.scans is None else log.scans.ranges.size
-    if not readings:
-        return _SECONDS_PER_METRE_WITHOUT_LIDAR * path + _SECONDS_PER_RANGE_WITHOUT_LIDAR * ranges
-    return _SECONDS_PER_METRE * path + _SECONDS_PER_RANGE * ranges + _SECONDS_PER_READING * readings
+    rates = WITH_LIDAR if readings else RANGES_ALONE
+    return rates.seconds_per_metre * path + rates.seconds_per_range * ranges + rates.seconds_per_reading * readings
 
 
 def model_seconds(log: SensorLog) -> float:
@@ -51,7 +58,7 @@ def seen_size(log: SensorLog) -> Floats:
     """Return the size (2,) of what the scans saw and the robot drove through, by the odometry alone, m."""
     points = [log.odometry.poses[:, :2]]
     if log.scans is not None:
-        scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS_LOOKED_AT) or 1))
+        scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS) or 1))
         bases = log.odometry.at(scans.stamps)
         lasers = se2.compose(bases, log.mounting.T_base_laser)
         rows, beams = np.nonzero(scans.hits(scans.ranges))
@@ -61,17 +68,16 @@ def seen_size(log: SensorLog) -> Floats:
     return np.asarray(np.ptp(np.concatenate(points), axis=0))
 
 
-def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict[str, float]:
+def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
     """Return the time and memory that the map of a screened recording is expected to need, and the size of the map.
 
-    The time is that on the computer of docs/performance.md; a Raspberry Pi 4 takes several times as long.
+    The time is that on the computer of docs/lab/performance.md; a Raspberry Pi 4 takes several times as long.
     """
-    grid = GridConfig() if config is None else config.grid
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)
     scans, beams = (0, 0) if log.scans is None else log.scans.ranges.shape
-    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
+    path = float(log.odometry.travelled[-1])
     return {
         "seconds": round(model_seconds(log), 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
@@ -81,25 +87,14 @@ def expected_cost(log: SensorLog, config: "MappingConfig | None" = None) -> dict
     }
 
 
-def long_wait(seconds: float) -> str | None:
-    """Return what to say beforehand of a map that takes more than ten minutes, s; None of others."""
-    if seconds <= _LONG:
-        return None
-    cure = "a part of it (uwblite convert --start --end) or a larger --set keyframes.distance=METRES takes less"
-    return f"this map will take about {seconds / 60.0:.0f} minutes of a desktop computer, more of a small one: {cure}"
-
-
-_LONG = 600.0
-"""s; a user who is not told of it takes a longer run for one that hangs."""
-
-
 def together(costs: Sequence[dict[str, float]]) -> dict[str, float]:
     """Return the time and memory of one map of several recordings."""
-    twice = (len(costs) - 1) * SECONDS_AT_LEAST, (len(costs) - 1) * 1e-6 * _BYTES_AT_LEAST
+    twice = (len(costs) - 1) * SECONDS_AT_LEAST, (len(costs) - 1) * 1e-6 * BYTES_AT_LEAST
     return {name: sum(cost[name] for cost in costs) - less for name, less in zip(("seconds", "megabytes"), twice, strict=True)}
 
 
 def expected_megabytes(path: float, scans: int, beams: int, cells: int) -> float:
     """Return the expected peak memory of a map, MB."""
-    lidar = _BYTES_PER_METRE * path + _BYTES_PER_READING * scans * beams + _BYTES_PER_CELL * cells
-    return 1e-6 * (_BYTES_AT_LEAST + (lidar if scans else _BYTES_PER_METRE_WITHOUT_LIDAR * path))
+    rates = WITH_LIDAR if scans else RANGES_ALONE
+    size = rates.bytes_per_metre * path + rates.bytes_per_reading * scans * beams + rates.bytes_per_cell * cells
+    return 1e-6 * (BYTES_AT_LEAST + size)

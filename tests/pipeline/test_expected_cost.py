@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwblite.cli import check, cost
+from uwblite.cli import check
 from uwblite.config import override
-from uwblite.mapping import MappingConfig
+from uwblite.grid.occupancy_grid import GridConfig
+from uwblite.pipeline import expected_cost as cost
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
@@ -64,9 +65,9 @@ def test_the_map_is_as_large_as_what_was_seen(log):
 
 
 def test_a_larger_grid_than_is_allowed_costs_what_is_allowed(log):
-    few = cost.expected_cost(log, override(MappingConfig(), ["grid.resolution=0.001", "grid.max_cells=10000"]))
+    few = cost.expected_cost(log, override(GridConfig(), ["resolution=0.001", "max_cells=10000"]))
     assert few["map cells"] == 10_000
-    many = cost.expected_cost(log, override(MappingConfig(), ["grid.resolution=0.001"]))
+    many = cost.expected_cost(log, override(GridConfig(), ["resolution=0.001"]))
     assert many["megabytes"] > few["megabytes"] + 100
     assert few["map width m"] == cost.expected_cost(log)["map width m"] > 5.0
     assert cost.expected_cost(log.without(lidar=True))["map cells"] == 0

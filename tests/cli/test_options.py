@@ -6,7 +6,7 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import VERBS, console
-from uwblite.cli.wording import OPTIONS, findings_with_options, with_options
+from uwblite.cli.options import OPTIONS, name_options, name_options_in
 from uwblite.findings import doubt
 
 
@@ -21,7 +21,7 @@ from uwblite.findings import doubt
     ],
 )  # fmt: skip
 def test_names_become_options(said, shown):
-    assert with_options(said) == shown
+    assert name_options(said) == shown
 
 
 def test_what_is_printed_and_what_is_written_says_the_same(capsys):
@@ -31,7 +31,7 @@ def test_what_is_printed_and_what_is_written_says_the_same(capsys):
     out, err = capsys.readouterr()
     assert out == "give --tag\n"
     assert err == "use --force\nuwblite: error: choose another --out\n"
-    (found,) = findings_with_options([doubt("odd", "see `crop`")])
+    (found,) = name_options_in([doubt("odd", "see `crop`")])
     assert (found.text, found.kind) == ("see --crop", "odd")
     assert console.plain({"text": "use `force`"}) == {"text": "use --force"}
 
