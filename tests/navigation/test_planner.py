@@ -121,6 +121,27 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     assert np.mean(dearer) < 1.05
 
 
+@pytest.mark.parametrize("unknown", ["refuse", "price"])
+def test_a_long_corridor_is_hardly_searched_and_its_path_is_as_cheap(monkeypatch, unknown):
+    """Three legs of 100 m, 1.8 m wide: where the way is open for long, no cell is searched."""
+    log_odds = np.full((120, 2000), -4.0, dtype=np.float32)
+    for k, row in enumerate(range(36, 116, 40)):
+        log_odds[row : row + 4] = 4.0
+        log_odds[row : row + 4, slice(2, 34) if k % 2 else slice(-34, -2)] = -4.0
+    grid = OccupancyGrid(GridGeometry(0.05, np.zeros(2), *log_odds.shape), log_odds)
+    start, goal = np.array([0.7, 0.8]), np.array([99.2, 5.2])
+    whole = make_planner(grid, 0.2, unknown=unknown).plan(start, [goal])
+    monkeypatch.setattr(steps, "_AT_ONCE", 30_000)
+    parts = make_planner(grid, 0.2, unknown=unknown)
+    searched = []
+    search = steps.StepSearch._search
+    monkeypatch.setattr(steps.StepSearch, "_search", lambda s, n, *ends: searched.append(len(n)) or search(s, n, *ends))
+    path = parts.plan(start, [goal])
+    assert 0 < sum(searched) < 0.4 * len(parts.steps.nodes())
+    assert whole.cost * 0.995 < path.cost < whole.cost * 1.005
+    assert distance_to_squares(grid, grid.states() == OCCUPIED, path.poses[:, :2]).min() >= 0.2 - 1e-6
+
+
 @pytest.mark.parametrize("cells", [7, 8, 9])
 @pytest.mark.parametrize("resolution", [0.05, 0.1])
 @pytest.mark.parametrize("shift", [0, 1])

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, runs_of
 from .nlos_mixture import RangeMixture, fit
-from .range_noise import RangeNoise, RangeNoiseConfig, effective_sigma
+from .range_noise import RangeNoiseConfig, independent_shares
 from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
 
 
@@ -122,11 +122,7 @@ class PlaceModel:
         Ranges of one interval from neighbouring places have most of their errors in common. That ranges differ which were made
         at one place at different times is no error of that kind, so intervals count apart.
         """
-        white, slow = np.sqrt(1.0 - self.noise.slow_share), np.sqrt(self.noise.slow_share)
-        correlated, shares = RangeNoise(white, slow, self.noise.correlation_length), np.ones(len(place))
-        for own in [*intervals_of(place), *ways_of(place)]:
-            shares[own] = effective_sigma(self.track.path[own], correlated) ** -2
-        return shares
+        return independent_shares(self.track.path, [*intervals_of(place), *ways_of(place)], self.noise)
 
     def likeliest(self, height: float, parts: Sequence[slice | Bools | Ints]) -> list[AnchorHypothesis]:
         """Return the likeliest place by each of some parts of the ranges, at usual errors."""
