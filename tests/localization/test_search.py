@@ -1,5 +1,7 @@
 """Branch and bound against trying every pose, and the factors of ranges against numeric derivatives."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.localization_room import ODD, cast, grid_of
@@ -117,6 +119,15 @@ def test_of_places_that_look_alike_the_one_that_the_ranges_fit_comes_first():
     ranges = ranges_at(poses[17], np.array([[0.0, 3.0], [6.0, 3.0]]), (0.0, 0.0))
     found = finished(search._likeliest(poses, np.linspace(0.9, 0.85, 25), ranges, complete=True))
     np.testing.assert_allclose(found.poses[0], poses[17], atol=0.26)
+
+
+def test_where_ranges_leave_too_many_places_no_place_is_tried():
+    """One range of a hundred metres, wide as a house, in a field of a square kilometre."""
+    one = ranges_at((0.0, 0.0, 0.0), np.array([[100.0, 0.0]]), (0.0, 0.0))
+    bounds = (np.array([-500.0, -500.0]), np.array([500.0, 500.0]))
+    wide = dataclasses.replace(one, sigma=np.array([80.0]))
+    found = finished(search._by_ranges(wide, bounds))
+    assert (len(found.poses), found.complete) == (0, False)
 
 
 def test_a_cell_holds_the_likelihood_of_its_distance_to_the_nearest_wall(walls, room):
