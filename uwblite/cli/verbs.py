@@ -60,7 +60,6 @@ MAP_OPTIONS = (
         option("--crop X0,Y0,X1,Y1", "keep this part of the grid, m: short for --set crop=[...]", numbers(4)),
         option("--scale-map", "write the probabilities too: map_scale.png (mode: scale)"),
         option("--no-timings", "leave timings out of report.json: same run, same bytes"),
-        option("--report-timings", "show the stages' seconds in report.html too"),
     ),
     group(
         "known beforehand",
