@@ -24,6 +24,7 @@ from uwblite.arrays import (
     spread,
     spread_about_median,
     unique_rows,
+    white_noise,
 )
 from uwblite.errors import DataError, SolverError
 from uwblite.graph import distance_edges, graph, point_edges, pose_edges, range_edges
@@ -280,3 +281,9 @@ def test_the_row_of_a_table_that_is_no_measurement_is_named(value, most, words):
     table[3, 1:] = value
     with pytest.raises(DataError, match=rf"^poses\[3\] {words} \(1 such rows\)"):
         require_finite(table, "poses", most)
+
+
+def test_the_noise_of_a_smooth_series_is_what_was_added_to_it():
+    """20,000 values: the median absolute deviation of normal errors scatters by 1.2 / sqrt(n), neighbours counted twice."""
+    rng, time = np.random.default_rng(0), np.linspace(0.0, 30.0, 20_000)
+    assert white_noise(4.0 * np.sin(time) + 0.3 * rng.standard_normal(len(time))) == pytest.approx(0.3, rel=0.03)

@@ -248,7 +248,7 @@ def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed:
     rng = np.random.default_rng(seed)
     places = _free_places(planner)
     origin = se2.transform(se2.inverse(ground.T_truth_map), np.asarray(PLANS[place.world]().start)[:2])
-    roomy = places[clearance_map(ground.result.grid, ROOMY).at(places)[0] >= ROOMY**2]
+    roomy = places[clearance_map(ground.result.grid, ROOMY).bounds(places) >= ROOMY**2]
     here = roomy[np.argmin(np.hypot(*(roomy - origin).T))]
     start = np.array([*se2.transform(ground.T_truth_map, here), rng.uniform(-3.0, 3.0)])
     robot = Robot(place, seed, start)

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.planted_graphs import plain_ranges
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
@@ -18,9 +18,7 @@ from uwblite.assessment.recording import diagnose
 from uwblite.findings import Finding, doubt, folded, warning
 from uwblite.graph.graph import Graph
 from uwblite.map_result import AnchorEstimate
-from uwblite.mapping import MappingConfig, build_map
-from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.progress import Stages
+from uwblite.mapping import build_map
 from uwblite.sensor_log import LogNotes, Odometry
 
 
@@ -88,12 +86,8 @@ def planted_view(wrong):
     }  # fmt: skip
     share = float(table["agrees"].mean())
     anchors = [AnchorEstimate(n, np.zeros(2), np.eye(2), 400, share, 0.0, 0.1, 0.1, "distrusted") for n in "AB"]
-    each = [SimpleNamespace(number=0, frames=SimpleNamespace(stamps=np.arange(400.0)))]
-    recordings = type(
-        "Recordings", (), {"each": each, "__len__": lambda self: 1, "have_scans": False, "of_keyframe": np.zeros(400, int)}
-    )()
-    task = SimpleNamespace(recordings=recordings, stages=Stages(None, None), config=MappingConfig())
-    estimate = Estimate(graph, None, replace(ranges, stamps=stamps), ("A", "B"), None)
+    task = task_of(recordings_of(poses))
+    estimate = estimate_of(graph, ranges=replace(ranges, stamps=stamps), anchor_ids=("A", "B"))
     return ResultView(task, estimate, anchors, (), {}, table, None, 0.1)
 
 

@@ -78,7 +78,8 @@ def test_wheels_that_turn_otherwise_from_half_way_on_are_noisy_and_the_ranges_ho
 
 
 def test_wheels_that_turn_the_other_way_from_half_way_on_are_a_doubt(sound):
-    assert build_map(with_steps(sound, mirrored_from_half_way)).doubts
+    half = sound.crop(end=float(sound.odometry.stamps[0]) + 0.5 * float(np.ptp(sound.odometry.stamps)))
+    assert build_map(with_steps(half, mirrored_from_half_way)).doubts
 
 
 def test_a_heading_that_drifts_throughout_is_calibrated(sound):

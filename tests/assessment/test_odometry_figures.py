@@ -23,10 +23,11 @@ def test_silences_are_a_warning_by_their_share_or_their_length(silences, seconds
     (2, None, "odometry", None), (3, None, "odometry", "warning"), (3, None, "radio", "note"), (50, 0.02, "radio", None),
     (0, 0.021, "radio", "note"),
 ])  # fmt: skip
-def test_equal_stamps_are_said_from_a_fiftieth_on(equal, repeats, sensor, severity):
-    """More than 2 of 100 steps, or what the caller says to be wrong of them."""
+@pytest.mark.parametrize("step", [0.0, 1e-6])
+def test_equal_stamps_are_said_from_a_fiftieth_on(equal, repeats, sensor, severity, step):
+    """More than 2 of 100 steps, or what the caller says to be wrong of them; rows of one piece are a microsecond apart."""
     steps = np.full(100, 0.1)
-    steps[::2][:equal] = 0.0
+    steps[::2][:equal] = step
     figures = rhythm(np.concatenate([[5.0], 5.0 + np.cumsum(steps)]), expected_gap=1.0, repeated=repeats)
     assert [f.severity for f in check_equal_stamps(sensor, figures)] == ([] if severity is None else [severity])
     assert figures["share of equal stamps"] == equal / 100

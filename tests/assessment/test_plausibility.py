@@ -1,11 +1,11 @@
 """What contradicts a result: turns of the wrong sign, values far from usual, ranges out of time; and where the map begins."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.planted import aligned_error, box, odometry, ranges, recording, scans, wander
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 
 from uwblite import se2
 from uwblite.assessment.plausibility import (
@@ -18,11 +18,14 @@ from uwblite.assessment.plausibility import (
 )
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.findings import warning
+from uwblite.graph.calibration import Unknown
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.map_result import AnchorEstimate, CalibrationEstimate
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.loop_closure.closures import no_closures
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
-from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -64,10 +67,7 @@ def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
 
 def handedness(graph, lidar):
     """Return the doubts about the handedness of a graph."""
-    stages = Stages(None, None)
-    task = SimpleNamespace(config=MappingConfig(), recordings=SimpleNamespace(have_scans=lidar), stages=stages)
-    stages.findings.extend(check_handedness(SimpleNamespace(graph=graph), task))
-    return stages.doubts
+    return [found for found in check_handedness(estimate_of(graph), task_of(lidar=lidar)) if found.severity == "doubt"]
 
 
 @pytest.mark.parametrize(("error", "kind"), [
@@ -123,12 +123,10 @@ def told_of_moves(places, lidar=False, recordings=1, moment=100.0):
             measured = np.arange(moment * number, 200.0 if number == len(own) - 1 else moment, 5.0)
             stamps.append(measured)
             anchor.append(np.full(len(measured), len(anchors) - 1))
-    stages = Stages(None, None)
     table = {"stamp": np.concatenate(stamps), "anchor": np.concatenate(anchor).astype(np.float64)}
-    recorded = SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0]), each=[None] * recordings)
-    task = SimpleNamespace(recordings=recorded, stages=stages)
-    stages.findings.extend(check_moved_together(anchors, table, task))
-    return stages.doubts
+    of_each = np.repeat(np.arange(recordings), 2)
+    task = task_of(recordings_of(np.zeros((len(of_each), 3)), np.tile([0.0, 200.0], recordings), of_each, lidar=lidar))
+    return [found for found in check_moved_together(anchors, table, task) if found.severity == "doubt"]
 
 
 A, B, C, ELSEWHERE = (0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 20.0)
@@ -242,22 +240,25 @@ def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts):
 ])  # fmt: skip
 def test_a_map_without_closures_or_with_more_that_contradict_is_named(accepted, contradicted, other, grid, kind):
     outcomes = ["accepted"] * accepted + ["contradicts-closures"] * contradicted + ["too-few-matches"] * other
-    found = tuple(SimpleNamespace(outcome=o, accepted=o == "accepted") for o in outcomes)
-    stages = Stages(None, None)
-    estimate = SimpleNamespace(closures=SimpleNamespace(candidates=found))
-    stages.findings.extend(check_closures(estimate, object() if grid else None))
-    said = [f"doubt {n.kind}" for n in stages.doubts] + [f"warning {n.kind}" for n in stages.warnings]
+    found = tuple(LoopClosure(0, 1, np.zeros(3), np.eye(3), 0.02, 0.5, o, "why") for o in outcomes)
+    estimate = estimate_of(Graph(np.zeros((2, 3))), closures=replace(no_closures(), candidates=found))
+    said = [
+        f"{n.severity} {n.kind}"
+        for n in check_closures(
+            estimate, OccupancyGrid(GridGeometry(0.05, np.zeros(2), 4, 4), np.zeros((4, 4), np.float32)) if grid else None
+        )
+    ]
     assert said == ([] if kind is None else [kind])
 
 
 @pytest.mark.parametrize(("fits", "doubted"), [((), False), ((9.0, 3.99), False), ((1.0, 4.01), True)])
 def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_are_a_doubt(fits, doubted):
-    stages = Stages(None, None)
+    task = task_of()
     for fit in fits:
-        stages.end("optimisation", chi2_per_dof=fit)
-    stages.end("summary")
-    stages.findings.extend(check_fit(SimpleNamespace(stages=stages)))
-    assert [n.figures["chi2_per_dof"] for n in stages.doubts] == ([fits[-1]] if doubted else [])
+        task.stages.end("optimisation", chi2_per_dof=fit)
+    task.stages.end("summary")
+    found = [n for n in check_fit(task) if n.severity == "doubt"]
+    assert [n.figures["chi2_per_dof"] for n in found] == ([fits[-1]] if doubted else [])
 
 
 @pytest.mark.parametrize(
@@ -265,14 +266,12 @@ def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_ar
 )
 def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doubted):
     """Where it is known that the wheels lost some of their way, and by more than a radio is usually off."""
-    stages, key = Stages(None, None), UnknownKey("range_scale")
+    task, key = task_of(lidar=True), UnknownKey("range_scale")
+    stages = task.stages
     if wheels:
         stages.findings.append(warning("wheels-stand-still", "the wheels count nothing from t = 3 to 5 s"))
     value = CalibrationEstimate(key, scale, 0.004, "1", "relative error of all ranges", "estimated")
-    recordings = SimpleNamespace(have_scans=True)
-    stages.findings.extend(
-        check_calibration([value], {}, SimpleNamespace(stages=stages, config=MappingConfig(), recordings=recordings))
-    )
+    stages.findings.extend(check_calibration([value], {}, task))
     of_scale = [notice.kind == "unusual-calibration" for notice in (*stages.warnings[wheels:], *stages.doubts)]
     assert of_scale == [True]
     assert len(stages.doubts) == doubted
@@ -281,10 +280,10 @@ def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doub
 @pytest.mark.parametrize(("scale", "lidar", "doubted"), [(0.094, False, True), (0.094, True, False), (-0.09, False, False)])
 def test_a_scale_that_another_unit_explains_is_a_doubt_where_no_lidar_says_whose_it_is(scale, lidar, doubted):
     """0.0936: ranges in yards, or wheels that are 9 % larger than set."""
-    stages, key = Stages(None, None), UnknownKey("odometry_scale", recording=0)
+    task, key = task_of(lidar=lidar), UnknownKey("odometry_scale", recording=0)
+    stages = task.stages
     value = CalibrationEstimate(key, scale, 0.01, "1", "relative error of travelled distance", "estimated")
-    task = SimpleNamespace(stages=stages, config=MappingConfig(), recordings=SimpleNamespace(have_scans=lidar))
-    stages.findings.extend(check_calibration([value], {key: SimpleNamespace(sigma=0.02)}, task))
+    stages.findings.extend(check_calibration([value], {key: Unknown(key, 0.02, "1", "")}, task))
     notices = stages.doubts if doubted else stages.warnings
     assert [("yards" in n.text, n.kind) for n in notices] == [(scale > 0.09, "unusual-calibration")]
     assert len(stages.doubts) + len(stages.warnings) == 1

@@ -1,9 +1,8 @@
 """Stretches in which an anchor's ranges disagree with the map, and a unit of the wheels that rests on them."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from helpers.planted_tasks import recordings_of, standing, task_of
 
 from uwblite.assessment.range_agreement import (
     check_range_agreement,
@@ -12,7 +11,6 @@ from uwblite.assessment.range_agreement import (
 )
 from uwblite.findings import Fact, warning
 from uwblite.map_result import AnchorEstimate
-from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import OdometryBreaks, Screening
 
 
@@ -55,10 +53,11 @@ def told(agrees, statuses=(), lidar=False, left_out=0, starts=(0.0,), where=None
         AnchorEstimate(names[k], np.zeros(2), np.eye(2), seconds, float(agrees[k].mean()), 0.0, 0.1, 0.1, status)
         for k, status in enumerate(statuses or ("ok",) * count)
     ]
-    each = [SimpleNamespace(number=n, frames=SimpleNamespace(stamps=np.array([t]))) for n, t in enumerate(starts)]
-    recordings = type("Recordings", (), {"each": each, "__len__": lambda self: len(each), "have_scans": lidar})()
-    stages = SimpleNamespace(findings=[warning("shared-name", "")] * left_out)
-    return list(check_range_agreement(anchors, table, SimpleNamespace(recordings=recordings, stages=stages)))
+    begins = np.ravel([(t, t + 1.0) for t in starts])
+    of_each = np.repeat(np.arange(len(starts)), 2)
+    task = task_of(recordings_of(np.zeros((len(begins), 3)), begins, of_each, lidar=lidar))
+    task.stages.findings.extend([warning("shared-name", "")] * left_out)
+    return list(check_range_agreement(anchors, table, task))
 
 
 def wrong_from(count, anchors=4, seconds=1000, since=500):
@@ -112,14 +111,15 @@ def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretc
     table = {"stamp": stamps, "anchor": stamps % 3, "residual": residual(stamps), "recording": np.zeros(150)}
     other = {**table, "residual": np.ones(150), "recording": np.ones(150)}
     table = {name: np.concatenate([table[name], other[name]]) for name in table}
-    anchors = [SimpleNamespace(id=name, status=status) for name, status in zip(names, statuses, strict=True)]
+    anchors = [
+        AnchorEstimate(name, np.zeros(2), np.eye(2), 50, 1.0, 0.0, 0.1, 0.1, status)
+        for name, status in zip(names, statuses, strict=True)
+    ]
     found = Fact.of("wheels-against-lidar", start=0.0, stretches=stretches)
-    logs = [SimpleNamespace(screening=None), SimpleNamespace(screening=None)]
-    logs[whose - 1] = SimpleNamespace(screening=Screening((found,), OdometryBreaks.none()))
-    task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log) for log in logs]))
-    stages = Stages(None, None)
-    stages.findings.extend(check_wheels_against_lidar(table, anchors, task))
-    return stages
+    screened = {"screening": Screening((found,), OdometryBreaks.none())}
+    task = task_of(standing(2, lidar=True, each=[screened if n == whose - 1 else {} for n in range(2)]))
+    task.stages.findings.extend(check_wheels_against_lidar(table, anchors, task))
+    return task.stages
 
 
 def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():

@@ -1,7 +1,6 @@
 """Findings: a sound recording has none that matter, and each fault put into it is named."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -161,15 +160,15 @@ def test_missing_sensors_and_notes_of_the_reader(without_scans):
     assert_named(noted, "warning", "3 messages out of order")
 
 
-def test_what_a_map_finds_is_said_as_the_map_says_it(without_scans):
+def test_what_a_map_finds_is_said_as_the_map_says_it(without_scans, room_result):
     scales = doubt("scales", "the ranges are 0.80 times the distances on the map")
-    made = SimpleNamespace(findings=(scales, warning("moved-anchor", "an anchor was moved")), anchors=(), calibration=())
+    made = replace(room_result, findings=(scales, warning("moved-anchor", "an anchor was moved")))
     assert_named(without_scans, "doubt", scales.text, result=made)
     assert_named(without_scans, "warning", "an anchor was moved", result=made)
     assert_named(without_scans, "doubt", "nothing to map", refused="nothing to map")
     still = with_poses(without_scans, np.repeat(without_scans.odometry.poses[:1], len(without_scans.odometry.stamps), axis=0))
     (found,) = [f for f in diagnose(still).findings if "hardly moves" in f.text]
-    made.findings = (found,)
+    made = replace(room_result, findings=(found,))
     assert sum(f.text == found.text for f in diagnose(still, result=made).findings) == 1
 
 

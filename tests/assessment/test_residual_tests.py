@@ -1,12 +1,12 @@
 """What noise cannot explain is a doubt; a sound recording has none."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
 from helpers.planted_graphs import plain_ranges
+from helpers.planted_tasks import estimate_of, recordings_of, standing, task_of
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
@@ -23,8 +23,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.mapping import build_map
-from uwblite.pipeline.progress import Stages
-from uwblite.radio.range_noise import RangeNoiseConfig
+from uwblite.sensor_log import OdometryBreaks, Screening
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +83,9 @@ def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
     ties = ScanEdges(
         i, j, se2.between(truth[i], truth[j]), np.tile(np.diag(root), (len(i), 1, 1)), none, none, scan_indices(Calibration())
     )
-    recordings = SimpleNamespace(
-        stamps=50.0 + np.arange(80.0), path=truth[:, 0], of_keyframe=np.zeros(80, dtype=int), have_scans=lidar
-    )
-    graph = Graph(truth, edges=(ties,) if len(i) else ())
-    estimate = SimpleNamespace(odometry=wheels, graph=graph, placed=np.array([not lidar]), ranges=None)
-    return list(check_odometry(estimate, SimpleNamespace(recordings=recordings)))
+    graph = Graph(truth, np.zeros((1, 2)), edges=(ties,) if len(i) else ())
+    estimate = estimate_of(graph, odometry=wheels, placed=[not lidar])
+    return list(check_odometry(estimate, task_of(recordings_of(truth, 50.0 + np.arange(80.0), lidar=lidar))))
 
 
 LONG = dict.fromkeys(range(30, 45), (0.0, 0.0, 0.15))
@@ -140,16 +136,14 @@ def test_a_slip_is_the_longest_way_and_turn_of_all_steps_that_slipped():
 ])  # fmt: skip
 def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
     """By the first such recording; recordings that compare nothing do not count."""
-    each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=r))) for r in ratios]
-    each.append(SimpleNamespace(log=SimpleNamespace(screening=None)))
-    stages = Stages(None, None)
-    stages.findings.extend(
-        check_scales(
-            SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.zeros(0, dtype=bool)),
-            SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages),
-        )
-    )
-    assert [n.figures["lidar_by_wheels"] for n in stages.doubts] == ([] if said is None else [said])
+    task = task_of(standing(len(ratios) + 1, lidar=True, each=[screened(ratio) for ratio in ratios]))
+    found = check_scales(estimate_of(Graph(np.zeros((3, 3)))), task)
+    assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])
+
+
+def screened(ratio):
+    """Return what a recording has of a screening whose lidar measures so many times the distance of the wheels."""
+    return {"screening": Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)}
 
 
 @pytest.mark.parametrize(("poses", "edges", "alive", "doubted"), [
@@ -159,11 +153,12 @@ def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, ali
     """From three poses on, unless a range that counts, a scan or a closure says more."""
     none = np.zeros((0, 3))
     ties = RelativePoseEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)))
-    stages = Stages(None, None)
-    ranges = None if alive is None else SimpleNamespace(alive=np.array([False, alive]))
-    graph = Graph(np.zeros((poses, 3)), edges=(ties,) * len(edges))
-    stages.findings.extend(check_support(SimpleNamespace(ranges=ranges, graph=graph), SimpleNamespace(stages=stages)))
-    assert [n.kind for n in stages.doubts] == (["odometry-alone"] if doubted else [])
+    ranges, two = None, np.zeros(2, dtype=int)
+    if alive is not None:
+        ranges = replace(plain_ranges(two, two, np.ones(2), 0.1), weights=np.array([0.0, float(alive)]))
+    graph = Graph(np.zeros((poses, 3)), np.zeros((1, 2)), edges=(ties,) * len(edges))
+    found = check_support(estimate_of(graph, ranges=ranges), task_of())
+    assert [n.kind for n in found if n.severity == "doubt"] == (["odometry-alone"] if doubted else [])
 
 
 @pytest.mark.parametrize(("scale", "placed", "lidar", "said"), [
@@ -172,28 +167,19 @@ def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, ali
 ])  # fmt: skip
 def test_ranges_of_another_scale_are_named_where_anchors_are_placed(scale, placed, lidar, said):
     calibration = Calibration((UnknownKey("bias", "A"), UnknownKey("range_scale")), np.array([5.0, scale - 1.0]))
-    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3)), calibration=calibration), placed=np.array([placed]))
-    stages = Stages(None, None)
-    stages.findings.extend(
-        check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=[], have_scans=lidar), stages=stages))
-    )
-    assert [n.figures["range_scale"] for n in stages.doubts] == ([] if said is None else [scale])
-    assert all(f"the ranges are {said}" in n.text for n in stages.doubts)
-    estimate.graph = Graph(np.zeros((3, 3)), calibration=Calibration((UnknownKey("bias", "A"),), np.array([5.0])))
-    task = SimpleNamespace(recordings=SimpleNamespace(each=[], have_scans=lidar), stages=stages)
-    assert list(check_scales(estimate, task)) == []
+    graph, task = Graph(np.zeros((3, 3)), np.zeros((1, 2)), calibration=calibration), task_of(lidar=lidar)
+    doubts = [n for n in check_scales(estimate_of(graph, placed=[placed]), task) if n.severity == "doubt"]
+    assert [n.figures["range_scale"] for n in doubts] == ([] if said is None else [scale])
+    assert all(f"the ranges are {said}" in n.text for n in doubts)
+    biased = Graph(graph.poses, graph.anchors, calibration=Calibration((UnknownKey("bias", "A"),), np.array([5.0])))
+    assert list(check_scales(estimate_of(biased, placed=[placed]), task)) == []
 
 
 @pytest.mark.parametrize(("placed", "outcome"), [(True, "the ranges are 0.77 times the"), (False, "no ranges measure the")])
 def test_what_ranges_say_of_the_scale_of_wheels_and_lidar_is_said(placed, outcome):
-    each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=1.3)))]
-    stages = Stages(None, None)
     calibration = Calibration((UnknownKey("range_scale"),), np.array([1.0 / 1.3 - 1.0]))
-    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3)), calibration=calibration), placed=np.array([placed]))
-    stages.findings.extend(
-        check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages))
-    )
-    notice = stages.doubts[-1]
+    estimate = estimate_of(Graph(np.zeros((3, 3)), np.zeros((1, 2)), calibration=calibration), placed=[placed])
+    *_, notice = check_scales(estimate, task_of(standing(lidar=True, each=[screened(1.3)])))
     assert f"measures 1.30 times the distance that the wheels count, and {outcome} distances on the map" in notice.text
 
 
@@ -208,30 +194,26 @@ def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
     # The median absolute deviation of two values, one each half, is half their distance: in sigmas 1.4826 times that.
     residuals = np.where(stamps < 300.0, -1.0, 1.0) * off / 1.4826 * np.array([1.0, 0.2, 5.0])[anchor]
     values = 10.0 + residuals + steps * rng.standard_normal(600)
-    ranges = replace(plain_ranges(np.arange(600), anchor, values, 0.1), weights=np.where(stamps == 7.0, 0.0, 1.0))
-    object.__setattr__(ranges, "stamps", stamps)
-    stages = Stages(None, None)
-    stages.findings.extend(
-        check_range_scatter(SimpleNamespace(ranges=ranges), residuals, None, scatter_task(stages, np.zeros(600, dtype=int)))
-    )
-    assert len(stages.doubts) == (said is not None)
-    assert all(said in n.text for n in stages.doubts)
+    ranges = plain_ranges(np.arange(600), anchor, values, 0.1)
+    doubts = scattered(replace(ranges, weights=np.where(stamps == 7.0, 0.0, 1.0), stamps=stamps), residuals)
+    assert len(doubts) == (said is not None)
+    assert all(said in n.text for n in doubts)
 
 
-def scatter_task(stages, of_keyframe):
-    recordings, config = SimpleNamespace(of_keyframe=of_keyframe), SimpleNamespace(ranges=RangeNoiseConfig())
-    return SimpleNamespace(config=config, stages=stages, recordings=recordings)
+def scattered(ranges, residuals, poses=None, recording=None, grid=None):
+    """Return the doubts about the scatter of ranges from poses (k, 3) of recordings (k,) on a map."""
+    poses = np.zeros((len(ranges.pose), 3)) if poses is None else poses
+    estimate = estimate_of(Graph(poses, np.zeros((3, 2))), ranges=ranges)
+    task = task_of(recordings_of(poses, None, recording))
+    return [found for found in check_range_scatter(estimate, residuals, grid, task) if found.severity == "doubt"]
 
 
 def test_ranges_of_two_recordings_whose_clocks_show_the_same_do_not_scatter_from_one_to_the_next():
     """Each sees one anchor from its own place, 10 and 20 m away; the residuals are of one half a metre off."""
-    stamps, recording = np.repeat(np.arange(300.0), 2), np.arange(600) % 2
+    stamps, recording = np.tile(np.arange(300.0), 2), np.repeat([0, 1], 300)
     off = np.where(stamps < 150.0, -0.5, 0.5)
     ranges = plain_ranges(np.arange(600), np.zeros(600, dtype=int), 10.0 + 10.0 * recording + off, 0.1)
-    object.__setattr__(ranges, "stamps", stamps)
-    stages = Stages(None, None)
-    stages.findings.extend(check_range_scatter(SimpleNamespace(ranges=ranges), off, None, scatter_task(stages, recording)))
-    (doubt,) = stages.doubts
+    (doubt,) = scattered(replace(ranges, stamps=stamps), off, recording=recording)
     assert doubt.figures["short_term"] < 0.1
 
 
@@ -247,16 +229,11 @@ def test_ranges_through_walls_may_be_late_where_the_map_shows_the_walls(walled, 
     rng = np.random.default_rng(0)
     wrong = np.where(np.arange(600) % 2, free, -free)
     residuals = np.where(behind, late * np.linspace(-1.0, 3.0, 600), wrong) + 0.05 * rng.standard_normal(600)
-    ranges = plain_ranges(np.arange(600), np.zeros(600, dtype=int), away + residuals, 0.1)
-    object.__setattr__(ranges, "stamps", np.arange(600.0))
+    ranges = replace(plain_ranges(np.arange(600), np.zeros(600, dtype=int), away + residuals, 0.1), stamps=np.arange(600.0))
     geometry = GridGeometry(0.05, np.array([0.0, -5.0]), 200, 200)
     log_odds = np.zeros((200, 200), dtype=np.float32)
     log_odds[:, 120] = 5.0 * walled
-    stages = Stages(None, None)
-    task = scatter_task(stages, np.zeros(600, dtype=int))
-    estimate = SimpleNamespace(ranges=ranges, graph=Graph(poses, np.zeros((1, 2))))
-    stages.findings.extend(check_range_scatter(estimate, residuals, OccupancyGrid(geometry, log_odds), task))
-    assert len(stages.doubts) == said
+    assert len(scattered(ranges, residuals, poses, grid=OccupancyGrid(geometry, log_odds))) == said
 
 
 @pytest.mark.parametrize(("off", "few", "found"), [

@@ -1,12 +1,12 @@
 """The result in the user's words: anchors with status and reason, calibration with state, warnings and doubts."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.planted import odometry, ranges, recording, wander
 from helpers.planted_graphs import plain_ranges
+from helpers.planted_tasks import recordings_of, standing
 
 from uwblite import se2
 from uwblite.assessment.summary import (
@@ -22,14 +22,14 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.findings import doubt
 from uwblite.graph.calibration import CalibrationConfig, Unknown
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
-from uwblite.graph.marginals import marginals
+from uwblite.graph.marginals import Covariances, marginals
 from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import preset
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.trilateration import AnchorHypothesis
-from uwblite.sensor_log import SensorMounting
+from uwblite.sensor_log import SensorMounting, UwbRanges
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 BIAS = np.array([0.4, -0.1, 0.2, 0.0])
@@ -224,9 +224,15 @@ def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, scatte
 def anchor_of(found=None, ranges=None, recordings=None, k=1, limit=0.2):
     """Judge anchor B of two whose places and residuals are given; its first two ranges of three are within the limit."""
     graph = Graph(np.zeros((3, 3)), np.array([[9.0, 9.0], [3.0, 4.0]]), (), Calibration(BIASES, np.array([0.7, 0.2, 0.3])))
-    covariance = SimpleNamespace(anchors=np.array([np.eye(2), np.diag([0.04, 0.09])]), calibration=np.array([0.5, 0.6, 0.7]))
+    covariance = covariances([np.eye(2), np.diag([0.04, 0.09])], [0.5, 0.6, 0.7])
     estimate = Estimate(graph, None, ranges, ("A", "B"), found)
     return _anchor(k, estimate, recordings, covariance, np.array([5.0, 0.1, -0.19, 0.21]), limit)
+
+
+def covariances(anchors, calibration):
+    """Return covariances of anchors (a, 2, 2) and standard deviations of calibration values (c,)."""
+    none = np.zeros(0, dtype=np.intp)
+    return Covariances(np.zeros((0, 3, 3)), np.array(anchors), np.array(calibration), none, np.zeros((0, 3, 0, 3)))
 
 
 BIASES = (UnknownKey("bias", "A"), UnknownKey("bias", "B"), UnknownKey("bias", "B", 1))
@@ -266,7 +272,7 @@ def test_readings_that_are_left_out_are_not_too_short(left_out, status):
     ranges = plain_ranges(np.zeros(40, int), np.zeros(40, int), np.where(short, 0.0, 5.0), 0.1)
     ranges = replace(ranges, calibration=np.full((40, 6), -1), weights=np.where(short & left_out, 0.0, 1.0))
     graph = Graph(np.zeros((1, 3)), np.array([[3.0, 4.0]]))
-    covariance = SimpleNamespace(anchors=0.04 * np.eye(2)[None], calibration=np.zeros(0))
+    covariance = covariances([0.04 * np.eye(2)], [])
     no = np.zeros(1, dtype=bool)
     estimate = Estimate(graph, None, ranges, ("A",), BootstrapResult(None, ~no, ((),), no))
     assert _anchor(0, estimate, None, covariance, np.where(short, -5.0, 0.0), 0.2).status == status
@@ -293,21 +299,17 @@ def test_an_anchor_without_a_place_says_how_many_ranges_it_has():
             [*anchor.position, *anchor.covariance.ravel(), anchor.bias, anchor.bias_sigma, anchor.residual_rms]
         ).all()
     # Where no range could be used at all, the recordings say how many there are.
-    each = [
-        SimpleNamespace(anchor_ids=("B", "A"), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([0, 0, 1])))),
-        SimpleNamespace(anchor_ids=("A",), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([0])))),
-        SimpleNamespace(anchor_ids=("A", "B"), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([1, 1, 1, 0])))),
-        SimpleNamespace(anchor_ids=("B",), log=SimpleNamespace(ranges=None)),
-    ]
-    assert anchor_of(recordings=SimpleNamespace(each=each)).ranges == 5
+    heard = [(("B", "A"), [0, 0, 1]), (("A",), [0]), (("A", "B"), [1, 1, 1, 0])]
+    of = [UwbRanges(np.zeros(len(k)), np.array(k), np.ones(len(k)), np.zeros(len(k)), ids) for ids, k in heard]
+    assert anchor_of(recordings=standing(4, each=[{"ranges": each} for each in of])).ranges == 5
 
 
 def named(*ids):
     return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
 
 
-ONE = SimpleNamespace(of_keyframe=np.zeros(1, dtype=np.intp))
-"""The only recording, of one keyframe."""
+ONE = standing()
+"""The only recording."""
 
 
 def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
@@ -327,7 +329,7 @@ def test_the_clock_of_a_move_is_that_of_the_recording_that_shows_it():
     """The first recording has B where it was, the second sees the move at 900 s, the third begins behind it, at 0 s."""
     recording, anchor = np.array([0, 1, 1, 2, 2]), np.array([0, 0, 1, 1, 1])
     ranges = replace(plain_ranges(recording, anchor, np.ones(5), 0.1), stamps=np.array([50.0, 800.0, 900.0, 0.0, 5.0]))
-    three = SimpleNamespace(of_keyframe=np.arange(3))
+    three = recordings_of(np.zeros((3, 3)), None, np.arange(3))
     one, other = named("B", "B@2")
     moved = _with_times((one, replace(other, position=np.array([40.0, 0.0]))), ranges, three)
     assert [a.since for a in moved] == [800.0, 900.0]
@@ -357,9 +359,7 @@ def test_a_value_is_estimated_where_the_recording_shows_it_better_than_the_prior
         calibration=Calibration(BIASES, np.array([9.0, value, 9.0])),
         fixed_calibration=np.array([False, fixed, False]),
     )
-    found = _calibration(
-        1, Unknown(BIASES[1], 1.0, "m", "what"), graph, SimpleNamespace(calibration=np.array([9.0, sigma, 9.0])), by_steps
-    )
+    found = _calibration(1, Unknown(BIASES[1], 1.0, "m", "what"), graph, covariances([], [9.0, sigma, 9.0]), by_steps)
     assert (found.key, found.value, found.unit, found.meaning) == (BIASES[1], value, "m", "what")
     assert (found.state, found.sigma) == (state, shown)
     assert reason in found.reason
@@ -372,7 +372,7 @@ def test_the_table_of_ranges_says_where_each_was_taken():
     ranges = replace(
         plain_ranges(np.array([3, 0, 2]), np.array([1, 0, 1]), np.array([4.0, 5.0, 6.0]), 0.1), turn=np.array([0.0, 3.0, 0.5])
     )
-    recordings = SimpleNamespace(of_keyframe=np.array([0, 0, 1, 2]))
+    recordings = recordings_of(poses, None, np.array([0, 0, 1, 2]))
     table = _range_table(ranges, Graph(poses), np.arange(3.0), np.ones(3), np.array([True, False, True]), recordings)
     np.testing.assert_allclose(np.column_stack([table["x"], table["y"]]), ranges.tag_positions(poses))
     np.testing.assert_allclose(se2.wrap_angle(table["theta"] - poses[[3, 0, 2], 2] - ranges.turn), 0.0, atol=1e-12)

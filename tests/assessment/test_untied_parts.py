@@ -1,10 +1,11 @@
 """Parts of a map that only the odometry ties, or holds, are a doubt; a gap that scans, closures or anchors bridge is none."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import plain_ranges
+from helpers.planted_graphs import plain_ranges, relative_edges
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 
 from uwblite.assessment.untied_parts import (
     _PER_METRE,
@@ -17,8 +18,8 @@ from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.range_edges import RangeEdges
-from uwblite.pipeline.progress import Stages
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog
+from uwblite.loop_closure.closures import no_closures
+from uwblite.sensor_log import LaserScans
 
 STAMPS = np.arange(100.0)
 POSES = np.column_stack([0.3 * STAMPS, np.zeros(100), np.zeros(100)])
@@ -45,18 +46,9 @@ def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
     """Return the figures of the doubts of a drive of 100 keyframes."""
     readings = None if scans_at is None else np.ones((len(scans_at), 3), np.float32)
     scans = None if scans_at is None else LaserScans(scans_at, readings, -1.0, 1.0, 0.0, 0.0, 5.0)
-    log = SensorLog(Odometry(STAMPS, poses), None, scans)
-    lengths = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    frames = SimpleNamespace(stamps=STAMPS, path=lengths, duration=np.diff(STAMPS))
-    recording = SimpleNamespace(
-        log=log, frames=frames, number=0, rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
-        has_scans=scans is not None,
-    )  # fmt: skip
-    stages = Stages(None, None)
-    graph = Graph(poses, np.zeros((4, 2)), edges=edges)
-    task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), stages=stages)
-    stages.findings.extend(check_untied_parts(SimpleNamespace(graph=graph, ranges=ranges), task))
-    return [n.figures for n in stages.doubts]
+    task = task_of(recordings_of(poses, STAMPS, each=[{"scans": scans}]))
+    estimate = estimate_of(Graph(poses, np.zeros((4, 2)), edges=edges), ranges=ranges)
+    return [n.figures for n in check_untied_parts(estimate, task) if n.severity == "doubt"]
 
 
 def untied(*args, **settings):
@@ -174,16 +166,15 @@ def doubted(heard, closures=(), few=()):
     one = [(n, name) for n, names in enumerate(heard) for name in names]
     pose, anchor = np.array([(n, ids.index(name)) for n, name in one for _ in range(2 if (n, name) in few else 3)]).T
     i, j = np.array(closures, dtype=np.intp).reshape(-1, 2).T
-    estimate = SimpleNamespace(
-        ranges=plain_ranges(pose, anchor, np.ones(len(pose)), 0.1), anchor_ids=ids, placed=np.ones(len(ids), dtype=bool),
-        closures=SimpleNamespace(edges=SimpleNamespace(i=i, j=j)),
+    poses = np.zeros((len(heard), 3))
+    estimate = estimate_of(
+        Graph(poses, np.zeros((len(ids), 2))), ranges=plain_ranges(pose, anchor, np.ones(len(pose)), 0.1), anchor_ids=ids,
+        closures=replace(no_closures(), edges=relative_edges(poses, i, j, [0.1, 0.1, 0.1])),
     )  # fmt: skip
-    each = [SimpleNamespace(number=n, name=f"recording {n + 1}") for n in range(len(heard))]
-    stages = Stages(None, None)
-    recordings = SimpleNamespace(each=each, of_keyframe=np.arange(len(heard)))
-    stages.findings.extend(check_untied_recordings(estimate, SimpleNamespace(recordings=recordings, stages=stages)))
-    assert all(notice.kind == "untied-parts" for notice in stages.doubts)
-    return {notice.figures["recording"]: notice.figures["moved"] for notice in stages.doubts}
+    task = task_of(recordings_of(poses, None, np.arange(len(heard))))
+    found = [finding for finding in check_untied_recordings(estimate, task) if finding.severity == "doubt"]
+    assert all(finding.kind == "untied-parts" for finding in found)
+    return {finding.figures["recording"]: finding.figures["moved"] for finding in found}
 
 
 @pytest.mark.parametrize(("heard", "doubts"), [

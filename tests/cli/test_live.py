@@ -20,8 +20,8 @@ from uwblite.cli import main
 from uwblite.cli.live import line_of
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
+from uwblite.localization import LocalizerState
 from uwblite.localization.live_feed import LiveFeed
-from uwblite.localization.records import LocalizerState
 
 
 @pytest.fixture(scope="module")

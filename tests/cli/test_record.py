@@ -203,9 +203,7 @@ def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
 
 
 def test_with_a_usb_device_nothing_is_said_to_be_missing(monkeypatch, capfd):
-    monkeypatch.setattr(
-        "uwblite.cli.devices.plugged_in", lambda: [PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")]
-    )
+    monkeypatch.setattr("uwblite.cli.devices.plugged_in", lambda: [PluggedIn("/dev/ttyUSB7", "a bridge", "1234:5678")])
     assert main(["devices", "--list"]) == 0
     assert "no USB device" not in capfd.readouterr().err
 

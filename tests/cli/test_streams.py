@@ -41,9 +41,7 @@ def folder(tmp_path_factory, room_log):
     return folder
 
 
-@pytest.mark.parametrize(
-    "words", ["--help", "--version", "map --help", "check small.log --json"]
-)
+@pytest.mark.parametrize("words", ["--help", "--version", "map --help", "check small.log --json"])
 def test_a_full_stdout_is_one_line(folder, words):
     code, _, output = shell(f"$UWBLITE {words} >/dev/full", folder)
     assert (code, output.count(b"\n")) == (1, 1)

@@ -164,3 +164,14 @@ def test_a_clock_is_accepted_through_a_stall_of_the_host():
         time = 0.02 * k
         clock.read(time, 50 + (time if not 7 < time < 12 else 12))
     assert clock.rate is None
+
+
+def test_a_stamp_is_known_to_the_tie_half_a_count_and_twice_what_the_quickest_frames_scatter_by():
+    rng, clock, alone, tick = random.Random(3), DeviceClock(1e-3), ClockMap(), 1e-3
+    for k in range(400):
+        arrival = 100.0 + 0.1 * k + rng.expovariate(50.0)
+        reading = clock.read(100 * k, arrival)
+        alone.add(0.1 * k, arrival)
+    assert alone.excess > 5e-4
+    assert reading.spread == pytest.approx(clock.tied + 0.5 * tick + 2.0 * alone.excess)
+    assert abs(reading.stamp - 100.0 - 0.1 * 399) < reading.spread

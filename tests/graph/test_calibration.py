@@ -43,13 +43,22 @@ def test_height_is_unknown_only_where_none_is_given():
 @pytest.mark.parametrize(
     ("field", "names"),
     [
-        ("odometry_scale", {"odometry_scale"}), ("heading_scale", {"heading_scale"}), ("heading_rate", {"heading_rate"}),
-        ("heading_per_metre", {"heading_per_metre"}), ("laser_offset", {"laser_x", "laser_y"}),
-        ("laser_angle", {"laser_theta"}), ("laser_delay", {"laser_delay"}), ("range_scale", {"range_scale"}),
-        ("tag_offset", {"tag_x", "tag_y"}), ("range_delay", {"range_delay"}), ("sideways_scale", {"sideways_scale"}),
-        ("sideways_per_turn", {"sideways_per_turn"}), ("sideways_per_metre", {"sideways_per_metre"}),
+        ("odometry_scale", {"odometry_scale"}),
+        ("heading_scale", {"heading_scale"}),
+        ("heading_rate", {"heading_rate"}),
+        ("heading_per_metre", {"heading_per_metre"}),
+        ("laser_offset", {"laser_x", "laser_y"}),
+        ("laser_angle", {"laser_theta"}),
+        ("laser_delay", {"laser_delay"}),
+        ("range_scale", {"range_scale"}),
+        ("tag_offset", {"tag_x", "tag_y"}),
+        ("range_delay", {"range_delay"}),
+        ("sideways_scale", {"sideways_scale"}),
+        ("sideways_per_turn", {"sideways_per_turn"}),
+        ("sideways_per_metre", {"sideways_per_metre"}),
         ("ahead_per_sideways", {"ahead_per_sideways"}),
-        ("range_bias", {f"bias:{a}" for a in IDS}), ("anchor_height", {"height2:1E05", "height2:91A3"}),
+        ("range_bias", {f"bias:{a}" for a in IDS}),
+        ("anchor_height", {"height2:1E05", "height2:91A3"}),
     ],
 )
 def test_a_prior_of_zero_switches_its_unknowns_off_and_no_others(field, names):

@@ -9,6 +9,7 @@ from uwblite.graph.elimination import (
     adjacency,
     alike_columns,
     column_sizes,
+    contiguous,
     elimination_tree,
     is_full,
     minimum_degree,
@@ -16,7 +17,6 @@ from uwblite.graph.elimination import (
     order_of_columns,
     pairs_of,
     postorder,
-    with_subtrees_contiguous,
     work,
     work_of,
 )
@@ -46,11 +46,14 @@ def test_tree_and_sizes_are_those_of_the_filled_pattern(seed):
     order = rng.permutation(n) if seed % 2 else minimum_degree(pairs, n)
     parent, sizes = by_brute_force(pairs, order, width)
     np.testing.assert_array_equal(elimination_tree(pairs, order), parent)
-    np.testing.assert_array_equal(column_sizes(pairs, order, width, elimination_tree(pairs, order)), sizes)
+    order, tree = contiguous(pairs, order)
+    parent, sizes = by_brute_force(pairs, order, width)
+    np.testing.assert_array_equal(tree, parent)
+    np.testing.assert_array_equal(column_sizes(pairs, order, width, parent), sizes)
     above = np.append(sizes, 0)[parent]
     continued = [top == size - width[k] for k, top, size in zip(order, above, sizes, strict=True)]
     each = [width[k] * size**2 * (1 if more else _ALONE) for k, size, more in zip(order, sizes, continued, strict=True)]
-    assert work(pairs, order, width) == sum(each)
+    assert work(pairs, order, width, parent) == sum(each)
 
 
 def test_a_tree_is_walked_in_postorder():
@@ -76,9 +79,9 @@ def test_a_ring_of_hundreds_ties_its_ends():
     pairs = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     lower = superlu(adjacency(pairs, n), "NATURAL").L
     assert lower[n - 1, n // 2] == 0.0
-    sizes = column_sizes(pairs, np.arange(n), np.ones(n, dtype=int), elimination_tree(pairs, np.arange(n)))
+    sizes = column_sizes(pairs, np.arange(n), np.ones(n, dtype=int), contiguous(pairs, np.arange(n))[1])
     np.testing.assert_array_equal(sizes[:-2], np.full(n - 2, 3))
-    order = with_subtrees_contiguous(pairs, n)
+    order = contiguous(pairs, minimum_degree(pairs, n))[0]
     assert sorted(order) == list(range(n))
 
 
@@ -149,5 +152,5 @@ def test_columns_of_one_pattern_are_eliminated_together(seed):
 def filled_by_columns(matrix):
     """Return the entries of a factor by minimum degree of single columns."""
     pairs, n = pairs_of(matrix), matrix.shape[0]
-    order = minimum_degree(pairs, n)
-    return column_sizes(pairs, order, np.ones(n, dtype=int), elimination_tree(pairs, order)).sum()
+    order, parent = contiguous(pairs, minimum_degree(pairs, n))
+    return column_sizes(pairs, order, np.ones(n, dtype=int), parent).sum()

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_system, loop, relative_edges
+from scipy import sparse
 
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
 from uwblite.graph.joint_covariance import JointCovariance
-from uwblite.graph.marginals import CommonErrors, about_best_fit, added_unknown, marginals, shape_error
+from uwblite.graph.marginals import _VARIANCES, about_best_fit, added_unknown, marginals, shape_error
 from uwblite.graph.solver import optimize
-from uwblite.graph.variance_components import variances_of_kinds
 
 
 @pytest.mark.parametrize("n", [8, 60, 300])
@@ -113,30 +113,32 @@ def dense_jacobian(graph):
 
 
 @pytest.mark.parametrize(("table", "count"), [(0, 40), (1, 8)], ids=["odometry", "robust closures"])
-def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(monkeypatch, table, count):
-    """Against the dense normal equations with the errors among the unknowns. The last edge has none."""
-    monkeypatch.setattr("uwblite.graph.marginals._MET_AT_ONCE", 11)
+def test_common_errors_are_unknowns_of_the_size_that_the_residuals_show(table, count):
+    """Against the dense normal equations with the errors among the unknowns, and their evidence. The last edge has none."""
     graph, _ = calibrated_loop(n=40)
     graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
     edges, rng = graph.edges[table], np.random.default_rng(0)
     edge, error = np.repeat(np.arange(len(edges) - 1), 2), rng.permutation(2 * len(edges) - 2) % count
     assert len(np.unique(error)) == count
-    common = CommonErrors(edges, edge, error, rng.normal(size=(len(edge), 3)), np.arange(count) % 2)
+    shift = rng.normal(size=(len(edge), 3))
     jacobian, residuals, parts = dense_jacobian(graph)
     shifts = np.zeros((len(edges), 3, count))
-    np.add.at(shifts, (edge, slice(None), error), common.shift)
+    np.add.at(shifts, (edge, slice(None), error), shift)
+    common = sparse.csr_matrix(shifts.reshape(-1, count))
     shifts *= np.sqrt(edge_weights(edges, graph))[:, None, None]
     whole = np.zeros((len(residuals), count))
     whole[parts[table]] = shifts.reshape(-1, count)
-    moves = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ whole)
-    seen = whole.T @ residuals - moves.T @ (jacobian.T @ residuals)
-    scales = variances_of_kinds(seen, whole.T @ whole - whole.T @ jacobian @ moves, common.kind)
-
     both, size = np.hstack([jacobian, whole]), jacobian.shape[1]
-    information = both.T @ both
-    information[np.arange(size, size + count), np.arange(size, size + count)] += 1.0 / scales[common.kind]
-    expected = -np.linalg.solve(information, both.T @ residuals)[size:]
-    found = marginals(graph).estimated(common)
+    worth, values = [], []
+    for variance in _VARIANCES.ravel():
+        information, slope = both.T @ both, both.T @ residuals
+        information[np.arange(size, size + count), np.arange(size, size + count)] += 1.0 / variance
+        step = -np.linalg.solve(information, slope)
+        worth.append(-0.5 * (slope @ step + np.linalg.slogdet(information)[1] + count * np.log(variance)))
+        values.append(step[size:])
+    likely = np.exp(np.array(worth) - max(worth))
+    expected = likely @ np.array(values) / likely.sum()
+    found = marginals(graph).estimated(edges, common)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-7)
     assert np.abs(found).max() > 1e-3
 

@@ -7,13 +7,22 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights, linearize
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights, linearize, linearized_cost
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import ALL_WORK_DONE, SolverConfig, _step, as_much_again, extrapolated, optimize, relaxed
-from uwblite.graph.unknowns import cheaper_move, moved, moved_along
+from uwblite.graph.solver import (
+    ALL_WORK_DONE,
+    SolverConfig,
+    _step,
+    as_much_again,
+    cheaper_move,
+    extrapolated,
+    optimize,
+    relaxed,
+)
+from uwblite.graph.unknowns import moved, moved_along
 
 CAREFUL = SolverConfig(relative_decrease=1e-14)
 
@@ -373,8 +382,14 @@ def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
         truth[k + 1], start[k + 1] = se2.compose(truth[k], step[k]), se2.compose(start[k], noisy[k])
     i = np.arange(n - 1)
     wheels = OdometryEdges(
-        i, i + 1, noisy, np.full(n - 1, 0.3), np.full(n - 1, 0.5), np.tile(np.diag([100.0, 200.0, 100.0]), (n - 1, 1, 1)),
-        np.tile([-1, -1, 0, -1, -1, -1, -1, -1], (n - 1, 1)), Kernel("cauchy", 5.0),
+        i,
+        i + 1,
+        noisy,
+        np.full(n - 1, 0.3),
+        np.full(n - 1, 0.5),
+        np.tile(np.diag([100.0, 200.0, 100.0]), (n - 1, 1, 1)),
+        np.tile([-1, -1, 0, -1, -1, -1, -1, -1], (n - 1, 1)),
+        Kernel("cauchy", 5.0),
     )
     seen = i[i % 97 != 0]
     matched = step[seen] + rng.normal(scale=0.002, size=(len(seen), 3))
@@ -566,7 +581,11 @@ def test_a_step_takes_whichever_way_costs_less(way):
     ends = {moved: moved(graph, unknowns, step), moved_along: moved_along(graph, unknowns, step, linked)}
     aimed = graph.with_edges(PriorEdges("poses", np.arange(4), ends[way].poses, everywhere))
     assert not np.allclose(ends[moved].poses, ends[moved_along].poses)
-    assert np.allclose(cheaper_move(aimed, unknowns, step, linked).poses, ends[way].poses)
+    trial, linearized, chi2 = cheaper_move(aimed, unknowns, step, linked, enough=0.0)
+    assert np.allclose(trial.poses, ends[way].poses)
+    assert chi2 == linearized_cost(trial, linearized) == pytest.approx(0.0)
+    # What the first way reaches is enough: the other is not looked at.
+    assert np.allclose(cheaper_move(aimed, unknowns, step, linked, np.inf)[0].poses, ends[moved].poses)
 
 
 @pytest.mark.parametrize(
@@ -628,3 +647,24 @@ def test_the_work_allowed_is_counted(poses, closures):
     np.testing.assert_array_equal(again.poses, found.poses)
     assert same.work == summary.work
     assert optimize(graph, SolverConfig(max_iterations=5), allowed=1.0)[1].iterations == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_slope_alone_is_that_of_the_whole_and_leaves_the_rest(seed):
+    """At another estimate: H is that of the one before, g is the new one's."""
+    graph = mixed(seed)
+    normal, further = filled(graph), replace(graph, poses=graph.poses + 0.01)
+    before, linearized = normal.values.copy(), linearize(further)
+    weights = [edge_weights(e, further) for e in further.edges]
+    normal.fill(linearized, weights, again=False)
+    np.testing.assert_array_equal(normal.values, before)
+    np.testing.assert_array_equal(normal.gradient, filled(further).gradient)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_last_step_of_a_search_is_as_near_as_was_asked(seed):
+    """It is taken unseen where the factor of the step before predicts a negligible decrease."""
+    solved, summary = optimize(mixed(seed), SolverConfig(relative_decrease=1e-3))
+    assert summary.chi2 == pytest.approx(solved.chi2(), rel=1e-3)
+    best = optimize(solved, SolverConfig(relative_decrease=1e-12))[1].chi2
+    assert solved.chi2() == pytest.approx(best, rel=1e-3)

@@ -91,7 +91,16 @@ def cast(poses, bearings, walls) -> np.ndarray:
 
 
 def scans(
-    stamps, truth, walls, rate=5.0, beams=180, fov=2 * np.pi, sweep=0.1, range_max=20.0, noise=0.0, rng=None,
+    stamps,
+    truth,
+    walls,
+    rate=5.0,
+    beams=180,
+    fov=2 * np.pi,
+    sweep=0.1,
+    range_max=20.0,
+    noise=0.0,
+    rng=None,
     mounting=NOMINAL,
 ) -> LaserScans:
     """Return scans of walls, every ray cast from where the laser is at the ray's own time."""

@@ -59,8 +59,16 @@ def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: 
     pose, anchor = np.repeat(np.arange(k), 2), np.tile([0, 1], k)
     distance = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
     edges = RangeEdges(
-        pose, anchor, distance, np.full(2 * k, 0.1), np.zeros((2 * k, 2)), np.zeros(2 * k), np.zeros((2 * k, 2)),
-        np.zeros(2), np.zeros(2 * k), np.full((2 * k, 6), -1),
+        pose,
+        anchor,
+        distance,
+        np.full(2 * k, 0.1),
+        np.zeros((2 * k, 2)),
+        np.zeros(2 * k),
+        np.zeros((2 * k, 2)),
+        np.zeros(2),
+        np.zeros(2 * k),
+        np.full((2 * k, 6), -1),
     )
     i = np.arange(k - 1)
     motion = np.array([[0.5, 0.0, 0.1]] * (k - 1))

@@ -1,6 +1,5 @@
 """Logs whose stamps are false, stand still or were never set: the order of the lines tells what they do not."""
 
-
 import numpy as np
 import pytest
 

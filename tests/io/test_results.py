@@ -25,6 +25,7 @@ SMALL_PICTURE = np.zeros((2, 3, 3), dtype=np.uint8)
 
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
 
+
 @pytest.fixture
 def small_picture(monkeypatch):
     """A picture of six pixels in every result: for tests of how files are exchanged, whatever is in them."""

@@ -270,6 +270,7 @@ def test_a_database_that_is_no_bag(tmp_path):
 
 def test_scans_of_another_number_of_beams_are_resampled():
     """A spinning lidar in a round room; scans that look elsewhere are of another one."""
+
     def message(stamp, beams, first=-np.pi):
         time = SimpleNamespace(sec=stamp, nanosec=0)
         return SimpleNamespace(

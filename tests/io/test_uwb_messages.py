@@ -77,8 +77,6 @@ def nodeframe(package, header=""):
     }
 
 
-
-
 def documented(topic):
     """Return the mapping of docs/formats.md that fits this topic, as a user would paste it."""
     blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / "formats.md").read_text(), re.M | re.S)

@@ -1,6 +1,5 @@
 """Planted poses found from metres away, scores against brute force, ambiguity named."""
 
-
 import numpy as np
 import pytest
 from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points

@@ -15,9 +15,7 @@ from uwblite.lidar.point_cloud import (
     voxel_filter,
 )
 
-clouds = hnp.arrays(
-    np.float64, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5.0, 5.0, allow_subnormal=False)
-)
+clouds = hnp.arrays(np.float64, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5.0, 5.0, allow_subnormal=False))
 
 
 def _distances(points):

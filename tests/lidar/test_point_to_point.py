@@ -75,9 +75,9 @@ def test_information_is_half_the_curvature_of_the_squared_distances():
 
     variance, step = squares(np.zeros(3)) / (2 * 40 - 3), 1e-3
     basis = step * np.eye(3)
-    curvature = np.array([
-        [(squares(a + b) - squares(a - b) - squares(b - a) + squares(-a - b)) / (4.0 * step**2) for a in basis] for b in basis
-    ])
+    curvature = np.array(
+        [[(squares(a + b) - squares(a - b) - squares(b - a) + squares(-a - b)) / (4.0 * step**2) for a in basis] for b in basis]
+    )
     # Off the minimum by the tolerance of the last step, and third derivatives times the step: a thousandth.
     scale = np.sqrt(np.outer(np.diag(found.information), np.diag(found.information)))
     np.testing.assert_allclose(0.5 * curvature / variance / scale, found.information / scale, atol=3e-3)

@@ -162,9 +162,7 @@ def test_points_match_by_chance_in_clutter_and_hardly_in_a_room(room):
     shelves = [[x, y, x + 0.15, y] for x in np.arange(-2.8, 2.8, 0.4) for y in np.arange(-2.6, 2.6, 0.4)]
     full = scanned(truth, np.array(shelves), 0.005, 4)
     one, step = np.array([0]), se2.between(truth[:1], truth[1:])
-    shares = [
-        matched_by_chance(c, rasterize(c, 0.1, 0.5), one, pair_points(c, one + 1, 150), step)[0] for c in (clouds, full)
-    ]
+    shares = [matched_by_chance(c, rasterize(c, 0.1, 0.5), one, pair_points(c, one + 1, 150), step)[0] for c in (clouds, full)]
     assert shares[0] < 0.2
     assert shares[1] > shares[0] + 0.1
 

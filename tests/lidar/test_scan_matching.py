@@ -77,9 +77,9 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
         assert factors.squared[e] == pytest.approx(np.sum(w * r * r))
         assert factors.weight[e] == pytest.approx(np.sum(w))
         along = np.column_stack([-normal[:, 1], normal[:, 0]])
-        slide = np.column_stack([
-            (residual(pose[e] + d, normal=along) - residual(pose[e] - d, normal=along)) / (2 * step) for d in step * np.eye(3)
-        ])
+        slide = np.column_stack(
+            [(residual(pose[e] + d, normal=along) - residual(pose[e] - d, normal=along)) / (2 * step) for d in step * np.eye(3)]
+        )
         spurious = (slide * (w * scatter)[:, None]).T @ slide
         np.testing.assert_allclose(factors.spurious[e], spurious, rtol=1e-4, atol=1e-4 * np.abs(spurious).max())
 

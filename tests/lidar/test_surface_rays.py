@@ -24,9 +24,13 @@ def test_points_of_clouds_are_told_walls_columns_and_the_rest():
     walls = np.concatenate([box, [[1.55, -1.0, 1.63, -1.0]], np.column_stack([ring[:-1], ring[1:]])])
     clouds = scanned(poses, walls, beams=720, reach=5.0)
     pieces, on = straight_pieces(seen(walls, poses, beams=720))
-    straight = find_walls(pieces, poses, ~surroundings(np.array([[0.0, 1.2, 0.3]]), NEAR).on_rim(
-        se2.transform_each(poses, pieces.keyframe, pieces.centre), 0.06
-    ))
+    straight = find_walls(
+        pieces,
+        poses,
+        ~surroundings(np.array([[0.0, 1.2, 0.3]]), NEAR).on_rim(
+            se2.transform_each(poses, pieces.keyframe, pieces.centre), 0.06
+        ),
+    )
     surfaces = surfaces_of(straight.centre, straight.normal, np.array([[0.0, 1.2, 0.3]]))
     kind = points_on(clouds, MeasuredSurfaces(surfaces, on.renumbered(straight.of_piece), UNLEARNT), poses)
     at = se2.transform_each(poses, clouds.owner, clouds.points.astype(float))

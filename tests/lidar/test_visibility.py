@@ -92,8 +92,6 @@ def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(hal
     assert violates_free_space(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
 
 
-
-
 def with_a_walker(truth, clouds):
     """Return clouds in each of which a person stands, 2 m ahead of where the robot is and each time somewhere else."""
     parts = []

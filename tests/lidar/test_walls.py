@@ -186,3 +186,20 @@ def test_neighbours_that_are_apart_and_few_rays_make_no_piece():
     assert len(pieces.length) == len(on.keyframe) == 0
     pieces, on = straight_pieces(seen([[50.0, 50.0, 51.0, 50.0]], np.zeros((2, 3))))
     assert len(pieces.length) == len(on.keyframe) == 0
+
+
+@pytest.mark.parametrize(("apart", "pieces"), [(0.27, 1), (0.42, 0)])
+def test_rays_farther_apart_than_a_third_of_a_metre_are_of_no_piece(apart, pieces):
+    """A wall 4 m away that is hit every so many metres: such hits in a row are a piece, or as many of one each."""
+    beams = round(6.2 * 4.0 / apart) + 1
+    found, _ = straight_pieces(seen([[-1.6, 4.0, 1.6, 4.0]], np.zeros((1, 3)), 0.0, beams=beams))
+    assert len(found.length) == pieces
+
+
+@pytest.mark.parametrize(("wall", "noise", "count"), [
+    ([[1.0, -1.0, 4.0, -1.0]], 0.01, 1), ([[3.0, -0.35, 5.0, -0.35]], 0.01, 0), ([[2.0, -0.12, 2.0, 0.12]], 0.06, 0),
+])  # fmt: skip
+def test_a_grazed_wall_and_one_of_vague_direction_are_no_pieces(wall, noise, count):
+    """Readings at a grazing angle err; a narrow post seen by a bad lidar shows no direction."""
+    pieces, _ = straight_pieces(seen(wall, np.zeros((1, 3)), noise, beams=2880, reach=6.0))
+    assert len(pieces.length) == count

@@ -65,3 +65,12 @@ def test_range_errors_that_fade_keep_their_size_and_forget_by_the_distance_drive
             still, fresh = (hypotheses.moved(b, np.array([way / count, 0.0, 0.0]), slow_sigma=sigma) for b in (still, fresh))
         np.testing.assert_allclose(still.covariance[0, at, at], sigma**2, rtol=1e-12)
         np.testing.assert_allclose(fresh.covariance[0, at, at], sigma**2 * (1.0 - np.exp(-2.0 * way / SLOW_LENGTH)), rtol=1e-12)
+
+
+def test_a_robot_that_stands_is_lost_by_a_random_walk_in_all_three_directions():
+    bank = hypotheses.started(np.zeros((1, 3)), np.zeros((1, 3, 3)), np.array([0.05]))
+    bank = hypotheses.Hypotheses(bank.mean, np.zeros_like(bank.covariance), bank.log_weight)
+    for _ in range(50):
+        bank = hypotheses.moved(bank, np.zeros(3))
+    variance = np.diagonal(bank.pose_covariances[0])
+    np.testing.assert_allclose(variance, 50.0 * hypotheses._STANDING**2, rtol=1e-9)

@@ -230,7 +230,6 @@ def test_legs_and_moved_things_do_not_pull():
     poses = path(ROUND)
     walker = ((0.6, 0.5), (0.7, -0.5))
 
-
     drive = robot(known())
     states = []
     for pose in poses[:80]:

@@ -9,6 +9,7 @@ from helpers.localization_room import ANCHORS, ODD, ROUND, cast, grid_of, known,
 from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.localization import scale
 from uwblite.localization.scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
 from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
@@ -94,3 +95,11 @@ def test_ranges_measure_it_too_and_a_moved_anchor_is_no_other_unit():
 def test_a_map_of_another_scale_is_never_certain(factor, scans):
     drive = robot(enlarged(known(), factor))
     assert all(s.lost for s in drive.along(path(ROUND), scans=scans))
+
+
+def test_a_ray_counts_once_however_many_looks_there_were():
+    """Beyond as many looks as rays are worth, more of them make the scale no surer."""
+    walls, rays = known().walls, rays_of(POSES[-1:])
+    few, enough, more = (scale._matched(walls, POSES[-1], rays, looks, 0.1)[1] for looks in (1, 10, 2000))
+    assert few > 1.2 * enough
+    assert more == enough

@@ -1,11 +1,14 @@
 """Branch and bound against trying every pose, and the factors of ranges against numeric derivatives."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
-from uwblite.localization import likelihood_field, search
+from uwblite.localization import search
+from uwblite.localization.search import FARTHEST, LEVELS, field_of
 from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
 
@@ -14,8 +17,13 @@ NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), *np
 
 
 @pytest.fixture(scope="module")
-def room():
-    return likelihood_field.field_of(walls_of(grid_of(ODD)))
+def walls():
+    return walls_of(grid_of(ODD))
+
+
+@pytest.fixture(scope="module")
+def room(walls):
+    return search.field_of(walls)
 
 
 def finished(steps):
@@ -100,7 +108,7 @@ def test_a_few_points_of_walls_give_the_heading_where_ranges_fix_the_place(room)
     points = seen_from(pose, 9)
     rays = Rays(points, np.zeros_like(points), np.ones(len(points), bool))
     ranges = ranges_at(pose, np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 4.0], [5.0, 4.0]]), (0.05, 0.0))
-    assert search._FEWEST_BESIDE <= len(search._thinned(rays)) < search._FEWEST_POINTS
+    assert search.FEW_BESIDE <= len(search._thinned(rays)) < search.FEW_ENDS
     off = se2.between(pose, finished(search.places(room, rays, ranges, BOUNDS)).poses)
     near = np.hypot(off[:, 0], off[:, 1]) < 0.2
     assert np.abs(off[near, 2]).min() < 0.1
@@ -111,3 +119,56 @@ def test_of_places_that_look_alike_the_one_that_the_ranges_fit_comes_first():
     ranges = ranges_at(poses[17], np.array([[0.0, 3.0], [6.0, 3.0]]), (0.0, 0.0))
     found = finished(search._likeliest(poses, np.linspace(0.9, 0.85, 25), ranges, complete=True))
     np.testing.assert_allclose(found.poses[0], poses[17], atol=0.26)
+
+
+def test_where_ranges_leave_too_many_places_no_place_is_tried():
+    """One range of a hundred metres, wide as a house, in a field of a square kilometre."""
+    one = ranges_at((0.0, 0.0, 0.0), np.array([[100.0, 0.0]]), (0.0, 0.0))
+    bounds = (np.array([-500.0, -500.0]), np.array([500.0, 500.0]))
+    wide = dataclasses.replace(one, sigma=np.array([80.0]))
+    found = finished(search._by_ranges(wide, bounds))
+    assert (len(found.poses), found.complete) == (0, False)
+
+
+def test_a_cell_holds_the_likelihood_of_its_distance_to_the_nearest_wall(walls, room):
+    rng = np.random.default_rng(1)
+    rows, cols = (rng.integers(room.margin - 10, n - room.margin + 10, 400) for n in room.free.shape)
+    centres = room.origin + (np.stack([cols, rows], axis=1) + 0.5) * room.cell
+    apart = np.hypot(*(centres[:, None] - walls.points[None]).transpose(2, 0, 1)).min(axis=1)
+    expected = 255.0 * np.exp(-0.5 * (apart / 0.15) ** 2)
+    found = room.levels[0][rows, cols].astype(float)
+    # The table of nearest walls has cells of 0.05 m: the distance is known to half a diagonal of one.
+    slope = 255.0 * np.exp(-0.5) / 0.15
+    assert np.abs(found - expected).max() < slope * 0.5 * np.sqrt(2.0) * walls.cell + 1.0
+    assert (found[apart > 0.8] == 0).all()
+
+
+@pytest.mark.parametrize("level", range(1, LEVELS + 1))
+def test_a_level_holds_the_maxima_over_squares_of_cells(room, level):
+    base, size = room.levels[0], 2**level
+    rng = np.random.default_rng(level)
+    rows, cols = (rng.integers(0, n, 300) for n in base.shape)
+    for row, col in zip(rows, cols, strict=True):
+        assert room.levels[level][row, col] == base[row : row + size, col : col + size].max()
+
+
+def test_every_point_of_a_scan_finds_a_cell(walls, room):
+    """A robot stands in a free cell; what it sees is at most FARTHEST away."""
+    rows, cols = np.nonzero(room.free)
+    reach = FARTHEST / room.cell + 2**LEVELS
+    assert rows.min() >= reach
+    assert cols.min() >= reach
+    assert rows.max() + reach < room.free.shape[0]
+    assert cols.max() + reach < room.free.shape[1]
+    inside = room.origin + (np.stack([cols, rows], axis=1) + 0.5) * room.cell
+    assert (walls.state_at(*inside.T) == 0).all()
+    assert len(rows) == pytest.approx(48.0 / room.cell**2, rel=0.05)
+
+
+def test_a_large_map_gets_coarser_cells():
+    wide = grid_of((), size=(160.0, 160.0), cell=0.5)
+    room = field_of(walls_of(wide))
+    assert room.cell > 0.1
+    # Three million, and a rim for the coarsest level on every side.
+    assert room.levels[0].size < (np.sqrt(3e6) + 2 * 2 ** (LEVELS + 1) + 2) ** 2
+    assert not room.levels[0].any()

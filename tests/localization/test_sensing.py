@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.localization.records import Scanner
+from uwblite.localization import Scanner
 from uwblite.localization.sensing import LEAD, TRACK_RAYS, Range, Scan, Waiting, scan_rays
 from uwblite.odometry.odometer import Odometer
 from uwblite.sensor_log import SensorMounting

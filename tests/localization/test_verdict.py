@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization import hypotheses
-from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, map_odds, needed, nowhere, undecided, vague
+from uwblite.localization.verdict import CERTAIN, FEW_ENDS, RangeFit, imprecise, map_odds, needed, nowhere, undecided, vague
 
 MANY, FEW, ONE_ANCHOR = RangeFit(12, 1.0, 4, 6.0, -2.0), RangeFit(3, 1.0, 2, 1.5, 0.0), RangeFit(3, 1.0, 1, 1.5, -0.2)
 ENDS, RAYS = 3.0 * FEW_ENDS, 30.0
@@ -20,6 +20,7 @@ def a_bank(rival=-20.0):
 def is_certain(odds, fitting, bank=None, proven=False):
     certain = needed(fitting, proven)
     bank = a_bank() if bank is None else bank
+    assert not imprecise(bank.pose_covariances[0])
     return not undecided(bank, 0, True, certain) and not nowhere(odds, fitting) and odds.total >= certain
 
 
@@ -67,10 +68,11 @@ def test_a_rival_a_hundred_times_less_likely_is_none_in_a_map_in_which_the_robot
         assert is_certain(odds, fitting, a_bank(-5.0), proven) is certain
 
 
-def test_a_search_that_left_places_out_and_a_pose_that_is_not_sure_decide_nothing():
+def test_a_search_that_left_places_out_decides_nothing_and_a_pose_that_is_not_sure_is_the_only_one_all_the_same():
     assert "too many" in undecided(a_bank(), 0, False, CERTAIN)
     wide = hypotheses.started(np.zeros((1, 3)), np.diag([0.1, 0.001, 0.001])[None], np.zeros(0))
-    assert "not sure" in undecided(wide, 0, True, CERTAIN)
+    assert undecided(wide, 0, True, CERTAIN) == ""
+    assert "not sure" in imprecise(wide.pose_covariances[0])
 
 
 def test_a_pose_is_known_while_its_longest_axis_is_short_in_any_frame():

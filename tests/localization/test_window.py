@@ -13,6 +13,8 @@ def test_the_newest_part_of_a_window_is_of_its_time(parts, kept):
     window = Window(looks=[WindowLook(rays, np.zeros(3), 0.4 * k, float(k)) for k in range(9)])
     assert [look.stamp for look in window.newest(parts).looks] == list(range(9 - kept, 9))
     assert not Window().newest(parts).looks
+    assert window.newest(parts).length(4.0) == pytest.approx(4.0 - 0.4 * (9 - kept))
+    assert Window().length(4.0) == 0.0
 
 
 def look(way, stamp):

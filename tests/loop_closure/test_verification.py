@@ -21,10 +21,12 @@ from uwblite.loop_closure.verification import _judge, find, reconcile
 from uwblite.map_result import LoopClosure
 
 PERIOD = 1.2
-TWINS = np.concatenate([
-    [[-26.0, -2.0, 26.0, -2.0], [26.0, 2.0, -26.0, 2.0]],
-    *([[PERIOD * k, 2.0, PERIOD * k, 1.2], [PERIOD * k, -2.0, PERIOD * k, -1.2]] for k in range(-20, 21)),
-])
+TWINS = np.concatenate(
+    [
+        [[-26.0, -2.0, 26.0, -2.0], [26.0, 2.0, -26.0, 2.0]],
+        *([[PERIOD * k, 2.0, PERIOD * k, 1.2], [PERIOD * k, -2.0, PERIOD * k, -1.2]] for k in range(-20, 21)),
+    ]
+)
 """A corridor with equal pillars all along."""
 SOLVER, SEARCH = SolverConfig(), CorrelativeConfig()
 CONFIG = LoopClosureConfig()
@@ -84,8 +86,11 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     truth, graph, covariances, pieces, recording, candidates = hall
     sure = replace(candidates, spread=np.zeros(len(candidates.target)))
     gone = missed(sure, closures, CONFIG)
-    few = {(int(a), int(b)) for a, b, c in zip(sure.target, sure.source, closures.candidates, strict=True)
-           if c.overlap < CONFIG.overlap}
+    few = {
+        (int(a), int(b))
+        for a, b, c in zip(sure.target, sure.source, closures.candidates, strict=True)
+        if c.overlap < CONFIG.overlap
+    }
     assert gone == few
     assert gone
     assert not missed(replace(candidates, spread=np.full(len(candidates.target), 9.0)), closures, CONFIG)
@@ -325,8 +330,13 @@ def test_a_pair_that_was_matched_twice_has_two_fates(hall):
     closures, _ = planted_closures(rng, truth, 12, 0.0)
     wrong = closures.edges.T_i_j + np.array([1.0, -1.0, 0.0])
     again = Closures(
-        replace(closures.edges, i=closures.edges.i[:2], j=closures.edges.j[:2], T_i_j=wrong[:2],
-                sqrt_information=closures.edges.sqrt_information[:2]),
+        replace(
+            closures.edges,
+            i=closures.edges.i[:2],
+            j=closures.edges.j[:2],
+            T_i_j=wrong[:2],
+            sqrt_information=closures.edges.sqrt_information[:2],
+        ),
         tuple(replace(c, T_i_j=z) for c, z in zip(closures.candidates[:2], wrong[:2], strict=True)),
     )
     _, left = reconcile(graph, merged(closures, again), CONFIG, SOLVER)

@@ -15,7 +15,7 @@ def test_no_obstacle_is_nearer_than_the_clearance_anywhere(seed):
     h = grid.geometry.resolution
     rng = np.random.default_rng(seed)
     points = rng.uniform(grid.geometry.origin, grid.geometry.corner, (2000, 2))
-    bound = np.sqrt(clearance.at(points)[0])
+    bound = np.sqrt(clearance.bounds(points))
     true = distance_to_squares(grid, grid.states() == OCCUPIED, points)
     true[grid.states()[grid.geometry.cell_of(points)] == OCCUPIED] = 0.0
     assert np.all(bound <= true + 1e-6)
@@ -96,6 +96,6 @@ def test_unknown_space_is_an_obstacle_or_dear_and_specks_are_neither():
 
 def test_outside_the_map_there_is_no_clearance():
     clearance = clearance_map(grid_of("....\n....\n....\n...."), 0.1)
-    squared, _ = clearance.at(np.array([[-0.01, 0.2], [0.2, 9.0], [0.2, 0.2]]))
+    squared = clearance.bounds(np.array([[-0.01, 0.2], [0.2, 9.0], [0.2, 0.2]]))
     assert squared[0] == squared[1] == 0.0
     assert squared[2] > 0.0

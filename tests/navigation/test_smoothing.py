@@ -14,12 +14,13 @@ def test_costs_along_lines_are_integrals():
     rng = np.random.default_rng(0)
     begin, end = (rng.uniform(clearance.geometry.origin + 0.3, clearance.geometry.corner - 0.3, (40, 2)) for _ in range(2))
     found = along_lines(clearance, begin, end)
-    for b, e, cost, clear, crossing in zip(begin, end, *found, strict=True):
+    for b, e, cost, clear, open_, crossing in zip(begin, end, *found, strict=True):
         dense = b + np.linspace(0.0, 1.0, 4001)[:, None] * (e - b)
         squared, rates = clearance.at(dense)
         assert cost == pytest.approx(rates.mean() * np.hypot(*(e - b)), rel=0.03, abs=1e-3)
         assert not (clear and squared.min() < 0.1**2 - 1e-9)
         assert not (crossing and clear)
+        assert open_ == (clear and rates.max() == 1.0)
 
 
 def test_batches_change_nothing(monkeypatch):

@@ -100,3 +100,14 @@ def test_equations_are_those_of_wheels_with_unknown_patches():
     even = floor.equations(wheels, floor.even(wheels), graph, normal.unknowns)
     np.testing.assert_array_equal(even.slope, 0.0)
     assert abs(even.among).sum() == 0.0
+
+
+def test_the_certainty_of_poses_is_turned_into_their_own_frames():
+    rng = np.random.default_rng(2)
+    poses = rng.uniform(-3.0, 3.0, (5, 3))
+    root = rng.standard_normal((5, 3, 3))
+    certainty = root @ root.transpose(0, 2, 1) + np.eye(3)
+    for found, pose, information in zip(floor._pose_variance(Graph(poses), certainty), poses, certainty, strict=True):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        own = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        np.testing.assert_allclose(found, np.diag(own @ np.linalg.inv(information) @ own.T), rtol=5e-3)

@@ -131,7 +131,7 @@ def test_redundancy_of_wheels_is_the_trace_of_what_ranges_show_of_them():
                     jacobian[first : first + part.shape[0], 3 * pose : 3 * pose + 3] += part
         row += each.residuals.size
     own = jacobian[: 3 * len(wheels)]
-    left = 1.0 - np.einsum("ri,ij,rj->r", own, np.linalg.inv(jacobian.T @ jacobian), own)
+    left = 1.0 - np.einsum("ri,ri->r", own @ np.linalg.inv(jacobian.T @ jacobian), own)
     expected = left.reshape(-1, 3).sum(axis=0)
     assert redundancy(graph, wheels, np.ones(len(wheels))) == pytest.approx(expected, rel=0.15)
 

@@ -1,38 +1,37 @@
 """Which hypothesis about the heights of anchors is taken, and when the other one is a doubt."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from functools import cache
 
 import numpy as np
 import pytest
 from helpers.planted import NOMINAL, drive, odometry, ranges
 from helpers.planted_graphs import loop
+from helpers.planted_tasks import estimate_of, task_of
 from helpers.told import doubted, warned
 
 from uwblite import se2
 from uwblite.arrays import rms_length
 from uwblite.constraints import Constraints
 from uwblite.graph.calibration import HEIGHT
+from uwblite.graph.graph import Graph
+from uwblite.graph.solver import Optimizer
 from uwblite.pipeline import anchor_heights, radio_stages
 from uwblite.pipeline.anchor_heights import check_heights
 from uwblite.pipeline.estimate import Estimate, OtherHeights, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import gather
-from uwblite.problem.alternatives import Explanation
+from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog
 
 
-@pytest.mark.parametrize(
-    ("apart", "lidar", "doubts"), [(None, False, 0), (0.39, False, 0), (0.41, False, 1), (0.41, True, 0)]
-)
+@pytest.mark.parametrize(("apart", "lidar", "doubts"), [(None, False, 0), (0.39, False, 0), (0.41, False, 1), (0.41, True, 0)])
 @pytest.mark.parametrize("taken", [False, True])
 def test_heights_that_make_another_trajectory_are_a_doubt_without_a_lidar(apart, lidar, taken, doubts):
-    stages = Stages(None, None)
-    other = None if apart is None else OtherHeights(4.7, taken, apart)
-    check_heights(
-        SimpleNamespace(other_heights=other), SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar), stages=stages)
-    )
+    task = task_of(lidar=lidar)
+    stages, other = task.stages, None if apart is None else OtherHeights(4.7, taken, apart)
+    check_heights(estimate_of(Graph(np.zeros((2, 3))), other_heights=other), task)
     assert [d.kind for d in doubted(stages)] == ["anchor-heights"] * doubts
     assert not warned(stages)
     for doubt in doubted(stages):
@@ -40,12 +39,14 @@ def test_heights_that_make_another_trajectory_are_a_doubt_without_a_lidar(apart,
         assert ("taken as high" in doubt.text) == taken
 
 
+PLACES = np.array([[9.0, 14.0], [-8.0, 2.0], [3.0, -4.0]])
+
+
 def round_trip(height: float, unit: float) -> tuple[SensorLog, np.ndarray]:
     """Return a drive on a circle of 8 m radius past three anchors, wheels in units of so many metres, and the truth."""
     rng = np.random.default_rng(3)
     stamps, truth = drive([[0.7, 0.0, 0.7 / 8.0]], [72.0])
-    places = np.array([[9.0, 14.0], [-8.0, 2.0], [3.0, -4.0]])
-    radio = ranges(rng, stamps, truth, places, rate=1.0, sigma=0.05)
+    radio = ranges(rng, stamps, truth, PLACES, rate=1.0, sigma=0.05)
     radio = replace(radio, ranges=np.hypot(radio.ranges, height))
     return SensorLog(odometry(stamps, truth, rng, scale=1.0 / unit, noise=0.01, turn_noise=0.01), radio, None, NOMINAL), truth
 
@@ -77,21 +78,28 @@ def test_without_heights_to_find_nothing_is_compared():
     assert anchor_heights.choose_heights(estimate, MappingConfig()) is estimate
 
 
-@pytest.mark.parametrize(("gains", "ids", "refuted", "asked"), [
-    ([-21.0, 50.0], ["AB", "A"], True, 1),
-    ([-21.0, 50.0], ["AB", "BC"], False, 2),
-    ([-8.0, -8.0], ["AB", "C"], True, 2),
-    ([-8.0, -6.0], ["AB", "C"], False, 2),
-    ([None, -21.0], ["AB", "AB"], True, 2),
+@cache
+def alone(height: float) -> Estimate:
+    """Return the estimate of the round trip alone, at its optimum by low anchors."""
+    config, (log, truth) = MappingConfig(), round_trip(height, 1.0)
+    task = task_of(gather([log], config.keyframes))
+    wheels = radio_stages.dead_reckoning(task.recordings.each[0], config)
+    true = se2.interpolate_trajectory(log.odometry.stamps, truth, task.recordings.stamps)
+    graph, yes = replace(wheels.graph, poses=true, anchors=PLACES), np.ones(3, dtype=bool)
+    return replace(wheels, graph=graph, bootstrap=BootstrapResult(graph, yes, ((),) * 3, ~yes)).solved(config.solver)[0]
+
+
+@pytest.mark.parametrize(("heights", "ids", "refuted"), [
+    ([0.0], ["ABC"], False),
+    ([0.0] * 4, ["ABC", "DEF", "GHI", "JKL"], True),
+    ([0.0] * 4, ["ABC", "DEF", "GHI", "ABC"], True),
+    ([0.0] * 4, ["ABC", "ABC", "BCA", "AB"], False),
+    ([0.0] * 4 + [4.5], ["ABC", "DEF", "GHI", "JKL", "MNO"], False),
 ])  # fmt: skip
-def test_joined_recordings_are_asked_alone_each_that_has_other_anchors(monkeypatch, gains, ids, refuted, asked):
-    given = iter(gains)
-
-    def compared(estimate, config, optimizer):
-        return None if (gain := next(given)) is None else Explanation(None, gain)
-
-    monkeypatch.setattr(anchor_heights, "_high_anchors", compared)
-    graph = SimpleNamespace(calibration=SimpleNamespace(of_kinds=lambda *kinds: np.ones(1, dtype=bool)))
-    alone = [SimpleNamespace(ranges=0, graph=graph, anchor_ids=tuple(own)) for own in ids]
-    assert anchor_heights._refuted(alone, MappingConfig()) is refuted
-    assert len(gains) - len(list(given)) == asked
+def test_recordings_refute_high_anchors_together_each_that_has_other_anchors(heights, ids, refuted):
+    """Three low anchors of one round are no proof: the odds of recordings of other anchors are multiplied."""
+    log_odds = [anchor_heights._high_anchors(alone(h), MappingConfig(), Optimizer()).log_odds for h in (0.0, 4.5)]
+    assert -15.0 < log_odds[0] < -5.0 < 20.0 < log_odds[1]
+    each = [replace(alone(height), anchor_ids=tuple(own)) for height, own in zip(heights, ids, strict=True)]
+    assert anchor_heights._refuted(each, MappingConfig()) is refuted
+    assert not anchor_heights._refuted([replace(own, ranges=None) for own in each], MappingConfig())

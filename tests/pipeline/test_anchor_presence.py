@@ -1,16 +1,15 @@
 """Anchors of some recordings alone."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.told import warned
 
 from uwblite.graph.graph import Graph
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.pipeline.anchor_places import name_new_and_absent_anchors
-from uwblite.pipeline.progress import Stages
 
 STEPS = 40
 """Keyframes of each recording, 0.3 m apart along x."""
@@ -28,16 +27,7 @@ def estimate_and_task(beginnings, heard, ids=("A", "B")):
         np.full((len(pose), 6), -1), weights=np.ones(len(pose)),
     )  # fmt: skip
     graph = Graph(poses, np.tile([6.0, 3.0], (len(ids), 1)))
-    estimate = SimpleNamespace(ranges=ranges, graph=graph, anchor_ids=ids, placed=np.ones(len(ids), dtype=bool))
-    return estimate, SimpleNamespace(recordings=_Recordings(recording, len(beginnings)), stages=Stages(None, None))
-
-
-class _Recordings(SimpleNamespace):
-    def __init__(self, of_keyframe, number):
-        super().__init__(of_keyframe=of_keyframe, number=number)
-
-    def __len__(self):
-        return self.number
+    return estimate_of(graph, ranges=ranges, anchor_ids=ids), task_of(recordings_of(poses, None, recording))
 
 
 def said(beginnings, heard, ids=("A", "B")):
@@ -79,10 +69,10 @@ def test_readings_without_a_distance_are_no_hearing_and_ranges_without_weight_ar
     estimate, task = estimate_and_task([HERE, HERE], ["A", "AB"])
     first = estimate.ranges.pose < STEPS
     of_a = first & (estimate.ranges.anchor == 0)
-    estimate.ranges = replace(estimate.ranges, weights=np.where(of_a, 0.0, 1.0))
+    estimate = replace(estimate, ranges=replace(estimate.ranges, weights=np.where(of_a, 0.0, 1.0)))
     assert [w.figures["anchor"] for w in named(estimate, task)] == ["B"]
     task.stages.facts.clear()
-    estimate.ranges = replace(estimate.ranges, ranges=np.where(of_a, 0.0, 1.0))
+    estimate = replace(estimate, ranges=replace(estimate.ranges, ranges=np.where(of_a, 0.0, 1.0)))
     name_new_and_absent_anchors(estimate, task)
     assert sorted(w.figures["anchor"] for w in warned(task.stages)) == ["A", "B"]
     assert "anchor B has ranges only from recording 2 on: recording 1 drove within its reach" in warned(task.stages)[1].text

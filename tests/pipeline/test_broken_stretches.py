@@ -31,7 +31,7 @@ from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog
 
 ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
-SLIP = 40.0
+SLIP = 30.0
 
 
 def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
@@ -48,7 +48,7 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
 @cache
 def walked_once(shift, moved):
     rng = np.random.default_rng(3)
-    stamps, truth = wander(rng, 40.0, half_width=4.0)
+    stamps, truth = wander(rng, 30.0, half_width=4.0)
     motion = se2.between(truth[:-1], truth[1:])
     motion[(stamps[:-1] >= SLIP) & (stamps[:-1] < SLIP + 1.0)] *= [0.0, 0.0, 1.0]
     radio = ranges(rng, stamps, truth, ANCHORS, rate=0.75, sigma=0.05)
@@ -61,8 +61,9 @@ def walked_once(shift, moved):
         scans(stamps, truth, HALL, rate=4.0, sweep=0.0, range_max=6.0, noise=0.01, rng=rng),
     )  # fmt: skip
     task = Task(gather([log], KeyframeConfig()), MappingConfig(), Constraints(), Stages(None, None))
-    estimate, true = dead_reckoning(task.recordings.each[0], task.config), se2.interpolate_trajectory(
-        stamps, truth, task.recordings.stamps
+    estimate, true = (
+        dead_reckoning(task.recordings.each[0], task.config),
+        se2.interpolate_trajectory(stamps, truth, task.recordings.stamps),
     )
     graph = replace(estimate.graph, poses=true, anchors=ANCHORS.copy())
     yes = np.ones(4, dtype=bool)

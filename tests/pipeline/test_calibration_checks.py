@@ -2,11 +2,11 @@
 Slip in turns does not bend the lidar's mounting, nor do crooked ways to the side turn it. Units of wheels; a clock's offset."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
+from helpers.planted_tasks import estimate_of, log_of, recordings_of, standing, task_of
 from helpers.told import doubted, warned
 
 from uwblite import se2
@@ -36,9 +36,15 @@ from uwblite.pipeline.calibration_checks import (
 )
 from uwblite.pipeline.estimate import Estimate, OtherHeights, ScanClouds
 from uwblite.pipeline.mapping_config import MappingConfig
-from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.recordings import Recordings
-from uwblite.sensor_log import LogNotes, SensorMounting
+from uwblite.sensor_log import OdometryBreaks, Screening, SensorMounting
+
+STANDING, MOMENTS = np.zeros((2, 3)), np.array([0.0, 1.0])
+
+
+def screened(ratio):
+    """Return the screening of a recording whose lidar measures so many times the wheels' distance; None = not screened."""
+    return None if ratio is None else Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)
+
 
 CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
 INDEX = CALIBRATION.index("heading_scale")
@@ -62,8 +68,8 @@ def judged(true, used):
     values[INDEX] = used
     free = np.zeros(len(values), dtype=bool)
     graph = Graph(truth, calibration=CALIBRATION, fixed_calibration=free).updated(truth, np.zeros((0, 2)), values)
-    stages = Stages(None, None)
-    task = SimpleNamespace(stages=stages)
+    task = task_of(recordings_of(truth))
+    stages = task.stages
     guarded = with_constant_turn_scales(Estimate(graph, wheels, None, (), steps=steps), task).graph
     stages.findings.extend(check_turn_scales(Estimate(graph.with_edges(wheels, steps), wheels, None, ()), task))
     return guarded.calibration.values[INDEX], bool(guarded.fixed_calibration[INDEX]), stages
@@ -114,8 +120,7 @@ def slipping(slip, mounted, given=True):
     estimate = Estimate(graph, wheels, None, (), steps=steps)
     estimate = estimate.with_estimates_of(optimize(estimate.problem)[0])
     mounting = SensorMounting(np.array([0.2 * given, 0.0, 0.0]))
-    recording = SimpleNamespace(has_scans=True, log=SimpleNamespace(mounting=mounting))
-    task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), config=MappingConfig())
+    task = task_of(recordings_of(truth, lidar=True, each=[{"mounting": mounting}]))
     return estimate, with_slip_in_turns(estimate, task), truth
 
 
@@ -180,16 +185,14 @@ def test_wheels_that_go_crooked_to_the_side_do_not_turn_the_lidar(crooked):
 ])  # fmt: skip
 def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
     """Of several recordings the one is named; no factor where the scale is no unknown."""
-    values = [0.0 if e is None else e for e in errors]
-    calibration = SimpleNamespace(index=lambda kind, recording: -1 if errors[recording] is None else recording, values=values)
-    each, stages = [SimpleNamespace(name=f"{n}.log", number=n, has_scans=False) for n in range(len(errors))], Stages(None, None)
-    recordings = type("Recordings", (), {"each": each, "__len__": lambda self: len(each)})()
-    estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=None)
-    task = SimpleNamespace(recordings=recordings, config=None, stages=stages, constraints=Constraints())
-    assert odometry_unit_factors(estimate, task).tolist() == factors
+    known = {UnknownKey("odometry_scale", recording=n): error for n, error in enumerate(errors) if error is not None}
+    graph = Graph(np.zeros((2, 3)), calibration=Calibration(tuple(known), np.array([*known.values()])))
+    task = task_of(standing(len(errors), each=[{"name": f"{n}.log"} for n in range(len(errors))]))
+    stages = task.stages
+    assert odometry_unit_factors(estimate_of(graph), task).tolist() == factors
     wrong = [n for n, factor in enumerate(factors) if factor != 1.0]
     assert [w.figures for w in warned(stages)] == [{"recording": n + 1, "factor": factors[n]} for n in wrong]
-    named = [w.text.startswith(f"{n}.log: ") for n, w in zip(wrong, warned(stages), strict=True)]
+    named = [w.text.startswith(f"recording {n + 1} ({n}.log): ") for n, w in zip(wrong, warned(stages), strict=True)]
     assert named == [len(errors) > 1] * len(wrong)
 
 
@@ -218,15 +221,11 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
 
     lidar: its ways by those of the wheels, nan where it shows none, None without.
     """
-    stages = Stages(None, None)
     calibration = Calibration((UnknownKey("odometry_scale", recording=0),), np.array([factor - 1.0]))
-    log = SimpleNamespace(screening=lidar and SimpleNamespace(lidar_by_wheels=lidar))
-    recording = SimpleNamespace(name="run.log", number=0, has_scans=lidar is not None, log=log)
-    recordings = Recordings((recording,), *(np.zeros(0),) * 4)
     given = Constraints(anchors=tuple(GivenAnchor(name, (0.0, 0.0)) for name in "AB"[:given]))
-    task = SimpleNamespace(stages=stages, recordings=recordings, constraints=given, config=None)
-    other = None if height is None else OtherHeights(height, taken=False, apart=1.0)
-    estimate = SimpleNamespace(graph=SimpleNamespace(calibration=calibration), other_heights=other)
+    task = task_of(standing(lidar=lidar is not None, each=[{"screening": screened(lidar)}]), given=given)
+    stages, other = task.stages, None if height is None else OtherHeights(height, taken=False, apart=1.0)
+    estimate = estimate_of(Graph(np.zeros((2, 3)), calibration=calibration), other_heights=other)
     factors = odometry_unit_factors(estimate, task)
     assert factors == pytest.approx([factor if warnings or doubts else 1.0])
     assert (len(warned(stages)), len(doubted(stages))) == (warnings, doubts)
@@ -239,7 +238,7 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
 ])  # fmt: skip
 def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_say(ways, checked):
     """None: a recording that was not screened."""
-    logs = [SimpleNamespace(screening=None if w is None else SimpleNamespace(lidar_by_wheels=w)) for w in ways]
+    logs = [log_of(STANDING, MOMENTS, screening=screened(way)) for way in ways]
     config = MappingConfig()
     found = with_units_checked(config, logs)
     assert (found.calibration.odometry_unit <= found.calibration.odometry_scale) == checked
@@ -252,8 +251,7 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
     ([()], 0.1, 0.1), ([("scans",)], 0.1, 0.0), ([("odometry",)], 0.0, 0.0), ([(), ("odometry", "scans")], 0.0, 0.0),
 ])  # fmt: skip
 def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
-    mounting = SimpleNamespace(laser_is_base=False)
-    logs = [SimpleNamespace(screening=SimpleNamespace(in_bursts=s), mounting=mounting, scans=0, notes=LogNotes()) for s in late]
+    logs = [log_of(STANDING, MOMENTS, lidar=True, screening=Screening((), OdometryBreaks.none(), in_bursts=s)) for s in late]
     config = MappingConfig()
     found = with_given_mounting_and_clock(config, logs)
     expected = replace(config.calibration, range_delay=radio, laser_delay=lidar)
@@ -263,12 +261,8 @@ def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
 @pytest.mark.parametrize(("is_base", "fixed"), [([True], True), ([True, False], False), ([True, None], True), ([None], False)])
 def test_a_laser_whose_poses_the_log_gives_is_where_it_is_said_to_be(is_base, fixed):
     """None: a recording without lidar."""
-    logs = [
-        SimpleNamespace(
-            screening=None, notes=LogNotes(), mounting=SimpleNamespace(laser_is_base=bool(b)), scans=None if b is None else 0
-        )
-        for b in is_base
-    ]
+    mountings = [SensorMounting(laser_is_base=bool(b)) for b in is_base]
+    logs = [log_of(STANDING, MOMENTS, lidar=b is not None, mounting=m) for b, m in zip(is_base, mountings, strict=True)]
     assert with_given_mounting_and_clock(MappingConfig(), logs).calibration.laser_offset == (0.0 if fixed else 0.1)
 
 
@@ -298,9 +292,7 @@ def walked(offsets, made_with=0.0, noise=0.002):
     scans = ScanClouds(None, None, made_with)
     estimate = Estimate(graph, wheels, None, (), steps=steps, scans=scans)
     estimate = estimate.with_estimates_of(optimize(estimate.problem)[0])
-    recordings = SimpleNamespace(each=[SimpleNamespace(rows=slice(0, WALKED + 1))])
-    task = SimpleNamespace(config=MappingConfig(), following=lambda estimate: SimpleNamespace(recordings=recordings))
-    return estimate, task
+    return estimate, task_of(recordings_of(truth, PERIOD * np.arange(WALKED + 1.0), lidar=True))
 
 
 @pytest.mark.parametrize("offset", [0.02, -0.09, 0.15])

@@ -1,11 +1,11 @@
 """Distances between landmarks: edges that are right, landmarks that are found, a map that becomes as long as it is."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import planted
+from helpers.planted_tasks import task_of
 from helpers.told import warned
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,8 +19,7 @@ from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
 from uwblite.mapping import MappingConfig
-from uwblite.pipeline.constraint_edges import _column_in, observations, outcome, ties
-from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.constraint_edges import Ties, _column_in, observations, outcome, ties
 from uwblite.sensor_log import Odometry
 
 LONG, SCALE = 24.0, 0.96
@@ -226,13 +225,12 @@ def test_a_cloud_s_own_column_is_what_it_saw_near_the_place():
 @pytest.mark.parametrize(("length", "named"), [(3.0, False), (3.29, False), (3.31, True), (2.69, True)])
 def test_a_distance_off_by_more_than_three_sigma_is_a_warning(length, named):
     edges = PointDistanceEdges(*(np.array([k]) for k in (0, 1)), *np.zeros((2, 1, 2)), np.array([3.0]), np.array([0.1]))
-    stages = Stages(None, None)
     distance = GivenLandmarkDistance(("a", "b"), 3.0, 0.1)
-    task = SimpleNamespace(constraints=Constraints(landmark_distances=(distance,)), stages=stages)
+    task = task_of(given=Constraints(landmark_distances=(distance,)))
     graph = Graph(np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]))
-    (figures,) = outcome(task, SimpleNamespace(edges=edges, measured=np.array([0])), graph)
+    (figures,) = outcome(task, Ties(edges, np.array([0])), graph)
     assert figures == {"landmarks": "a - b", "measured": 3.0, "map": length}
-    assert [n.kind for n in warned(stages)] == (["landmark-distance"] if named else [])
+    assert [n.kind for n in warned(task.stages)] == (["landmark-distance"] if named else [])
 
 
 def test_all_ties_of_a_distance_weigh_as_much_as_it_does():

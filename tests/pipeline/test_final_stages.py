@@ -1,21 +1,21 @@
 """The occupancy grid: a map larger than memory allows is drawn coarser, and that is said."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import plain_ranges
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
-from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import final_stages
-from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.final_stages import _sweeps
 from uwblite.pipeline.recordings import gather
 from uwblite.problem.solution import at_given_poses
@@ -64,25 +64,30 @@ def test_at_given_poses_only_what_belongs_to_anchors_is_free_and_what_was_fixed_
     np.testing.assert_array_equal(given.fixed_calibration, [False, False, True, True, True, True])
 
 
-def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monkeypatch):
-    """What is free of poses, wheels and laser is free again afterwards."""
-    keys = tuple(UnknownKey(kind) for kind in ("bias", "height2", "height2", "odometry_scale"))
-    graph = Graph(np.ones((3, 3)), np.zeros((2, 2)), (), Calibration(keys, np.ones(4)), np.arange(3) == 0)
-    monkeypatch.setattr(final_stages, "with_range_noise", lambda estimate, *_, steady: estimate)
-
-    def solved(estimate, solver):
-        given = estimate.graph
-        height = np.array([False, True, False, False])
-        values = np.where(height, 0.0, given.calibration.values)
-        moved = given.updated(given.poses, given.anchors + 2.0, values)
-        return replace(estimate, graph=replace(moved, fixed_calibration=given.fixed_calibration | height)), None
-
-    monkeypatch.setattr(Estimate, "solved", solved)
-    found = final_stages._anchors_alone(Estimate(graph, None, None, ()), SimpleNamespace(config=MappingConfig())).graph
+def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed():
+    """What is free of poses, wheels and laser is free again afterwards. One anchor is 2 m above the tag; of the other one
+    ranges are shorter than from its own height."""
+    rng = np.random.default_rng(0)
+    turn = np.linspace(0.0, 6.0, 60)
+    poses = np.column_stack([4.0 * np.cos(turn), 3.0 * np.sin(2.0 * turn), 0.5 * turn])
+    anchors, keys = np.array([[7.0, 1.0], [-2.0, 6.0]]), ("bias", "height2", "height2", "odometry_scale")
+    pose, anchor = np.repeat(np.arange(60), 2), np.tile([0, 1], 60)
+    level = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
+    measured = np.sqrt(level**2 + np.array([-0.5, 4.0])[anchor]) + 0.02 * rng.standard_normal(120)
+    columns = np.full((120, 6), -1)
+    columns[:, 2] = np.array([1, 2])[anchor]
+    ranges = replace(plain_ranges(pose, anchor, measured, 0.05), calibration=columns, stamps=pose.astype(float))
+    prior = PriorEdges("calibration", np.arange(4), np.zeros((4, 1)), np.array([10.0, 0.1, 0.1, 10.0])[:, None, None])
+    graph = Graph(poses, anchors, (prior,), Calibration(tuple(map(UnknownKey, keys)), np.ones(4)), np.arange(60) == 0)
+    before = estimate_of(graph, ranges=ranges)
+    before = replace(before, graph=before.problem)
+    found = final_stages._anchors_alone(before, task_of(recordings_of(poses))).graph
     assert found.fixed_calibration.tolist() == [False, True, False, False]
-    assert found.fixed_poses.tolist() == [True, False, False]
-    assert found.calibration.values.tolist() == [1.0, 0.0, 1.0, 1.0]
-    assert (found.anchors == 2.0).all()
+    assert found.fixed_poses.tolist() == [True] + [False] * 59
+    assert found.calibration.values[1] == 0.0
+    assert found.calibration.values[2] == pytest.approx(4.0, abs=0.5)
+    np.testing.assert_allclose(found.anchors[1], anchors[1], atol=0.1)
+    np.testing.assert_array_equal(found.poses, poses)
 
 
 def test_the_time_from_keyframes_to_scans_is_that_of_a_random_walk(room):

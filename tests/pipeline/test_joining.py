@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
 from helpers.planted import odometry, ranges, wander
 from helpers.planted_graphs import plain_ranges, random_poses
+from helpers.planted_tasks import estimate_of, recordings_of, standing
 
 from uwblite import se2
 from uwblite.errors import DataError
@@ -35,36 +35,39 @@ from uwblite.pipeline.joining import (
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import TrilaterationConfig
+from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 from uwblite.sensor_log import SensorMounting
 
 STATES = [(False, False), (True, True), (True, False)]
 """Placed, ambiguous."""
 
 
-def one_anchor(name, placed, ambiguous):
-    """Return an estimate of one anchor whose hypotheses are its name and stay where they are."""
-    bootstrap = BootstrapResult(Graph(np.zeros((1, 3))), np.array([placed]), ((name,),), np.array([ambiguous]))
-    estimate = SimpleNamespace(bootstrap=bootstrap)
-    estimate.with_hypotheses_moved = lambda motion: estimate
-    return estimate
+def one_anchor(x, placed, ambiguous):
+    """Return an estimate of one anchor with a hypothesis at (x, 0)."""
+    graph, where = Graph(np.zeros((2, 3)), np.zeros((1, 2))), AnchorHypothesis(np.array([x, 0.0]), 0.0, 0.1, 0.0, 0.1)
+    return estimate_of(graph, bootstrap=BootstrapResult(graph, np.array([placed]), ((where,),), np.array([ambiguous])))
+
+
+def hypotheses(joined):
+    """Return x of the hypotheses of each anchor."""
+    return [[float(where.position[0]) for where in each] for each in joined.hypotheses]
 
 
 @pytest.mark.parametrize(("first", "second"), list(product(STATES, repeat=2)))
 def test_the_clearer_of_two_recordings_says_where_an_anchor_is(first, second):
     """Placed and clear before placed before not placed; the first recording where both are alike."""
-    estimates, worth = [one_anchor("one", *first), one_anchor("two", *second)], [a + (a and not b) for a, b in (first, second)]
+    estimates, worth = [one_anchor(1.0, *first), one_anchor(2.0, *second)], [a + (a and not b) for a, b in (first, second)]
     joined = _one_bootstrap(estimates, [np.zeros(3)] * 2, [np.array([0])] * 2, 1)
     assert joined.placed.tolist() == [max(worth) > 0]
     assert joined.ambiguous.tolist() == [max(worth) == 1]
-    assert joined.hypotheses == (("two",) if worth[1] > worth[0] else ("one",),)
+    assert hypotheses(joined) == [[2.0] if worth[1] > worth[0] else [1.0]]
 
 
 def test_anchors_of_one_recording_alone_keep_what_it_says_and_none_is_no_bootstrap():
-    estimates = [one_anchor("one", True, True), SimpleNamespace(bootstrap=None), one_anchor("two", True, False)]
-    estimates[1].with_hypotheses_moved = lambda motion: estimates[1]
+    without = estimate_of(Graph(np.zeros((2, 3))), bootstrap=None)
+    estimates = [one_anchor(1.0, True, True), without, one_anchor(2.0, True, False)]
     joined = _one_bootstrap(estimates, [np.zeros(3)] * 3, [np.array([2]), np.zeros(0, int), np.array([0])], 3)
-    assert joined.hypotheses == (("two",), (), ("one",))
+    assert hypotheses(joined) == [[2.0], [], [1.0]]
     assert (joined.placed.tolist(), joined.ambiguous.tolist()) == ([True, False, True], [False, False, True])
     assert _one_bootstrap(estimates[1:2], [np.zeros(3)], [np.zeros(0, int)], 0) is None
 
@@ -72,7 +75,7 @@ def test_anchors_of_one_recording_alone_keep_what_it_says_and_none_is_no_bootstr
 def test_slips_of_one_recording_are_kept_beside_another_without():
     """Those of steps of recordings that show none are 0."""
     wheels = chained(np.zeros((4, 3)), (0.01, 0.01, 0.01))
-    slips, recordings = np.array([0.0, 0.7, 0.2]), SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=4)])
+    slips, recordings = np.array([0.0, 0.7, 0.2]), recordings_of(np.zeros((8, 3)), None, np.repeat([0, 1], 4))
     one = _one_odometry([wheels, replace(wheels, slips=slips)], [np.zeros(0, dtype=np.intp)] * 2, recordings)
     assert one.slips.tolist() == [0.0, 0.0, 0.0, *slips]
     assert one.i.tolist() == [0, 1, 2, 4, 5, 6]
@@ -82,10 +85,10 @@ def test_slips_of_one_recording_are_kept_beside_another_without():
 def test_a_recording_that_nothing_lays_on_the_others_is_refused():
     """One anchor in common leaves the heading open; two whose distance differs by 3 m are no common frame."""
     placed = Places(("A", "B"), np.array([[0.0, 0.0], [8.0, 0.0]]), 0.04 * np.eye(4))
-    recording = SimpleNamespace(name="other.log")
-    with pytest.raises(DataError, match=r"other.log shares 1 placed anchors with the others \(B\)"):
+    recording = standing(each=[{"name": "other.log"}]).each[0]
+    with pytest.raises(DataError, match=r"other.log\) shares 1 placed anchors with the others \(B\)"):
         _laid_on(replace(placed, names=("X", "B")), placed, recording)
-    with pytest.raises(DataError, match=r"other\.log has the anchors A, B in common with the others, but in no two"):
+    with pytest.raises(DataError, match=r"other\.log\) has the anchors A, B in common with the others, but in no two"):
         _laid_on(replace(placed, at=np.array([[0.0, 0.0], [11.0, 0.0]])), placed, recording)
     motion, agree = _laid_on(placed.moved(np.array([3.0, -2.0, 0.7])), placed, recording)
     np.testing.assert_allclose(motion, se2.inverse(np.array([3.0, -2.0, 0.7])), atol=1e-9)
@@ -114,10 +117,16 @@ def mapped(seed, tag, ids):
     return Estimate(graph, wheel, edges, ids, bootstrap), len(frames)
 
 
+def together_of(*estimates):
+    """Return the recordings of estimates, a keyframe at each pose."""
+    poses = [estimate.graph.poses for estimate in estimates]
+    return recordings_of(np.concatenate(poses), None, np.repeat(np.arange(len(poses)), [len(own) for own in poses]))
+
+
 def test_recordings_in_one_graph_have_the_residuals_that_they_had_alone():
     """A rigid motion of a recording with its anchors changes no residual, wherever its tag sits; the second's come behind."""
     (one, first), (two, second) = mapped(1, (0.1, -0.2), ("A", "B", "C")), mapped(2, (-0.3, 0.4), ("D", "E", "F"))
-    recordings = SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=first)])
+    recordings = together_of(one, two)
     motion = np.array([3.0, -1.0, 0.9])
     joined = _one_graph([one, two], [np.zeros(3), motion], [one.anchor_ids, two.anchor_ids], recordings)
     assert joined.anchor_ids == ("A", "B", "C", "D", "E", "F")
@@ -146,8 +155,8 @@ def test_recordings_in_one_graph_have_the_residuals_that_they_had_alone():
 
 
 def test_an_anchor_of_two_recordings_stands_where_the_first_has_it():
-    (one, first), (two, _) = mapped(3, (0.0, 0.0), ("A", "B", "C")), mapped(4, (0.0, 0.0), ("C", "D", "A"))
-    recordings = SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=first)])
+    (one, _), (two, _) = mapped(3, (0.0, 0.0), ("A", "B", "C")), mapped(4, (0.0, 0.0), ("C", "D", "A"))
+    recordings = together_of(one, two)
     joined = _one_graph([one, two], [np.zeros(3)] * 2, [("A", "B", "C"), ("C", "D", "A#2")], recordings)
     assert joined.anchor_ids == ("A", "B", "C", "D", "A#2")
     np.testing.assert_array_equal(joined.graph.anchors, [*one.graph.anchors, *two.graph.anchors[1:]])
@@ -167,8 +176,7 @@ def test_a_third_recording_links_two_and_a_moved_anchor_has_a_place_of_its_own()
         graph = replace(estimate.graph, anchors=se2.transform(se2.inverse(frame), places))
         estimates.append(replace(estimate, graph=graph))
         poses.append(poses[-1] + count)
-    recordings = SimpleNamespace(each=[SimpleNamespace(first=k, name=f"{k}.log") for k in poses[:3]])
-    joined = join(estimates, recordings)
+    joined = join(estimates, together_of(*estimates))
     assert joined.anchor_ids == ("A", "B", "C", "D", "E", "F", "C#3")
     expected = [*world.values(), (32.0, 38.0)]
     np.testing.assert_allclose(joined.graph.anchors, expected, atol=1e-6)
@@ -253,12 +261,8 @@ def test_places_have_the_joint_covariance_of_the_graph_and_open_ones_some_metres
     full = anchor_covariance(graph.with_edges(ranges), np.array([0, 1]))
     blocks = marginals(graph.with_edges(ranges)).covariances.anchors
     np.testing.assert_allclose([full[:2, :2], full[2:, 2:]], blocks[:2], rtol=1e-9)
-    bootstrap = SimpleNamespace(ambiguous=np.zeros(3, dtype=bool))
-    estimate = SimpleNamespace(
-        graph=graph, placed=np.ones(3, dtype=bool), odometry_and_ranges=(ranges,), anchor_ids=("A", "B", "C"),
-        bootstrap=bootstrap,
-    )  # fmt: skip
+    estimate = estimate_of(graph, ranges=ranges, anchor_ids=("A", "B", "C"))
     places = places_of(estimate)
     np.testing.assert_allclose(places.covariance[:2, :2], full[:2, :2], rtol=1e-3)
     np.testing.assert_allclose(np.diag(places.covariance)[4:], 25.0, rtol=0.05)
-    assert places_of(SimpleNamespace(bootstrap=None)).names == ()
+    assert places_of(replace(estimate, bootstrap=None)).names == ()

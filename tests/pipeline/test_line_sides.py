@@ -52,9 +52,7 @@ def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
     assert error(best.poses, true) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("beside", "line"), [([], 1), ([4.0], 1), ([4.0, -4.0], 0), ([0.5, -0.5, 0.5], 1)]
-)
+@pytest.mark.parametrize(("beside", "line"), [([], 1), ([4.0], 1), ([4.0, -4.0], 0), ([0.5, -0.5, 0.5], 1)])
 def test_anchors_stand_on_a_line_but_for_one(beside, line):
     """Four of them along a wall at y = 2, and more beside it; in a corridor 1 m wide none is far enough across."""
     along = np.column_stack([np.arange(4) * 9.0, np.full(4, 2.0)])

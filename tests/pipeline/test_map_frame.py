@@ -1,10 +1,10 @@
 """Alignment and cropping: angles are found, chi2 stays, cells keep their places."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_tasks import estimate_of, task_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +14,10 @@ from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.lidar.clouds import Clouds
+from uwblite.pipeline.estimate import ScanClouds
 from uwblite.pipeline.map_frame import ALIGNMENTS, _quarter, alignment, alignment_of, cropped, moved, wall_direction
+from uwblite.pipeline.mapping_config import MappingConfig
 
 RNG = np.random.default_rng(2)
 
@@ -120,14 +123,15 @@ def test_the_walls_of_all_clouds_are_taken_as_the_poses_lie():
     """Each cloud's normals turned by its own pose's heading; without any the walls cannot be aligned with."""
     angle, headings = 0.2, np.array([0.3, 1.9, -2.0])
     each = [walls(angle - heading, n=400) for heading in headings]
-    clouds = SimpleNamespace(owner=np.repeat(np.arange(3), 400), normals=np.concatenate(each))
+    normals, owner = np.concatenate(each), np.repeat(np.arange(3, dtype=np.int32), 400)
+    clouds = Clouds(400 * np.arange(4), np.zeros_like(normals), normals, owner, np.zeros(len(normals)))
     poses = np.column_stack([RNG.normal(size=(3, 2)), headings])
-    estimate = SimpleNamespace(graph=Graph(poses), placed=np.zeros(0, dtype=bool), scans=SimpleNamespace(clouds=clouds))
-    motion = alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="walls")))
+    estimate = estimate_of(Graph(poses), scans=ScanClouds(clouds, None, 0.0))
+    by_walls, by_odometry = (task_of(config=MappingConfig(align=how)) for how in ("walls", "odometry"))
+    motion = alignment_of(estimate, by_walls)
     turned = se2.compose(motion, poses)
     np.testing.assert_allclose(turned[0, :2], 0.0, atol=1e-12)
     assert abs(np.exp(4j * (motion[2] + angle)) - 1.0) < 4 * np.radians(0.5)
-    np.testing.assert_array_equal(alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="odometry"))), 0.0)
-    estimate.scans = None
+    np.testing.assert_array_equal(alignment_of(estimate, by_odometry), 0.0)
     with pytest.raises(DataError, match="no walls"):
-        alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="walls")))
+        alignment_of(replace(estimate, scans=None), by_walls)

@@ -85,9 +85,11 @@ def test_absurd_readings_count_for_nothing_even_squared(log, result):
     # No two alike: one that returns is a mark and left out before.
     spoilt[::9], spoilt[4::9] = 0.0, 1e4 + np.arange(len(spoilt[4::9]))
     radio = next(
-        e for e in build_map(
+        e
+        for e in build_map(
             replace(log, ranges=replace(log.ranges, ranges=spoilt)), replace(preset("paper"), use_lidar=False)
-        ).graph.edges if isinstance(e, RangeEdges)
+        ).graph.edges
+        if isinstance(e, RangeEdges)
     )
     np.testing.assert_array_equal(radio.weights[::9], 0.0)
     np.testing.assert_array_equal(radio.weights[4::9], 0.0)

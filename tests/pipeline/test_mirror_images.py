@@ -1,11 +1,11 @@
 """A straight path leaves an anchor its mirror image; a bend in it, or a range that decides, does not."""
 
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.planted_graphs import plain_ranges, relative_edges
+from helpers.planted_tasks import estimate_of, task_of
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
@@ -14,30 +14,19 @@ from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.pipeline.mirror_images import _costs, _images, _second_places, find_mirror_images, mirrored_whole
+from uwblite.radio.bootstrap_attempt import BootstrapResult
+from uwblite.radio.trilateration import AnchorHypothesis
 
 ANCHOR = np.array([4.0, 3.0])
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What the stage asks of an estimate."""
-
-    graph: Graph
-    ranges: RangeEdges
-    bootstrap: SimpleNamespace
-    placed: np.ndarray
+def place(position):
+    """Return the hypothesis that an anchor is there."""
+    return AnchorHypothesis(np.asarray(position), 0.0, 0.1, 0.0, 0.1)
 
 
-@dataclass(frozen=True)
-class Bootstrap:
-    placed: np.ndarray
-    ambiguous: np.ndarray
-    hypotheses: tuple
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    position: np.ndarray
+def estimated(graph, ranges, placed, ambiguous, hypotheses):
+    return estimate_of(graph, ranges=ranges, bootstrap=BootstrapResult(graph, placed, hypotheses, ambiguous))
 
 
 def estimate(bend, believed=ANCHOR):
@@ -52,12 +41,10 @@ def estimate(bend, believed=ANCHOR):
     )  # fmt: skip
     poses, known = np.column_stack([tags, np.zeros(count)]), np.ones(count, dtype=bool)
     graph = Graph(poses, np.array([believed]), (edges,), fixed_poses=known)
-    found = Bootstrap(np.array([True]), np.array([False]), ((Hypothesis(np.array(believed)),),))
-    return Estimate(graph, edges, found, found.placed)
+    return estimated(graph, edges, np.array([True]), np.array([False]), ((place(believed),),))
 
 
-TASK = SimpleNamespace(config=SimpleNamespace(solver=SolverConfig()), recordings=SimpleNamespace(have_scans=True))
-WITHOUT_LIDAR = SimpleNamespace(config=TASK.config, recordings=SimpleNamespace(have_scans=False))
+TASK, WITHOUT_LIDAR = task_of(lidar=True), task_of(lidar=False)
 
 
 @pytest.mark.parametrize(("bend", "ambiguous"), [(0.0, True), (0.05, True), (1.0, False), (3.0, False)])
@@ -121,15 +108,13 @@ def test_what_ranges_of_little_worth_say_together_decides():
 
 def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path():
     before = estimate(3.0)
-    unsure = replace(
-        before.bootstrap, ambiguous=np.array([True]), hypotheses=((Hypothesis(ANCHOR), Hypothesis(ANCHOR * (1, -1))),)
-    )
+    unsure = replace(before.bootstrap, ambiguous=np.array([True]), hypotheses=((place(ANCHOR), place(ANCHOR * (1, -1))),))
     assert not find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap.ambiguous.any()
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_an_anchor_that_later_moved_to_its_second_place_is_ambiguous_with_its_first(side):
-    places = (Hypothesis(ANCHOR), Hypothesis(ANCHOR * (1.0, -1.0)))
+    places = (place(ANCHOR), place(ANCHOR * (1.0, -1.0)))
     before = estimate(0.0, ANCHOR * (1.0, side))
     unsure = replace(before.bootstrap, ambiguous=np.array([True]), hypotheses=(places,))
     done = find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap
@@ -155,15 +140,14 @@ def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best
     alive = np.arange(40) % 5 != 0
     ranges = replace(plain_ranges(np.arange(40), anchor, np.ones(40), 0.1), weights=alive.astype(float))
     places = rng.normal(size=(4, 2)) * 5.0
-    second = Hypothesis(np.array([7.0, 7.0]))
+    second = place(np.array([7.0, 7.0]))
     graph = Graph(np.column_stack([tags, np.zeros(40)]), places.copy())
-    found = Bootstrap(
-        np.array([True, True, False, True]), np.array([False, True, False, True]), ((), (second, second), (), (second,))
-    )
-    images, straight = _images(Estimate(graph, ranges, found, found.placed), ranges)
+    placed, ambiguous = np.array([True, True, False, True]), np.array([False, True, False, True])
+    before = estimated(graph, ranges, placed, ambiguous, ((), (second, second), (), (second,)))
+    images, straight = _images(before, ranges)
     assert straight.tolist() == [True, True, False, True]
     np.testing.assert_array_equal(images[2], places[2])
-    np.testing.assert_array_equal(_second_places(Estimate(graph, ranges, found, found.placed))[[0, 1]], [places[0], [7.0, 7.0]])
+    np.testing.assert_array_equal(_second_places(before)[[0, 1]], [places[0], [7.0, 7.0]])
     for k in (0, 1, 3):
         own = tags[(anchor == k) & alive]
         middle, (_, _, (along, across)) = own.mean(axis=0), np.linalg.svd(own - own.mean(axis=0))
@@ -175,18 +159,18 @@ def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best
 def test_two_ranges_from_beside_a_straight_way_hide_no_mirror_image():
     """They tilt the line that fits all places of the tag, but say little: the bootstrap's second place is tried as well."""
     tags = np.concatenate([np.column_stack([np.linspace(0.0, 10.0, 18), np.zeros(18)]), [[21.4, 17.7], [21.8, 17.8]]])
-    place, image = np.array([-2.0, -36.0]), np.array([-2.0, 36.0])
+    there, image = np.array([-2.0, -36.0]), np.array([-2.0, 36.0])
     noise = np.random.default_rng(2).normal(0.0, 0.1, 20)
     measured = np.hypot(*(tags - image).T) + noise
     # Seen from beside, both places are as far.
-    measured[18:] = np.hypot(*(tags[18:] - place).T)
+    measured[18:] = np.hypot(*(tags[18:] - there).T)
     ranges = plain_ranges(np.arange(20), np.zeros(20, dtype=np.intp), measured, 0.1)
     ranges = replace(ranges, weights=np.where(np.arange(20) < 18, 1.0, 1e-5))
     poses, known = np.column_stack([tags, np.zeros(20)]), np.ones(20, dtype=bool)
-    graph = Graph(poses, place[None], (ranges,), fixed_poses=known)
-    for second, ambiguous in (((), False), ((Hypothesis(image),), True)):
-        found = Bootstrap(np.ones(1, dtype=bool), np.zeros(1, dtype=bool), ((Hypothesis(place), *second),))
-        done = find_mirror_images(Estimate(graph, ranges, found, found.placed), TASK).bootstrap
+    graph = Graph(poses, there[None], (ranges,), fixed_poses=known)
+    for second, ambiguous in (((), False), ((place(image),), True)):
+        yes = np.ones(1, dtype=bool)
+        done = find_mirror_images(estimated(graph, ranges, yes, ~yes, ((place(there), *second),)), TASK).bootstrap
         assert done.ambiguous.tolist() == [ambiguous]
         if ambiguous:
             np.testing.assert_allclose(done.hypotheses[0][1].position, image, atol=1.0)

@@ -13,7 +13,6 @@ from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
-from uwblite.pipeline import recordings
 from uwblite.pipeline.calibration_checks import with_given_mounting_and_clock
 from uwblite.pipeline.recordings import prepared, thinned
 from uwblite.sensor_log import Odometry, SensorLog
@@ -56,12 +55,11 @@ def test_a_map_of_the_thinned_recording_is_the_same_map():
     assert whole.grid.scans_used == part.grid.scans_used
 
 
-def test_a_recording_is_prepared_once(monkeypatch):
+def test_a_recording_is_prepared_once():
     config = MappingConfig()
     once = prepared(planted(4, 3.0), config)
     assert once.screening is not None
     assert once.notes.scans_left_out > 0
-    monkeypatch.setattr(recordings, "thinned", None)
     again = prepared(once, config)
     assert (again.scans, again.odometry, again.notes) == (once.scans, once.odometry, once.notes)
     assert prepared(once, replace(config, use_lidar=False)).scans is None

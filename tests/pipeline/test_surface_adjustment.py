@@ -16,7 +16,6 @@ from uwblite.graph.normal_equations import filled
 from uwblite.graph.solver import optimize
 from uwblite.lidar.ray_equations import linearized
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
 
@@ -124,12 +123,12 @@ def test_without_pairs_of_clouds_nothing_is_adjusted(around):
     assert adjust_surfaces(none, around["task"]) is none
 
 
-def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around, monkeypatch):
-    """What stands before is a rough one."""
+def test_without_surfaces_the_pairs_alone_are_brought_to_their_optimum(around):
+    """The rays of a lidar that sees nothing are on no wall. What stands before is a rough one."""
     before = around["before"]
-    measured = around["after"].surfaces
-    nothing = replace(measured, rays=measured.rays.rows(slice(0)))
-    monkeypatch.setattr(surface_adjustment, "find_surfaces", lambda *_: nothing)
-    found = adjust_surfaces(before, around["task"])
+    (one,) = around["task"].recordings.each
+    scans = replace(one.log.scans, ranges=np.full_like(one.log.scans.ranges, np.inf))
+    recordings = replace(around["task"].recordings, each=(replace(one, log=replace(one.log, scans=scans)),))
+    found = adjust_surfaces(before, replace(around["task"], recordings=recordings))
     assert found.surfaces is None
     assert before.problem.chi2() > found.problem.chi2() >= optimize(found.problem)[0].chi2() * (1.0 - 1e-6)

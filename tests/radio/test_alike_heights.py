@@ -81,7 +81,7 @@ def test_the_common_mean_is_that_of_well_measured_heights(spread):
     """Of many heights that ranges show well, mean and spread are theirs."""
     rng = np.random.default_rng(3)
     true = 2.0 + spread * rng.standard_normal(40)
-    covariance = np.diag(1.0 / (0.05**-2.0 + 2.25 ** -2.0) * np.ones(40))
+    covariance = np.diag(1.0 / (0.05**-2.0 + 2.25**-2.0) * np.ones(40))
     values = covariance @ (true / 0.05**2)
     mean, width = _common(values, covariance, np.full(40, 2.25))
     assert mean == pytest.approx(true.mean(), abs=0.05)

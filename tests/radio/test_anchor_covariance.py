@@ -244,3 +244,13 @@ def test_where_nothing_is_assumed_to_be_steady_or_no_range_counts_covariances_st
         assert with_correlated_errors(found, graph, ranges, config) is found.covariances
     whole = np.full((len(graph.anchors), 2, 2), 3.0)
     assert anchors_with_correlated_errors(graph, edges, whole, RangeNoiseConfig(steady=0.0)) is whole
+
+
+def test_ranges_that_were_left_out_change_nothing():
+    graph, edges = known_world()
+    every = np.arange(len(edges)) % 5 == 0
+    weighed = replace(edges, weights=np.where(every, 0.0, edges.weights), ranges=edges.ranges + 3.0 * every)
+    kept = edges.rows(np.flatnonzero(~every))
+    found, alone = (anchors_with_correlated_errors(graph.with_edges(each), each, WHOLE, CONFIG) for each in (weighed, kept))
+    np.testing.assert_allclose(found, alone, rtol=1e-9)
+    assert np.abs(found - WHOLE).max() > 1e-6

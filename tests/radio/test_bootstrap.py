@@ -147,7 +147,9 @@ def test_the_result_does_not_depend_on_where_the_recording_starts(seed):
     )
     back = reversed_in_time(wheels, radio)
     for (one, other), stated, true in (
-        ((wheels, radio), stamps, truth), (back, stamps, truth[::-1]), ((shorter, fewer), stamps, truth),
+        ((wheels, radio), stamps, truth),
+        (back, stamps, truth[::-1]),
+        ((shorter, fewer), stamps, truth),
     ):
         bootstrapped, at = start(one, other)
         error, anchor_error = judged(bootstrapped, at, stated, true, places)

@@ -232,3 +232,14 @@ def test_neighbouring_ranges_count_once_in_the_evidence_and_every_slip_has_its_p
     before = attempt.evidence()
     attempt.slips[[5, 20]] = 1.0
     assert attempt.evidence() < before - 2.0 * np.log(EVERY / LASTS)
+
+
+def test_an_attempt_from_the_middle_goes_on_until_it_has_the_way_that_is_asked_for():
+    class FromTheMiddle(Scheduled):
+        def _seed(self):
+            self.low, self.high = 30, 50
+            return 20.0
+
+    one = FromTheMiddle(100, [True] * 20, [False] * 20)
+    one.run(30.0)
+    assert one.path[one.high - 1] - one.path[one.low] >= 30.0 > one.path[one.high - 5] - one.path[one.low]

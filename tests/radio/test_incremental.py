@@ -47,7 +47,7 @@ def test_a_part_that_does_not_fit_is_solved_with_ever_more_of_the_path(fits_from
     part = _Incremental._fit(stand_in, 900, everything)
     assert part.low == lows[-1]
     assert [low <= fits_from or low == 0 for low in lows] == [False] * (len(lows) - 1) + [True]
-    assert lows[0] == (0 if everything else 900 - incremental._WINDOW)
+    assert lows[0] == (0 if everything else 900 - incremental.IncrementalPolicy.window)
     assert np.all(np.diff(900 - np.array([low for low in lows if low]), prepend=0) > 0)
 
 
@@ -143,7 +143,7 @@ def test_results_are_the_same_every_time():
 
 @pytest.fixture
 def short_probation(monkeypatch):
-    monkeypatch.setattr(incremental, "_PROBATION", 250)
+    monkeypatch.setattr(incremental.IncrementalPolicy, "window", 250)
 
 
 def _with_wrong_anchor(joined_at, wrong=5, n=400):
@@ -221,7 +221,7 @@ def test_an_anchor_is_searched_once_there_are_ranges_and_again_with_a_fifth_more
 
 
 def test_a_place_that_is_not_certain_does_not_join_yet(monkeypatch):
-    monkeypatch.setattr(incremental, "_MAX_POSITION_SIGMA", 1e-6)
+    monkeypatch.setattr(incremental.IncrementalPolicy, "position_sigma", 1e-6)
     state = _one_anchor(True)
     state._search(60)
     assert state.tried[0] == 60

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.radio.nlos_mixture import RangeMixture, _mean_detour, fit, shortest_half
+from uwblite.radio.nlos_mixture import RangeMixture, _densities, fit, shortest_half
 
 shapes = st.builds(
     RangeMixture,
@@ -74,7 +74,7 @@ def test_the_expected_detour_of_a_late_range_is_the_mean_over_all_detours(sigma,
     weight = np.exp(log_weight - log_weight.max())
     expected = np.sum(weight * grid) / np.sum(weight)
     # The sum's step is sigma / 950 at most; half a step is how far its first cell errs.
-    assert _mean_detour(np.array([off]), sigma, detour)[0] == pytest.approx(expected, rel=5e-3, abs=2e-3 * sigma)
+    assert _densities(np.array([off]), sigma, detour)[2][0] == pytest.approx(expected, rel=5e-3, abs=2e-3 * sigma)
 
 
 @given(shapes)

@@ -133,9 +133,15 @@ def driven(seed, scale=1.0, unit=1.0):
 @pytest.mark.parametrize(
     ("scale", "unit", "wide"),
     [
-        (1.0, 1.0, None), (1.004, 0.97, None),
-        (1.07, 1.0, "range_scale"), (0.93, 1.0, "odometry_scale"), (1.0, 1.1, "odometry_scale"), (1.0, 0.9, "odometry_scale"),
-        (1.0, 1.4, "odometry_scale"), (1.0, 0.7, "odometry_scale"), (1.0, 2.0, "odometry_scale"),
+        (1.0, 1.0, None),
+        (1.004, 0.97, None),
+        (1.07, 1.0, "range_scale"),
+        (0.93, 1.0, "odometry_scale"),
+        (1.0, 1.1, "odometry_scale"),
+        (1.0, 0.9, "odometry_scale"),
+        (1.0, 1.4, "odometry_scale"),
+        (1.0, 0.7, "odometry_scale"),
+        (1.0, 2.0, "odometry_scale"),
     ],
 )
 def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):

@@ -61,7 +61,10 @@ def test_the_prior_is_the_share_of_time_and_three_parameters():
     assert log_prior(10.0 * EVERY, 1) == 0.0
 
 
-@pytest.mark.parametrize(("seed", "moments"), [(1, (90.0,)), (2, (60.0, 150.0)), (3, (20.0, 110.0))])
+@pytest.mark.parametrize(
+    ("seed", "moments"),
+    [(3, (20.0, 110.0)), *(pytest.param(*each, marks=pytest.mark.slow) for each in [(1, (90.0,)), (2, (60.0, 150.0))])],
+)
 def test_a_path_by_wheels_that_slip_and_ranges_alone(seed, moments):
     """By bent wheels it is wrong by metres."""
     rng = np.random.default_rng(seed)

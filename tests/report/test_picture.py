@@ -68,8 +68,7 @@ def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
     assert share(image[: rows.max()], PATH, 60) == 0
 
 
-@pytest.mark.parametrize("size", [240, 300, 2000])
-@pytest.mark.parametrize("resolution", [0.01, 0.05, 0.3])
+@pytest.mark.parametrize(("size", "resolution"), [(240, 0.01), (240, 0.3), (300, 0.05), (2000, 0.05)])
 def test_thin_walls_survive_every_scale(size, resolution):
     image = draw_map(room(200, 300, resolution), PATH_IN_ROOM[:1], size=size)
     image = image[: -foot_height(image.shape[1], KEYS)]
@@ -280,3 +279,17 @@ def test_the_picture_of_errors_says_what_it_shows():
 def test_a_name_stands_right_of_its_mark_where_it_is_inside_the_picture(at, corner):
     """Else to the left, or below; on a bright picture 200 pixels wide, the name 60 pixels wide and 14 high."""
     assert picture._room_for(np.full((120, 200, 3), 255, dtype=np.uint8), *at, 60, 14) == corner
+
+
+def test_an_ellipse_is_of_two_standard_deviations_on_every_side_of_its_anchor():
+    """Drawn thinly on a white floor: its middle, and four standard deviations along each axis, lengthwise and across."""
+    grid, sigma = room(), np.array([0.5, 0.2])
+    grid.log_odds[:] = -5.0
+    each = [PictureAnchor("", np.array([1.0, 3.0]), np.diag(variance)) for variance in (np.full(2, 1e-9), sigma**2)]
+    plain, drawn = (draw_map(grid, np.zeros((0, 2)), Overlay([anchor]), size=900) for anchor in each)
+    rows, cols = np.nonzero(np.any(plain != drawn, axis=2))
+    extent = np.array([np.ptp(cols), np.ptp(rows)])
+    mark = np.abs(plain[: rows.max()].astype(int) - ANCHOR).max(axis=-1) < 12
+    ink = np.argwhere(mark)[:, ::-1].mean(axis=0)
+    assert extent[0] / extent[1] == pytest.approx(2.5, rel=0.1)
+    np.testing.assert_allclose([(cols.min() + cols.max()) / 2, (rows.min() + rows.max()) / 2], ink, atol=0.1 * extent[1])

@@ -4,23 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import planted
 from helpers.told import told
 
-from uwblite import se2
 from uwblite.screening import range_motion
 from uwblite.screening.range_motion import (
-    DelayPolicy,
     _agreed,
     _by_anchor,
     _driven,
     _jumps,
-    _log_likelihoods,
     _noise,
     _together,
     change_by_way,
     excess,
-    without_delay,
     without_shared_names,
 )
 from uwblite.screening.stuck_sensors import quiet_noise, resolution_of
@@ -328,63 +323,3 @@ def test_what_there_is_nothing_to_see_in():
         assert without_shared_names(few) == (few, [])
     still = replace(log, odometry=Odometry(log.odometry.stamps[:1], log.odometry.poses[:1]))
     assert without_shared_names(still) == (still, [])
-
-
-CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
-
-
-def late_by(seconds, seed=1, metres=100.0, still=()):
-    """Return a drive of 200 s among four anchors; ranges are stamped late, and wheels count nothing at times, s."""
-    rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, metres)
-    wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.01, turn_noise=0.01)
-    steps = se2.between(wheels.poses[:-1], wheels.poses[1:])
-    for begin, end in still:
-        steps[(stamps[1:] > begin) & (stamps[1:] < end)] = 0.0
-    radio = planted.ranges(rng, stamps, truth, CORNERS, rate=0.5, sigma=0.05, outliers=0.05)
-    return SensorLog(
-        replace(wheels, poses=se2.chain(wheels.poses[0], steps)), replace(radio, stamps=radio.stamps + seconds), None
-    )
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("late", [-18.0, 5.0])
-def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
-    log = late_by(late, seed)
-    moved, (fact,) = without_delay(log)
-    assert fact.kind == "late-ranges"
-    assert fact.figures["late"] == pytest.approx(late, abs=1.0)
-    np.testing.assert_allclose(moved.ranges.stamps, log.ranges.stamps - fact.figures["late"])
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("still", [(), ((80.0, 100.0),), ((100.0, 200.0),)])
-def test_a_radio_in_time_is_left_whatever_the_wheels_do(seed, still):
-    """Wheels that stand still for a time, or from half time on, make no clock."""
-    log = late_by(0.0, seed, still=still)
-    assert without_delay(log) == (log, [])
-    nothing = replace(log, ranges=None)
-    assert without_delay(nothing) == (nothing, [])
-
-
-@pytest.mark.parametrize("seed", [0, 2, 3])
-def test_windows_that_each_show_another_offset_show_none(seed):
-    """Wheels that turn at random for a quarter of an hour: without that criterion, these ranges would be moved by up to 1 s."""
-    rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, 400.0)
-    wheels = planted.odometry(stamps, truth, rng, noise=0.05, turn_noise=0.6)
-    log = SensorLog(wheels, planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.15, outliers=0.1), None)
-    assert without_delay(log, DelayPolicy(contradicts=1e-300))[1]
-    assert without_delay(log) == (log, [])
-
-
-def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
-    """Against a search over places: Cauchy errors of ranges from one place, the better path the likelier."""
-    rng = np.random.default_rng(0)
-    paths = rng.normal(size=(2, 30, 2)) * 3.0
-    values = np.hypot(*(paths[0] - [7.0, -4.0]).T) + 0.05 * rng.standard_normal(30)
-    one, other = _log_likelihoods(paths, values, 0.2)
-    around = np.stack(np.meshgrid(np.linspace(6.0, 8.0, 81), np.linspace(-5.0, -3.0, 81)), axis=-1).reshape(-1, 1, 2)
-    best = -np.log1p(((np.hypot(*np.moveaxis(paths[0] - around, -1, 0)) - values) / 0.2) ** 2).sum(axis=1).min()
-    assert one == pytest.approx(best, abs=0.1)
-    assert other < one - 10.0

@@ -105,7 +105,7 @@ def test_a_thousand_anchors_are_enough():
         SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), radio)
 
 
-@pytest.mark.parametrize("name", ["5C0B", "A@2", "-17", "anchor#2", "\u00c4nker,\"1\"", "x" * 64])
+@pytest.mark.parametrize("name", ["5C0B", "A@2", "-17", "anchor#2", '\u00c4nker,"1"', "x" * 64])
 def test_ids_of_anchors_are_words(name):
     assert fault_of_id(name) == ""
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwblite.localization.records import LocalizerState
+from uwblite.localization import LocalizerState
 from uwblite.server.pose_status import PoseStatus
 
 KNOWN = LocalizerState(10.0, np.array([1.0, 2.0, 0.5]), np.diag([4e-4, 9e-4, 1e-4]), 0.9, np.zeros(3), False)

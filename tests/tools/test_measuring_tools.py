@@ -79,7 +79,6 @@ def test_consistency_goes_on_where_an_earlier_call_stopped(tmp_path, monkeypatch
     assert "| warehouse | 3 |" in capsys.readouterr().out
 
 
-
 def test_a_trial_is_judged_by_all_figures(trial, result):
     found = trials.judged(result, trial)
     assert 0.0 < found.ate < 0.1

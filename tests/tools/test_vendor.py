@@ -37,7 +37,8 @@ write_result("out", [log], result, RunRecord("", ""))
 assert result.grid is not None
 """,
     "solve": SOLVE,
-    "covariances": SOLVE + """
+    "covariances": SOLVE
+    + """
 from acme._copy.graph.marginals import marginals
 assert marginals(solved).covariances.poses.shape == (3, 3, 3)
 """,

@@ -42,8 +42,8 @@ class UwbBoard:
         out = b""
         while self._feed.head is not None and (due := self._clock.host(self._feed.head.time)) <= now:
             epoch = self._feed.pop()
-            self._on_fix(due, epoch.readings)
             self._number += 1
+            self._on_fix(due, answered(epoch, self._number) if self._write is dwm3001 else epoch.readings)
             out += self._write(epoch, self._number, math.floor(1000 * (due - self._power)))
         return out
 
@@ -74,11 +74,16 @@ def bu01(epoch: Epoch, number: int, ms: int) -> bytes:
     return "".join(f"an{i}:{mm / 1000:.2f}m\r\n" for i, mm in enumerate(slots(epoch)) if mm).encode()
 
 
+def answered(epoch: Epoch, number: int) -> list[tuple[int, int, int]]:
+    """Return the readings of a round of a DWM3001CDK: in every tenth one anchor does not answer."""
+    return epoch.readings[1:] if number % 10 == 0 else epoch.readings
+
+
 def dwm3001(epoch: Epoch, number: int, ms: int) -> bytes:
-    """Write as the CLI firmware of the DWM3001CDK does; every tenth round one anchor does not answer."""
+    """Write as the CLI firmware of the DWM3001CDK does."""
     angles = '"LPDoA_deg":0.00,"LAoA_deg":0.00,"LFoM":0,"RAoA_deg":0.00,"CFO_100ppm":622'
     rows = [f'{{"Addr":"0x{a:04X}","Status":"Ok","D_cm":{round(mm / 10)},{angles}}}' for a, mm, _ in epoch.readings]
-    if number % 10 == 0 and rows:
+    if len(answered(epoch, number)) < len(rows):
         rows[0] = rows[0].partition("Ok")[0] + 'Err"}'
     return f'{{"Block":{number}, "results":[{",".join(rows)}]}}\r\n'.encode()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 WHEELS = (
     "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-steps", "odometry-unit", "drift",
     "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
-    "unusual-calibration", "scales", "laser-turned-over", "path-displaced",
+    "unusual-calibration", "scales", "laser-turned-over", "path-displaced", "wheels-against-ranges",
 )  # fmt: skip
 LIDAR = (
     "laser-turned-over", "laser-turned-away", "scans-do-not-match", "wheels-against-lidar", "free-space-violation",
@@ -17,7 +17,7 @@ LIDAR = (
 RADIO = (
     "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
     "anchor-mirror-ambiguous", "moved-anchor", "shared-name", "repeated-ranges", "marked-ranges", "sustained-outliers",
-    "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales",
+    "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales", "exchanged-names",
 )  # fmt: skip
 CLOCKS = (
     "clock-set-back", "clock-jump", "stamps-in-bursts", "stamps-of-receipt", "made-up-stamps", "late-scans", "late-ranges",
@@ -43,7 +43,7 @@ OWN = {
     "two logs in one, overlapping by 25 s": ("two robots", "set back"), "two anchors with one name": ("shared-name",),
     "two buildings in one log": (*CUT, "free-space-violation"),
     "all ranges 2 m longer from half time": (*RADIO, "anchor-heights"),
-    "ranges 5 s late": CLOCKS, "ranges 18 s late": CLOCKS,
+    "the radio's clock runs 2 % fast": (*RADIO, "late-ranges"), "ranges 5 s late": CLOCKS, "ranges 18 s late": CLOCKS,
     "lidar 1 s late": (*CLOCKS, "wheels-against-lidar"), "odometry 1 s late": (*CLOCKS, "wheels-against-lidar"),
     "ranges beyond 5 m reported as 5 m": ("marked-ranges",), "half missing, stamps closed up, counted from zero": CUT,
     "the clock of all runs 1 % fast": CLOCKS, "nine of ten readings lost": (*RADIO, "uncertain", *CUT),

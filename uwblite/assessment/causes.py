@@ -46,6 +46,8 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
         "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
+        "exchanged-names": _of(_BY_RANGES, "worse-than-parts odometry-steps untied-parts"),
+        "wheels-against-ranges": _BY_RANGES,
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
         "made-up-stamps": _TIMES,
         "stamps-of-receipt": _TIMES,
@@ -83,7 +85,7 @@ _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
             _TIMES,
             _BY_RANGES,
             "ranges-outside-odometry worse-than-parts range-scatter carried spikes few-in-reach few-ranges no-ranges",
-            "untied-parts odometry-alone",
+            "untied-parts odometry-alone odometry-steps",
         ),
         "lidar": _of(_TIMES, _BY_SCANS, _PLACES, "wheels-against-lidar carried no-lidar range-scatter path-displaced"),
     }

@@ -47,23 +47,20 @@ def anchor_heights(height: float, taken: bool, apart: float) -> Finding:
 
 
 def moved_anchor(
-    anchor: str,
-    distance: float,
-    recording: int = 0,
-    new_id: str = "",
-    between: Sequence[float] = (),
-    way: int = 0,
-    several: bool = False,
+    anchor: str, distance: float, recording: int = 0, new_id: str = "", between: Sequence[float] = (), several: bool = False
 ) -> Finding:
-    """Warn of an anchor that stands elsewhere from some time on, in another recording, or than in an earlier map."""
+    """Warn of an anchor that stands elsewhere from some time on, in another recording, or than in an earlier map.
+
+    `between` holds the last time at the one place, the first at the other, s, and the number of ranges meanwhile.
+    """
     if not recording:
         text = f"anchor {anchor} stands {distance:.2f} m from its earlier place: it was moved"
     elif not between:
         text = f"anchor {anchor} was moved: in recording {recording} it stands {distance:.2f} m away, and is called {new_id}"
     else:
-        begin, end = between
+        begin, end, way = between
         when = f"between t = {begin:.0f} and {end:.0f} s" if way else f"at about t = {end:.0f} s"
-        less = f" (its {way} ranges meanwhile were left out)" if way else ""
+        less = f" (its {way:.0f} ranges meanwhile were left out)" if way else ""
         where = f"recording {recording}: " if several else ""
         text = f"{where}anchor {anchor} was moved by {distance:.1f} m {when}{less}; from then on it is called {new_id}"
     return Finding("moved-anchor", WARNING, text, recording=recording, anchor=anchor)

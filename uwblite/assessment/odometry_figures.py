@@ -11,8 +11,8 @@ from ..findings import NOTE, WARNING, Finding
 from ..screening.units import CLEARLY, heading_agreement, heading_reading
 from ..sensor_log import Odometry
 
-_FINEST = 1e-6
-"""s; stamps are written no finer, and differences below are those of numbers that are no times."""
+FINEST = 1.5e-6
+"""s; stamps are written no finer than 1e-6, which `record` puts between rows that came in one piece: no time lies between."""
 _SOME = 0.02
 """Share of the time in silences, or of equal stamps, from which on they cost accuracy."""
 _LONG = 5.0
@@ -29,11 +29,11 @@ def rhythm(stamps: Floats, *, expected_gap: float, repeated: float | None = None
     repeated : share of equal stamps that is not right, where some are; None = any is wrong.
     """
     steps = np.diff(stamps)
-    some = steps > _FINEST
+    some = steps > FINEST
     period = float(np.median(steps[some])) if some.any() else 0.0
     gap = max(expected_gap, 5.0 * period)
     longest = int(np.argmax(steps)) if len(steps) else 0
-    equal = float(np.mean(steps == 0)) if len(steps) else 0.0
+    equal = float(np.mean(~some)) if len(steps) else 0.0
     return {
         "count": len(stamps),
         "duration s": round(float(stamps[-1] - stamps[0]), 3),

@@ -9,7 +9,7 @@ from ..arrays import Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, SensorLog, UwbRanges, plausible
-from .odometry_figures import STRAIGHT, check_equal_stamps, check_silences, rhythm, straightness
+from .odometry_figures import FINEST, STRAIGHT, check_equal_stamps, check_silences, rhythm, straightness
 
 FEW = 10
 """Ranges from which an anchor cannot be placed."""
@@ -60,7 +60,7 @@ def _repeats(ranges: UwbRanges) -> float:
     """
     order = np.lexsort((ranges.stamps, ranges.anchor))
     stamps, anchor = ranges.stamps[order], ranges.anchor[order]
-    again = (stamps[1:] == stamps[:-1]) & (anchor[1:] == anchor[:-1])
+    again = (np.diff(stamps) <= FINEST) & (anchor[1:] == anchor[:-1])
     return float(np.mean(again)) if len(again) else 0.0
 
 

@@ -89,6 +89,28 @@ def late_ranges(late: float) -> Finding:
     return replace(doubt("late-ranges", text), sensor="radio")
 
 
+def exchanged_names(begin: float, at: float, end: float, what: str, anchors: Sequence[str]) -> Finding:
+    """Warn of ranges that fit the path by the wheels under other names from a moment on, or under none."""
+    which = f"those of {', '.join(anchors)} fit the places of others" if what == "exchanged" else "fit no places at all"
+    text = (
+        f"from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
+        f"wheels, but {which}: check the anchors' ids in the radio and in what reads them"
+    )
+    return replace(warning("exchanged-names", text), sensor="radio")
+
+
+def wheels_against_ranges(begin: float, at: float, end: float, what: str, value: float) -> Finding:
+    """Warn of wheels that the ranges to the anchors contradict, more than clocks, names and moved anchors would explain."""
+    text = {
+        "ways": f"from t = {begin:.0f} to {end:.0f} s the wheels count {value:.2f} times the way that they count otherwise",
+        "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
+        "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
+        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
+        "turns": f"about t = {at:.0f} s no path that the wheels count fits: one of them, or the heading, is stuck or slips",
+    }[what]
+    return replace(warning("wheels-against-ranges", f"{text}, by the ranges to the anchors in reach"), sensor="odometry")
+
+
 def outside_odometry(sensor: str, count: int, total: int, off: float) -> Finding:
     """Warn of readings outside the odometry's time; doubt a recording of which most are: its clocks differ."""
     most = count > _MOST_OUTSIDE * total
@@ -300,6 +322,8 @@ RULES = by_kind(
     clock_set_back,
     clock_jump,
     late_ranges,
+    exchanged_names,
+    wheels_against_ranges,
     outside_odometry,
     stamps_in_bursts,
     repeated_odometry,

@@ -17,6 +17,8 @@ from .events import GyroHeading, LaserScan, Measurement, OdometryPose, RangeEpoc
 from .link import Host, Link, Mounting
 
 _MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
+COUNT = 1e-6
+"""s, resolution of the stamps in the log."""
 TAIL, _PIECE = 1 << 18, 1 << 20
 """Bytes read to find the last state; copied at once."""
 _OURS = re.compile(r"ODOM|GYRO|(ROBOTLASER|UWB)\d?")
@@ -261,6 +263,8 @@ class LogText:
         self._pose: OdometryPose | None = None
         self._params: dict[str, str] = {}
         self._lines: list[str] = []
+        self._written: dict[tuple[type, int, str], float] = {}
+        """s, wall time: the stamp of the last row of each series."""
 
     def flush(self) -> None:
         """Hand the lines to the log; DataError where it cannot be written any more."""
@@ -284,13 +288,13 @@ class LogText:
         """Write a PARAM unless it stands there already."""
         if self._params.get(name) != value:
             self._params[name] = value
-            line = f"PARAM {name} {value} {self._tail(self._host.monotonic())}"
+            line = f"PARAM {name} {value} {self._tail(self._host.monotonic() + self._host.wall_offset)}"
             self._lines.append(line)
             self._log.head.append(line)
 
     def write(self, measured: Measurement, link: Link) -> None:
         """Write a measurement, and count what is counted by its content."""
-        tail, counts = self._tail(measured.stamp), link.counts
+        tail, counts = self._tail(self._rising(measured, link.number)), link.counts
         spread = getattr(measured, "spread", 0.0)
         counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
         if isinstance(measured, OdometryPose):
@@ -308,8 +312,22 @@ class LogText:
             laser = lasers[min(link.number, len(lasers)) - 1]
             self._lines.append(scan_line(measured, laser, self._pose, tail, link.number))
 
+    def _rising(self, measured: Measurement, number: int) -> float:
+        """Return the stamp to write, s, later than that of the row before of the same sensor and anchor.
+
+        Rows that arrive in one read, and those around a correction of a clock's map, have stamps that stand still or go back.
+        Each becomes max(its own, the one before + one count of the log). No stamp gets further from the truth by that
+        than one before it already was: one that moves stays as late as the row before at most, since it was made later.
+        """
+        names = [reading.anchor_id for reading in measured.readings] if isinstance(measured, RangeEpoch) else [""]
+        series = [(type(measured), number, name) for name in names]
+        least = max((self._written[key] for key in series if key in self._written), default=-math.inf) + COUNT
+        stamp = float(f"{max(measured.stamp + self._host.wall_offset, least):.6f}")
+        self._written.update(dict.fromkeys(series, stamp))
+        return stamp
+
     def _elapsed(self) -> float:
         return max(0.0, self._host.monotonic() - self._start)
 
     def _tail(self, stamp: float) -> str:
-        return f"{stamp + self._host.wall_offset:.6f} {self._host.name} {self._elapsed():.6f}"
+        return f"{stamp:.6f} {self._host.name} {self._elapsed():.6f}"

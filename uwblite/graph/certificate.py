@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from .elimination import PER_COMPLEX, work_of
+from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
 from .point_edges import LandmarkEdges
 from .pose_edges import RelativePoseEdges
@@ -289,9 +289,8 @@ def _gap(S: sparse.csc_matrix, D: Floats, negligible: float, chi2: float) -> flo
 
 def _is_positive(S: sparse.csc_matrix, added: Floats) -> bool:
     """Return whether S + diag(added) is positive definite, by the pivots of its factor."""
-    options = {"SymmetricMode": True, "Equil": False}
     try:
-        factor = splu(S + sparse.diags(added), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    except RuntimeError:
+        factor = superlu(sparse.csc_matrix(S + sparse.diags(added)), "MMD_AT_PLUS_A")
+    except SolverError:
         return False
     return bool(np.array_equal(factor.perm_r, factor.perm_c) and np.all(factor.U.diagonal().real > 0.0))

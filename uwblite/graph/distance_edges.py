@@ -12,6 +12,9 @@ from ..config import documented
 from .graph import EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
+_LEAST = 1e-6
+"""Least distance, m: for smaller ones the direction is not defined."""
+
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,17 +34,10 @@ class AnchorDistanceEdges(EdgeTable):
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    def _offset(self, graph: Graph) -> tuple[Floats, Floats]:
-        offset = graph.anchors[self.i] - graph.anchors[self.j]
-        return offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
-
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 1)."""
-        return ((self._offset(graph)[1] - self.distance) / self.sigma)[:, None]
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both anchors."""
-        offset, length = self._offset(graph)
+        offset = graph.anchors[self.i] - graph.anchors[self.j]
+        length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
         by_i = (offset / (length * self.sigma)[:, None])[:, None, :]
         residuals = ((length - self.distance) / self.sigma)[:, None]
         return Linearization(residuals, (("anchors", self.i, by_i), ("anchors", self.j, -by_i)))
@@ -78,15 +74,11 @@ class PointDistanceEdges(EdgeTable):
         one, other = graph.poses[self.i], graph.poses[self.j]
         arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
         offset = one[:, :2] + arm_i - other[:, :2] - arm_j
-        return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
+        return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
 
     def lengths(self, graph: Graph) -> Floats:
         """Return the distances (e,), m, at the graph's estimates."""
         return self._arms(graph)[3]
-
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 1)."""
-        return ((self.lengths(graph) - self.distance) / self.sigma)[:, None]
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""

@@ -1,16 +1,13 @@
 """Symbolic elimination of sparse, symmetric matrices: order, elimination tree and work, from the pattern alone.
 
-Poses measured against a few anchors are a sparse matrix with a border: anchors and calibration, which touch nearly every
-pose, are eliminated last by a Schur complement. Inside, a chain whose closures reach back a few poses is a narrow
-band: reverse Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and
-minimum degree with SuperLU in its symmetric mode needs fewer operations. Many anchors are no border any more, but the
-last rows of the sparse matrix. The order is found on the graph of poses, a third of the matrix's size, and used for
-every factorisation.
+Anchors and calibration, which touch nearly every pose, are a border that is eliminated last by a Schur complement; many of them
+are the last rows of the sparse matrix instead. A chain whose closures reach back a few poses is a narrow band: reverse
+Cuthill-McKee and LAPACK's banded Cholesky. Once closures tie distant poses together the band fills, and minimum degree with
+SuperLU in its symmetric mode needs fewer operations. The order is found on the graph of poses, a third of the matrix's size.
 
-The parent of a column in the elimination tree is the first row below its diagonal in the factor. The nonzeros of a computed
-factor do not show it reliably: an entry that cancels, or that underflows along a ring of a hundred poses, would cut
-the tree. So the tree is found from the pattern, and with it the number of entries of each column (J. Gilbert, E. Ng, B. Peyton,
-An efficient algorithm to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
+The elimination tree is found from the pattern: entries of a computed factor that cancel, or underflow along a ring of a hundred
+poses, would cut it. With it the number of entries of each column is known (J. Gilbert, E. Ng, B. Peyton, An efficient algorithm
+to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
 """
 
 from dataclasses import dataclass
@@ -35,6 +32,8 @@ are connected, in the rooms of a site or the streets of a town only those nearby
 MOST_WORK = 4e9
 """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
 any poses and any others, however few, fill the whole matrix."""
+_LITTLE_WORK = 1e8
+"""Multiplications in the envelope of a band up to which those of a sparser order are not counted."""
 PER_COMPLEX = 4
 """Multiplications in one of complex numbers."""
 
@@ -137,17 +136,18 @@ def postorder(parent: Ints) -> Ints:
     return walk
 
 
-def with_subtrees_contiguous(pairs: Ints, nodes: int) -> Ints:
-    """Return the order (nodes,) of elimination by minimum degree in which every subtree is contiguous."""
-    order = minimum_degree(pairs, nodes)
-    return order[postorder(elimination_tree(pairs, order))]
+def contiguous(pairs: Ints, order: Ints) -> tuple[Ints, Ints]:
+    """Return an order (n,) that fills the same and has every subtree contiguous, and its elimination tree (n,)."""
+    parent = elimination_tree(pairs, order)
+    walk = postorder(parent)
+    return order[walk], np.append(np.argsort(walk), len(order))[parent[walk]]
 
 
 def order_of_columns(matrix: sparse.csc_matrix) -> Ints:
     """Return the order (n,) of elimination of the columns of a symmetric matrix, whose rows ascend in each of them: by minimum
     degree of groups that are alike, with every subtree contiguous."""
     group, pairs = alike_columns(matrix)
-    place = np.argsort(with_subtrees_contiguous(pairs, int(group.max(initial=-1)) + 1))
+    place = np.argsort(contiguous(pairs, minimum_degree(pairs, int(group.max(initial=-1)) + 1))[0])
     return np.argsort(place[group], kind="stable")
 
 
@@ -159,17 +159,12 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
 
     Parameters
     ----------
-    width : (n,) scalars of each node. parent : (n,) see elimination_tree.
+    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
     """
-    walk = postorder(parent)
-    place = np.append(np.argsort(walk), len(order))
-    parent = place[parent[walk]]
-    order, scalars = order[walk], width[order[walk]].astype(np.intp)
-    n = len(order)
+    n, scalars = len(order), width[order].astype(np.intp)
     lower = _lower_triangle(pairs, order)
     below, row = lower.indices.astype(np.intp), np.repeat(np.arange(n), np.diff(lower.indptr))
-    change = np.zeros(n + 1)
-    change += np.bincount(below, scalars[row], n + 1)
+    change = np.bincount(below, scalars[row], n + 1).astype(np.float64)
     again = np.flatnonzero(row[1:] == row[:-1]) + 1
     change -= np.bincount(_meeting(parent, below[again - 1], below[again]), scalars[row[again]], n + 1)
     tied = np.zeros(n, dtype=bool)
@@ -177,22 +172,19 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     change[:-1] += np.where(tied, 0, scalars)
     change -= np.bincount(parent, scalars, n + 1)
     total = np.append(0.0, np.cumsum(change[:-1]))
-    sizes = np.empty(n, dtype=np.intp)
-    sizes[walk] = np.rint(total[1:] - total[_first_below(parent)])
-    return sizes
+    return np.rint(total[1:] - total[_first_below(parent)]).astype(np.intp)
 
 
-def work(pairs: Ints, order: Ints, width: Ints) -> float:
+def work(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> float:
     """Return the multiplications of a factorisation with the nodes in this order, in units of one of a dense matrix.
 
     Columns with the pattern of the next one are multiplied together; others are slower because of memory access.
 
     Parameters
     ----------
-    width : (n,) scalars of each node.
+    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
     """
-    parent, scalars = elimination_tree(pairs, order), width[order]
-    sizes = column_sizes(pairs, order, width, parent)
+    sizes, scalars = column_sizes(pairs, order, width, parent), width[order]
     continued = np.append(sizes, 0)[parent] == sizes - scalars
     return float(scalars @ (np.square(sizes, dtype=np.float64) * np.where(continued, 1.0, _ALONE)))
 
@@ -206,8 +198,8 @@ def work_of(matrix: sparse.csc_matrix) -> float:
     pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
     if is_full(narrow_order(pairs, len(width))[1]):
         return np.inf
-    order = minimum_degree(pairs, len(width))
-    return work(pairs, order, width)
+    order, parent = contiguous(pairs, minimum_degree(pairs, len(width)))
+    return work(pairs, order, width, parent)
 
 
 def _lower_triangle(pairs: Ints, order: Ints) -> sparse.csr_matrix:
@@ -256,7 +248,7 @@ class Ordering:
     iterative: bool = False
     """A factor would fill up: see schwarz_cg.py."""
     work: float = 0.0
-    """Multiplications of a factorisation, where they are many enough to be counted."""
+    """Multiplications of a factorisation, where they are many enough to be counted; more than there are, where they are few."""
 
 
 def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
@@ -275,7 +267,7 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     if last is not None:
         return Ordering(_before(among, poses, last), False, False)
     if subtrees:
-        return Ordering(with_subtrees_contiguous(among, poses), False, False)
+        return Ordering(contiguous(among, minimum_degree(among, poses))[0], False, False)
     bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
     tied = poses >= _MANY and len(among) - poses > _TIED * poses
     if bordered or tied:
@@ -284,9 +276,14 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
             return Ordering(order, True, True)
         if tied and is_full(reach):
             return Ordering(np.arange(poses), False, False, iterative=True)
-    order = with_subtrees_contiguous(among, poses)
-    every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
-    multiplications = work(among if bordered else pairs, every, width)
+    order, parent = contiguous(among, minimum_degree(among, poses))
+    if bordered and not tied and (most := 27.0 * float(np.sum((reach + 1.0) ** 2))) <= _LITTLE_WORK:
+        return Ordering(order, True, False, work=most)
+    if bordered:
+        multiplications = work(among, order, width, parent)
+    else:
+        every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
+        multiplications = work(pairs, every, width, parent)
     entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
     if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
         return Ordering(np.arange(poses), False, False, iterative=True)
@@ -308,5 +305,5 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
         block = np.arange(poses) // reach + 1
         order = np.lexsort((np.arange(poses), block & -block))
     order = np.concatenate([order[~late[order]], order[late[order]]])
-    walk = order[postorder(elimination_tree(pairs, order))]
+    walk = contiguous(pairs, order)[0]
     return np.concatenate([walk[~late[walk]], order[late[order]]])

@@ -5,7 +5,6 @@ gathers the values with one indexing operation.
 """
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import Floats, Ints
+from ..arrays import WIDE, Floats, Ints
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
 from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
@@ -154,18 +153,16 @@ class Blocks:
         return rows, columns, places
 
 
-_SHAPES = tuple(product((3, 2, 1), repeat=2))
-"""Shapes of blocks between poses, anchors and calibration values."""
-
-
 def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
     """Return row, column, height, width, start and step down and across of the blocks of both triangles, by column."""
-    apart = blocks.row != blocks.column
-    one, start = np.ones_like(blocks.row), blocks.start
-    lower = (blocks.row, blocks.column, blocks.height, blocks.width, start, blocks.width, one)
-    upper = (blocks.column, blocks.row, blocks.width, blocks.height, start, one, blocks.width)
+    apart = np.flatnonzero(blocks.row != blocks.column)
+    row, column, height, width, start = (
+        a.astype(np.int32) for a in (blocks.row, blocks.column, blocks.height, blocks.width, blocks.start)
+    )
+    one = np.ones_like(row)
+    lower, upper = (row, column, height, width, start, width, one), (column, row, width, height, start, one, width)
     both = [np.concatenate([a, b[apart]]) for a, b in zip(lower, upper, strict=True)]
-    order = np.argsort(both[1] * blocks.size + both[0])
+    order = np.argsort(both[1].astype(WIDE) * blocks.size + both[0])
     return tuple(a[order] for a in both)
 
 
@@ -176,27 +173,20 @@ class SparseLayout:
         """Find for every entry of the compressed columns its place among the values."""
         n = blocks.size
         row, column, height, width, start, down, across = _both_triangles(blocks)
-        own = row == column
-        above = np.cumsum(height) - height
+        # Blocks run along the last axis: numpy's loops are as long as it.
+        i, j = np.arange(3, dtype=np.int32)[:, None, None], np.arange(3, dtype=np.int32)[:, None]
+        own, above = np.flatnonzero(row == column), np.cumsum(height, dtype=np.int32) - height
         above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
-        in_blocks = np.bincount(column, height, n).astype(np.intp)
-        tall = np.empty(n, dtype=np.intp)
-        for k in range(3):
-            has = own & (k < width)
-            tall[column[has] + k] = in_blocks[column[has]]
-        indptr = np.concatenate([[0], np.cumsum(tall)])
-        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int32)
-        for h, w in _SHAPES:
-            some = np.nonzero((height == h) & (width == w))[0]
-            r, own_some, at_column = row[some], own[some], column[some]
-            for i, j in np.ndindex(h, w):
-                at = indptr[at_column + j] + (above[some] + i)
-                indices[at] = r + i
-                place = start[some] + (i * down[some] + j * across[some])
-                if i < j:
-                    place = np.where(own_some, start[some] + (j * down[some] + i * across[some]), place)
-                source[at] = place
-        self._source = source
+        tall = np.bincount(column, height, n).astype(np.intp)[column[own]]
+        indptr = np.concatenate([[0], np.cumsum(np.repeat(tall, width[own]))])
+        at = indptr.astype(np.int32).take(column + j, mode="clip") + (above + i)
+        place = (start + i * down) + j * across
+        place[..., own] = start[own] + np.maximum(i, j) * down[own] + np.minimum(i, j)
+        has: Ints | slice = np.flatnonzero((i < height) & (j < width)) if np.min(height) < 3 else slice(None)
+        at = at.reshape(-1)[has]
+        indices, self._source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.intp)
+        indices[at] = np.broadcast_to(row + i, place.shape).reshape(-1)[has]
+        self._source[at] = place.reshape(-1)[has]
         self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
 
     def factor(self, values: Floats) -> SuperLU:
@@ -205,7 +195,8 @@ class SparseLayout:
 
     def matrix(self, values: Floats) -> sparse.csc_matrix:
         """Return the matrix with these values; the next call overwrites it."""
-        np.take(values, self._source, out=self._matrix.data)
+        # With a mode that cannot fail, numpy fills the array itself and no copy of it.
+        np.take(values, self._source, out=self._matrix.data, mode="clip")
         return self._matrix
 
 

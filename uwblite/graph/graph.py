@@ -89,6 +89,14 @@ class EdgeTable:
             arrays["weights"] = np.concatenate([t.own_weights for t in tables])
         return replace(self, **arrays)  # type: ignore[type-var]
 
+    def linearize(self, graph: "Graph") -> Linearization:
+        """Return whitened residuals and Jacobians."""
+        raise NotImplementedError
+
+    def residuals(self, graph: "Graph") -> Floats:
+        """Return whitened residuals (e, d)."""
+        return self.linearize(graph).residuals
+
     def by_edge(self) -> dict[str, Any]:
         """Return the arrays with a row per edge by their names; those that are left out are empty."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
@@ -227,7 +235,11 @@ class Graph:
 
     def updated(self, poses: Floats, anchors: Floats, calibration: Floats) -> "Graph":
         """Return the graph with new estimates."""
-        return replace(self, poses=poses, anchors=anchors, calibration=replace(self.calibration, values=calibration))
+        values = replace(self.calibration, values=calibration)
+        new = replace(self, poses=poses, anchors=anchors, calibration=values, edges=())
+        # There are as many unknowns as before, which is all that is required of edges.
+        object.__setattr__(new, "edges", self.edges)
+        return new
 
     def with_estimates_of(self, solved: "Graph") -> "Graph":
         """Return the graph with the estimates of another, its own edges kept."""

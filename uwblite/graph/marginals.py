@@ -15,13 +15,12 @@ from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from .eliminated import Blocks, WithBlocks
+from .eliminated import Blocks, WithBlocks, rows_of
 from .factorization import counted
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
-from .variance_components import variances_of_kinds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,25 +79,10 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
     return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
 
 
-_MET_AT_ONCE = 1 << 14
-"""Rows of a table of common errors in memory at once."""
+_VARIANCES = np.geomspace(1e-4, 4.0, 12)[:, None]
+"""Variances of common errors, from a hundredth to twice the size that is expected."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CommonErrors:
-    """Independent errors of unit variance, each common to many edges of one kind."""
-
-    edges: Edges
-    edge: Ints
-    """(m,) edge."""
-    error: Ints
-    """(m,) number of the error that affects it."""
-    shift: Floats
-    """(m, d) change of the edge's whitened residual by that error."""
-    kind: Ints
-    """(k,) kind of each error: errors of one kind have one variance, with 1 as the first guess."""
 
 
 class Marginals:
@@ -123,47 +107,36 @@ class Marginals:
         among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
         return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among)
 
-    def estimated(self, common: CommonErrors) -> Floats:
+    def estimated(self, edges: Edges, shifts: sparse.csr_matrix) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
 
-        The errors u are unknowns with the prior N(0, G); the variance of each kind is learnt from the residuals, see
-        variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r (best linear unbiased prediction:
-        C. R. Henderson, Biometrics 31, 1975).
+        The errors u are unknowns with the prior N(0, g): u = -(A + 1 / g)^-1 S^T P r, where P = W - W J (J^T W J)^-1 J^T W and
+        A = S^T P S (best linear unbiased prediction: C. R. Henderson, Biometrics 31, 1975), in the mean over g by marginal
+        likelihood.
+
+        Parameters
+        ----------
+        shifts : S (e d, k), change of their whitened residuals by each error of the size that is expected.
         """
-        slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
+        weighted, slopes = self._weighted(edges, shifts), self.slopes(edges, shifts)
         moves = self._factor.solve(slopes.toarray())
-        seen, products = seen - moves.T @ self._gradient, products - slopes.T @ moves
-        # With products of roots of G: a variance near 0 has no inverse.
-        root = np.sqrt(variances_of_kinds(seen, products, kind)[kind])
-        inside = root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root))
-        return np.asarray(-root * np.linalg.solve(inside, root * seen))
+        seen = weighted.T @ edges.residuals(self._graph).ravel() - moves.T @ self._gradient
+        products = (weighted.T @ shifts).toarray() - slopes.T @ moves
+        values, vectors = np.linalg.eigh(0.5 * (products + products.T))
+        inside, z = 1.0 + _VARIANCES * np.maximum(values, 0.0), vectors.T @ seen
+        worth = 0.5 * np.sum(_VARIANCES * z**2 / inside - np.log(inside), axis=1)
+        likely = np.exp(worth - worth.max())
+        return np.asarray(-vectors @ (likely @ (_VARIANCES / inside) / likely.sum() * z))
 
-    def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
-        """Return S^T W r (k,) and S^T W S (k, k)."""
-        edge, d = common.edge, common.shift.shape[1]
-        weights = edge_weights(common.edges, self._graph)
-        shape = (len(common.edges) * d, int(common.error.max(initial=-1)) + 1)
-        rows, columns = (edge[:, None] * d + np.arange(d)).ravel(), np.repeat(common.error, d)
-        shifts = sparse.csc_matrix((common.shift.ravel(), (rows, columns)), shape=shape)
-        weighted = shifts.multiply(np.repeat(weights, d)[:, None]).tocsc()
-        residuals = common.edges.residuals(self._graph).ravel()
-        return np.asarray(weighted.T @ residuals), np.asarray((weighted.T @ shifts).todense())
+    def slopes(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csc_matrix:
+        """Return J^T W S (unknowns, k) of errors of edges; see estimated."""
+        jacobian = rows_of(edges.linearize(self._graph), self.unknowns)
+        return sparse.csc_matrix(jacobian.T @ self._weighted(edges, shifts))
 
-    def slopes(self, common: CommonErrors) -> sparse.csc_matrix:
-        """Return J^T W s of each error as a column (unknowns, k)."""
-        size, count = self.unknowns.size, int(common.error.max(initial=-1)) + 1
-        weights, right = edge_weights(common.edges, self._graph), sparse.csc_matrix((size, count))
-        blocks = common.edges.linearize(self._graph).blocks
-        for first in range(0, len(common.edge), _MET_AT_ONCE):
-            part = slice(first, first + _MET_AT_ONCE)
-            edge = common.edge[part]
-            row = np.concatenate([self.unknowns.number[name][index[edge]] for name, index, _ in blocks], axis=1)
-            jacobian = np.concatenate([own[edge] for *_, own in blocks], axis=2)
-            slope = np.einsum("mdk,md->mk", jacobian, common.shift[part] * weights[edge, None])
-            error = np.broadcast_to(common.error[part, None], row.shape)
-            free = row >= 0
-            right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
-        return right
+    def _weighted(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csr_matrix:
+        """Return W S."""
+        weights = edge_weights(edges, self._graph)
+        return sparse.csr_matrix(sparse.diags(np.repeat(weights, shifts.shape[0] // len(weights))) @ shifts)
 
     def _block_diagonal(self) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -246,12 +219,7 @@ def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, F
     """
     normal = filled(graph, subtrees=True)
     lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
-    right = np.zeros((normal.unknowns.size, len(shifts)))
-    for name, index, jacobian in lin.blocks:
-        number = normal.unknowns.number[name][index]
-        free = number >= 0
-        for k, shift in enumerate(weighted):
-            np.add.at(right[:, k], number[free], np.einsum("edk,ed->ek", jacobian, shift)[free])
+    right = np.asarray(rows_of(lin, normal.unknowns).T @ weighted.reshape(len(shifts), -1).T)
     solved = factor_of(normal).solve(right)
     total = np.einsum("ked,ked->k", shifts, weighted)
     left = total - np.einsum("nk,nk->k", right, solved)

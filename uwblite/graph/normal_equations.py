@@ -1,9 +1,9 @@
 """Normal equations of a graph: the place of every product of Jacobians is analysed once, the values are filled often.
 
-A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
-H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration
-values share edges with many poses and are therefore not ordered: they come last. Scalars are numbered in the order of
-elimination, so that vectors need no permutation.
+A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of H = J^T W J is
+kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration values share edges
+with many poses and are therefore not ordered: they come last. Scalars are numbered in the order of elimination, so that vectors
+need no permutation.
 """
 
 from collections.abc import Iterator, Sequence
@@ -94,7 +94,7 @@ class NormalEquations:
             self._layout: Layout = IterativeLayout(blocks, pieces)
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
-        self.work = pieces.work if ordering.iterative else ordering.work
+        self.work = pieces.work(0, 0) if ordering.iterative else ordering.work
         """Multiplications of a factorisation, where they are many enough to be counted."""
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
@@ -197,28 +197,36 @@ class NormalEquations:
         start = np.where(free, self._base[block] + high * stride + low, self._trash)
         return start, np.where(a >= b, stride, 1) * free, np.where(a >= b, 1, stride) * free
 
-    def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
-        """Fill H and g from whitened Jacobians and a weight per edge."""
-        self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
-        self.spent[PRODUCTS] += sum(len(some.products) for places in self._places for some in places)
+    def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None], again: bool = True) -> None:
+        """Fill H and g from whitened Jacobians and a weight per edge; g alone, where H is not wanted again."""
+        self.gradient = np.zeros(self.unknowns.size)
+        if again:
+            self.values = np.zeros(self._trash + 1)
+            self.spent[PRODUCTS] += sum(len(some.products) for places in self._places for some in places)
         for lin, weight, places, free in zip(linearized, weights, self._places, self._free, strict=True):
             jacobians = [jac for _, _, jac in compress(lin.blocks, free)]
             for part, place in zip(_parts(len(lin.residuals)) if jacobians else (), places, strict=True):
-                self._add(_stacked(jacobians, part), lin.residuals[part], None if weight is None else weight[part], place)
+                jacobian, factor = _stacked(jacobians, part), None if weight is None else weight[part]
+                weighted = jacobian if factor is None else jacobian * factor
+                self._add_slopes(weighted, lin.residuals[part], place)
+                if again:
+                    self._add_products(weighted, jacobian, place)
 
-    def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: _Places) -> None:
-        """Add the products of some edges' Jacobian columns (d, k, e) and residuals (e, d)."""
-        products, slopes, at = np.empty(len(places.products)), np.empty(len(places.rows)), 0
-        weighted = jacobian if weight is None else jacobian * weight
-        _, k, e = jacobian.shape
-        _contract(weighted, residuals.T[:, None], slopes.reshape(k, e))
+    def _add_slopes(self, weighted: Floats, residuals: Floats, places: _Places) -> None:
+        """Add the products of some edges' weighted Jacobian columns (d, k, e) and residuals (e, d) to g."""
+        slopes = np.empty(weighted.shape[1:])
+        _contract(weighted, residuals.T[:, None], slopes)
+        self.gradient += np.bincount(places.rows, slopes.reshape(-1), self.unknowns.size + 1)[:-1]
+
+    def _add_products(self, weighted: Floats, jacobian: Floats, places: _Places) -> None:
+        """Add the products of some edges' Jacobian columns (d, k, e) to H."""
+        products, at, (_, k, e) = np.empty(len(places.products)), 0, jacobian.shape
         for row in range(k):
             block = products[at : at + (row + 1) * e].reshape(row + 1, e)
             _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
             at += (row + 1) * e
         products[places.twice] *= 2.0
         self.values += np.bincount(places.products, products, self._trash + 1)
-        self.gradient += np.bincount(places.rows, slopes, self.unknowns.size + 1)[:-1]
 
     @property
     def diagonal(self) -> Floats:

@@ -32,19 +32,11 @@ class LandmarkEdges(EdgeTable):
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    def _seen(self, graph: Graph) -> Floats:
-        poses = graph.poses[self.pose]
-        return se2.rotate(-poses[:, 2], graph.anchors[self.anchor] - poses[:, :2])
-
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 2)."""
-        return whiten(self.sqrt_information, self._seen(graph) - self.position)
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose and landmark."""
-        seen = self._seen(graph)
-        theta = graph.poses[self.pose, 2]
-        c, s = np.cos(theta), np.sin(theta)
+        poses = graph.poses[self.pose]
+        seen = se2.rotate(-poses[:, 2], graph.anchors[self.anchor] - poses[:, :2])
+        c, s = se2.cos_sin(poses[:, 2])
         by_anchor = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
         by_theta = np.stack([seen[:, 1], -seen[:, 0]], axis=1)
         by_pose = np.concatenate([-by_anchor, by_theta[:, :, None]], axis=2)

@@ -68,10 +68,6 @@ class RelativePoseEdges(EdgeTable):
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 3)."""
-        return whiten(self.sqrt_information, se2.between(self.T_i_j, se2.between(graph.poses[self.i], graph.poses[self.j])))
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
@@ -269,10 +265,6 @@ class ScanEdges(EdgeTable):
         """Return the pose (e, 3) of cloud j in cloud i at the present estimates."""
         si = self.sensor_poses(graph, self.i, self.twist_i)[0]
         return se2.between(si, self.sensor_poses(graph, self.j, self.twist_j)[0])
-
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 3)."""
-        return whiten(self.sqrt_information, se2.between(self.T_i_j, self.relative(graph)))
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration that is free."""

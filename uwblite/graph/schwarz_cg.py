@@ -1,11 +1,11 @@
 """Conjugate gradients for long chains of poses with many edges between distant poses.
 
-Where thousands of poses share a few rooms and each is matched with many others, a factorisation fills up: the 14,000
-poses of five hours in one hall need 100 million entries and minutes. Iteration solves their least squares well
-if errors of all wavelengths are reduced together: short ones piece by piece of the chain, long ones by moving whole
-pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996).
-The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level;
-where they are thousands, which would make it as large as the matrix, they are in pieces of their own.
+Where thousands of poses share a few rooms and each is matched with many others, a factorisation fills up: the 14,000 poses of
+five hours in one hall need 100 million entries and minutes. Iteration solves their least squares well if errors of all
+wavelengths are reduced together: short ones piece by piece of the chain, long ones by moving whole pieces as rigid bodies (a
+two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996). The number of iterations hardly
+depends on the length of the chain. Anchors and calibration belong to the coarse level; where they are thousands, which would
+make it as large as the matrix, they are in pieces of their own.
 """
 
 from collections.abc import Callable
@@ -43,24 +43,17 @@ class Pieces:
     basis: sparse.csr_matrix
     """(n, c) motions of the coarse level: three of each piece as a rigid body, and each unknown that is no pose."""
 
-    @property
-    def work(self) -> float:
-        """Multiplications that prepare a solution: the inverses of the pieces and the factor of the coarse matrix."""
-        (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
-        return _work(pieces, wide, coarse)
-
-    def work_of_a_step(self, entries: int) -> float:
-        """Return the work of an iteration with a matrix of so many entries, in multiplications of a factorisation."""
-        (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
-        return _work_of_a_step(pieces, wide, coarse, entries)
+    def work(self, steps: float, entries: int) -> float:
+        """Return the work, in multiplications of a factorisation, of preparing a solution (the inverses of the pieces and the
+        factor of the coarse matrix) and of iterations with a matrix of so many entries."""
+        return _work((*self.number.shape, int(self.basis.shape[1])), steps, entries)
 
 
-def _work(pieces: int, wide: int, coarse: int) -> float:
-    return pieces * float(wide) ** 3 + float(coarse) ** 3 / 3.0
-
-
-def _work_of_a_step(pieces: int, wide: int, coarse: int, entries: int) -> float:
-    return _PER_PRODUCT * (entries + pieces * float(wide) ** 2 + float(coarse) ** 2)
+def _work(shape: tuple[int, int, int], steps: float, entries: int) -> float:
+    """Return the same of pieces of so many unknowns and a coarse matrix of so many rows."""
+    pieces, wide, coarse = map(float, shape)
+    step = _PER_PRODUCT * (entries + pieces * wide**2 + coarse**2)
+    return pieces * wide**3 + coarse**3 / 3.0 + steps * step
 
 
 def expected_work(poses: int, others: int, entries: int) -> float:
@@ -73,7 +66,7 @@ def expected_work(poses: int, others: int, entries: int) -> float:
     pieces, wide = -(-poses // _PIECE), 3 * _PIECE
     apart = others > _MOST_COARSE
     pieces, coarse = pieces + (-(-others // wide) if apart else 0), 3 * pieces + (0 if apart else others)
-    return _work(pieces, wide, coarse) + _USUAL * _work_of_a_step(pieces, wide, coarse, entries)
+    return _work((pieces, wide, coarse), _USUAL, entries)
 
 
 def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
@@ -198,7 +191,7 @@ class TwoLevelFactor:
         if right.ndim == 2:
             return np.stack([self.solve(column) for column in right.T], axis=1)
         solution, steps = conjugate_gradients(self._matrix.__matmul__, right, self._nearly, _ENOUGH, _MOST)
-        self.work += steps * self._pieces.work_of_a_step(self._matrix.nnz)
+        self.work += self._pieces.work(steps, self._matrix.nnz) - self._pieces.work(0, 0)
         return solution
 
     @property

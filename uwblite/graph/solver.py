@@ -9,29 +9,27 @@ is omitted, so H stays positive semi-definite for every kernel. The step solves
 
     (H + lambda D) h = -g,    D = largest diag(H) so far (1 where an unknown is measured by nothing),
 
-which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
-keeps the matrix positive definite where the measurements leave a direction undetermined (an anchor without ranges, a closure
-whose information is singular): such a direction does not change. D never shrinks (J. J. More, The Levenberg-Marquardt
-algorithm, 1978): an anchor that comes into line with the poses with ranges to it loses all curvature across that line, and with
-a D that shrank with it, lambda would have to grow until it damped all other directions. The model predicts the decrease
-h^T (lambda D h - g); the ratio of the real decrease of F to the predicted one decides. A step that decreases F is taken, and
-lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
-nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
-O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
+Marquardt's scaling: lambda is a pure number, the same for metres, radians and scale factors, and the matrix is positive
+definite where the measurements leave a direction undetermined, which then does not change. D never shrinks (J. J. More, The
+Levenberg-Marquardt algorithm, 1978): an anchor that comes into line with its poses loses all curvature across that line, and
+lambda would have to grow until it damped all other directions. The model predicts the decrease h^T (lambda D h - g). A step
+that decreases F is taken, and lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3), with the ratio of the real decrease to the
+predicted one; otherwise it is multiplied by 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method,
+IMM-REP-1999-05; K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
-Where a step turns poses by much, it is tried in two ways that agree to first order, each pose on its own and link by
-link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a path of hundreds of
-metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
-iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
+Where a step turns poses by much and misses its prediction, it is tried in two ways that agree to first order, each pose on its
+own and link by link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a path
+of hundreds of metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard,
+S. Teller, Fast iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
-Near the minimum H hardly changes: a step after one of little effect uses the factor of that one.
+Near the minimum H hardly changes: a step after one of little effect uses the factor of that one. Where its predicted decrease
+is negligible and there are no robust kernels, it is the last, and its cost is the predicted one.
 
-The search ends, and reports the reason, when the remaining decrease is a negligible fraction of F, when every component of
-the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up, or the
-work that the caller allows: it is counted, not timed, so that the same graph gives the same result.
-Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
-convergence is linear, conservative where it is quadratic, and it saves the last one or two iterations, which would
-change nothing. With robust kernels, reweighting converges linearly at an unknown rate, and the last decrease itself is used.
+The search ends where the remaining decrease is a negligible fraction of F or every component of the gradient is negligible in
+units of its own curvature, where no step helps, or where the iterations or the work allowed are used up: work is counted, not
+timed, so that the same graph gives the same result. Without robust kernels the decrease to come is extrapolated from the last
+two as a geometric series: exact where convergence is linear, conservative where it is quadratic. With robust kernels,
+reweighting converges linearly at an unknown rate, and the last decrease itself is used.
 """
 
 from collections.abc import Callable
@@ -40,7 +38,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..config import documented, setting
 from ..errors import ConfigError, SolverError
 from .factorization import Factor
@@ -48,7 +46,7 @@ from .graph import Edges, Graph, Linearization, kernel_weights, linearize, linea
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .schwarz_cg import iterated
-from .unknowns import cheaper_move, linked_poses
+from .unknowns import Unknowns, linked_poses, moved, moved_along, turns_much
 from .work import ENTRIES
 
 Progress = Callable[[int, int], None]
@@ -130,9 +128,7 @@ def optimize(
     ------
     SolverError : nothing is free, there is no edge, or estimates or measurements are not finite.
     """
-    check(graph)
-    linearized = linearize(graph)
-    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress, allowed)
+    return Optimizer().optimize(graph, config, progress, allowed)
 
 
 def minimise(
@@ -170,23 +166,27 @@ class _Descent:
             raise SolverError(what_is_not_finite(graph, linearized))
         self.history: list[float] = []
         self.moved = True
-        """The normal equations are of an estimate before this one."""
+        """The gradient is of an estimate before this one."""
+        self.current = False
+        """H is of the estimate, and not of one before it."""
         self.factor: Factor | None = None
         """To be used again; None = factorise."""
         self.damping, self.raised_by, self.last_decrease = config.initial_damping, 2.0, np.inf
         self.decreases: list[float] = []
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
-        robust = any(edges.kernel.name != "none" for edges in graph.edges)
-        self.to_come = as_much_again if robust else extrapolated
+        self.robust = any(edges.kernel.name != "none" for edges in graph.edges)
+        self.to_come = as_much_again if self.robust else extrapolated
 
     def prepare(self) -> str:
         """Bring the normal equations to the estimate; return why the search ends here, "" where it goes on."""
-        if self.moved:
-            weights = [_or_none(e, lin.residuals) for e, lin in zip(self.graph.edges, self.linearized, strict=True)]
-            self.normal.fill(self.linearized, weights)
+        again = self.factor is None
+        if self.moved or (again and not self.current):
+            at = self.linearized or linearize(self.graph)
+            weights = [_or_none(e, lin.residuals) for e, lin in zip(self.graph.edges, at, strict=True)]
+            self.normal.fill(at, weights, again)
             # The normal equations contain all of it now; the Jacobians of a recording of hours are large.
-            self.linearized = []
+            self.linearized, self.current = [], again
             diagonal = self.normal.diagonal
             curvature = np.where(diagonal > 0, diagonal, 1.0)
             self.scale = np.maximum(self.scale, curvature)
@@ -203,11 +203,14 @@ class _Descent:
         steps = iterated(self.factor) - before if reused else iterated(self.factor)
         self.graph.work[ENTRIES] += int(steps)
         self.work += steps if reused else steps + self.normal.work
-        trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
-        linearized = linearize(trial)
-        chi2 = linearized_cost(trial, linearized)
-        self.history.append(chi2)
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING
+        if reused and not self.robust and 0 < promised <= negligible:
+            self.graph, self.chi2 = moved(self.graph, self.normal.unknowns, step), self.chi2 - promised
+            self.history.append(self.chi2)
+            return NO_DECREASE
+        enough = self.chi2 - _AS_PREDICTED * promised
+        trial, linearized, chi2 = cheaper_move(self.graph, self.normal.unknowns, step, self.linked, enough)
+        self.history.append(chi2)
         self.moved = promised > 0 and chi2 <= self.chi2
         if self.moved:
             over = self._take(trial, linearized, chi2, promised, negligible, reused)
@@ -264,7 +267,7 @@ _FREE = 1e-2
 """lambda up to which small steps indicate a minimum and not only strong damping."""
 _PATIENCE = 8
 """Accepted steps that together indicate a minimum if their decrease was negligible, for any damping."""
-_NEAR = 1e-2
+_NEAR = 5e-2
 """A step that decreased chi2 by less than this fraction of it changed H so little that the next one uses its factor."""
 _NEARLY_FREE = 1e-6
 """lambda up to which that is valid."""
@@ -292,6 +295,27 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     except SolverError:
         return None, np.zeros(len(damping)), -1.0
     return factor, step, float(step @ (damping * step - normal.gradient))
+
+
+_AS_PREDICTED = 0.9
+"""Share of the predicted decrease from which on the other way of moving has little to gain."""
+def cheaper_move(
+    graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools, enough: float
+) -> tuple[Graph, list[Linearization], float]:
+    """Return the graph moved by a step, linearised there, and its cost.
+
+    Where the step turns poses by much, and the first way of moving them costs more than enough, by whichever way costs less.
+    """
+    straight = _linearized(moved(graph, unknowns, step))
+    if straight[2] <= enough or not linked.any() or not turns_much(unknowns, step):
+        return straight
+    along = _linearized(moved_along(graph, unknowns, step, linked))
+    return along if along[2] < straight[2] else straight
+
+
+def _linearized(graph: Graph) -> tuple[Graph, list[Linearization], float]:
+    linearized = linearize(graph)
+    return graph, linearized, linearized_cost(graph, linearized)
 
 
 _KEPT = 0.5
@@ -322,10 +346,12 @@ class Optimizer:
     def __init__(self) -> None:
         self._normal: NormalEquations | None = None
 
-    def optimize(self, graph: Graph, config: SolverConfig) -> tuple[Graph, SolverSummary]:
+    def optimize(
+        self, graph: Graph, config: SolverConfig, progress: Progress | None = None, allowed: float = np.inf
+    ) -> tuple[Graph, SolverSummary]:
         """Return the graph at the nearest minimum of its cost, and how the search went; see solver.optimize."""
         check(graph)
         linearized = linearize(graph)
         if self._normal is None or not self._normal.suits(graph, linearized):
             self._normal = NormalEquations(graph, linearized)
-        return minimise(graph, linearized, self._normal, config)
+        return minimise(graph, linearized, self._normal, config, progress, allowed)

@@ -68,13 +68,9 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -
     return _moved_to(graph, unknowns, step, np.where(free[:, None], poses, start))
 
 
-def cheaper_move(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
-    """Return the graph moved by a step; where that turns poses by much, by whichever way of moving them costs less."""
-    straight = moved(graph, unknowns, step)
-    if np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) < _LARGE_TURN or not linked.any():
-        return straight
-    along = moved_along(graph, unknowns, step, linked)
-    return along if along.chi2() < straight.chi2() else straight
+def turns_much(unknowns: Unknowns, step: Floats) -> bool:
+    """Return whether a step turns a pose so much that `moved` and `moved_along` differ."""
+    return bool(np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) >= _LARGE_TURN)
 
 
 _LARGE_TURN = 0.05

@@ -39,7 +39,7 @@ _MANY = 1 << 16
 
 
 class RayCounter:
-    """Counts hits and misses of rays in the cells of one grid; the counts of two counters of one grid add up.
+    """Counts hits and misses of rays in the cells of one grid.
 
     Parameters
     ----------
@@ -165,11 +165,6 @@ class RayCounter:
         counter.hits, counter.misses = self.hits[window], self.misses[window]
         counter.geometry = self.geometry.window(top, left, *counter.hits.shape)
         return counter
-
-    def add(self, hits: Counts, misses: Counts) -> None:
-        """Add the counts of other scans in the same grid."""
-        np.add(self.hits, hits, out=self.hits, casting="unsafe")
-        self.misses += misses
 
 
 _Places = NDArray[np.int32]

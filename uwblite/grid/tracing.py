@@ -7,7 +7,6 @@ beyond a wall that other beams have drawn. This needs a second pass over the sca
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,7 @@ from ..errors import DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
 from .occupancy_grid import OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid, from_counts, walls_of
-from .ray_counter import Counts, RayCounter
+from .ray_counter import RayCounter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,8 +135,6 @@ Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
 
 _SCANS_AT_A_TIME = 64
-_TASKS = 8
-"""Parts the scans are split into for an executor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +160,6 @@ def from_sweeps(
     config: GridConfig,
     *,
     geometry: GridGeometry | None = None,
-    executor: Executor | None = None,
     progress: Progress | None = None,
     announce: Callable[[GridGeometry], object] | None = None,
 ) -> OccupancyGrid:
@@ -172,7 +168,6 @@ def from_sweeps(
     Parameters
     ----------
     geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
-    executor : any concurrent.futures executor; the result does not depend on it.
     announce : called with the geometry before the grid is allocated.
 
     Raises
@@ -199,11 +194,11 @@ def from_sweeps(
 
     def trace(counter: RayCounter, walls: Bools | None, before: int) -> None:
         for task in tasks:
-            _trace(task, counter, walls, executor, reporter(before))
+            for done, rays in task.batches(empty=walls is not None):
+                counter.insert_rays(rays.origins, rays.endpoints, rays.scan, walls)
+                if progress is not None:
+                    progress(before + done, count * (2 if clears else 1))
             before += len(task.chosen)
-
-    def reporter(before: int) -> Callable[[int], None]:
-        return lambda done: None if progress is None else progress(before + done, count * (2 if clears else 1))
 
     trace(counter, None, 0)
     if clears:
@@ -305,37 +300,3 @@ class _Task:
         """Return the task with some of its scans."""
         last = None if self.last is None else self.last[which]
         return replace(self, chosen=self.chosen[which], first=self.first[which], last=last)
-
-    def split(self, parts: int) -> "list[_Task]":
-        """Return tasks that hold only their own share of the scans."""
-        tasks = [self.rows(part) for part in np.array_split(np.arange(len(self.chosen)), parts) if len(part)]
-        return [replace(task, scans=self.scans.rows(task.chosen), chosen=np.arange(len(task.chosen))) for task in tasks]
-
-
-def _trace(
-    task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, report: Callable[[int], None]
-) -> None:
-    """Trace the beams with a reading, or, where walls are given, those without."""
-    if executor is None:
-        for done, rays in task.batches(empty=walls is not None):
-            _insert(counter, rays, walls)
-            report(done)
-        return
-    parts, done = task.split(_TASKS), 0
-    same: tuple[list[GridGeometry], list[Bools | None]] = [counter.geometry] * len(parts), [walls] * len(parts)
-    for part, counts in zip(parts, executor.map(_count, parts, *same), strict=True):
-        counter.add(*counts)
-        done += len(part.chosen)
-        report(done)
-
-
-def _count(task: _Task, geometry: GridGeometry, walls: Bools | None) -> tuple[Counts, Counts]:
-    """Trace one task; runs in a worker."""
-    counter = RayCounter(geometry, task.config.clear_weight)
-    for _, rays in task.batches(empty=walls is not None):
-        _insert(counter, rays, walls)
-    return counter.hits, counter.misses
-
-
-def _insert(counter: RayCounter, rays: ScanRays, walls: Bools | None) -> None:
-    counter.insert_rays(rays.origins, rays.endpoints, rays.scan, walls)

@@ -71,9 +71,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     start = (np.concatenate([[0], np.cumsum(runs)]) + 1).astype(np.int32)
     narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
     kind = np.dtype(np.int16 if narrow else np.int32)
-    steps = int(np.floor(reach / cell))
-    offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
-    offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
+    offsets = _offsets(reach / cell)
     run, kept, count = np.zeros(start[-1], dtype=np.int32), [np.full((1, _RUN), NOBODY, dtype=kind)], 1
     for some in _blocks(clouds):
         rows = slice(start[some.start], start[some.stop])
@@ -85,6 +83,15 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
         kept.append(block[named])
         count += len(named)
     return CloudRasters(cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1), clouds.work)
+
+
+def _offsets(reach: float) -> list[tuple[int, int]]:
+    """Return the cells within reach of one, cells, the farthest first."""
+    steps = np.arange(-int(reach), int(reach) + 1)
+    dx, dy = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    square = dx * dx + dy * dy
+    order = np.argsort(-square, kind="stable")
+    return [*zip(*(axis[order][square[order] <= reach * reach].tolist() for axis in (dx, dy)), strict=True)]
 
 
 def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:

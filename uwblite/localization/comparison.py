@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, concatenated
-from . import hypotheses, likelihood_field, range_likelihood, search, verdict
+from . import hypotheses, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .sensing import TRACK_RAYS
@@ -22,8 +22,6 @@ _SEARCH_LOOKS = 2.5
 """m driven; the search makes one cloud of the scans of this distance."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
-_AT_ONCE, _MATCHED_AT_ONCE = 8, 16
-"""Places whose rays are compared with the map at once, and that are matched by their scans at once."""
 _WORK = search.UNIT
 """Operations of a step from which on it begins no further unit of work."""
 _RADIO_REACH = 15.0
@@ -71,7 +69,7 @@ class PlaceSearch:
 
     def __init__(self, known: KnownMap) -> None:
         self.walls, self._biases = known.walls, known.anchors.bias_sigma
-        self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
+        self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
         self._odom = np.zeros(3)
         self._present = np.zeros((0, 3))
@@ -132,16 +130,16 @@ class PlaceSearch:
         recent = rays.rows(ago <= _SEARCH_LOOKS)
         found = yield from search.places(self._field, recent, ranges, self._bounds)
         parts = []
-        for start in range(0, max(len(found.poses), 1), _MATCHED_AT_ONCE):
-            parts.append(self._started(found.poses[start : start + _MATCHED_AT_ONCE], ranges, recent))
-            yield hypotheses.MATCHES * PER_FACTOR * len(parts[-1]) * min(len(recent.hit), TRACK_RAYS)
+        match = hypotheses.MATCHES * PER_FACTOR * min(len(recent.hit), TRACK_RAYS)
+        for part in search.units(max(len(found.poses), 1), match):
+            parts.append(self._started(found.poses[part], ranges, recent))
+            yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
         fit, known = np.zeros((2, len(poses)))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
-            for start in range(0, len(poses), _AT_ONCE):
-                part = slice(start, start + _AT_ONCE)
+            for part in search.units(len(poses), PER_RAY * len(rays.hit)):
                 agreement = self.walls.agreement(poses[part], rays)
                 fit[part], known[part] = agreement.log_likelihood, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)

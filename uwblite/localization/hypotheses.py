@@ -44,9 +44,9 @@ _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
 per metre is what a recording begins with before it is learnt; here nothing is learnt."""
 _STANDING = 2e-4
 """m and rad, of every step."""
-_FLIMSY = 0.03
+WALL_SIGMA = 0.03
 """m; standard deviation of a point about its wall: half a cell of 0.05 m and the lidar's noise at 3 m."""
-_INDEPENDENT = 20.0
+INDEPENDENT = 20.0
 """Points of a scan whose errors are independent: those of one wall share the cells' rounding."""
 GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 """m; gate and kernel width of each iteration of a scan's match."""
@@ -167,7 +167,7 @@ def scan_factors(walls: Walls, poses: Floats, rays: Rays, gate: float, width: fl
     """
     hessian, spurious, gradient, weight = walls.factors(poses, rays, gate, width)
     hessian, gradient = measured_part(hessian, spurious, gradient)
-    share = np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
+    share = np.minimum(INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / WALL_SIGMA**2
     return hessian * share[:, None, None], gradient * share[:, None]
 
 

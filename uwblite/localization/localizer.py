@@ -19,10 +19,9 @@ from ..odometry.gyro import GyroTurns
 from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from .known_map import KnownMap
-from .pose_estimator import PoseEstimator
+from .pose_estimator import LocalizerState, PoseEstimator
 from .range_update import RangeFacts
-from .records import LocalizerState, Scanner
-from .sensing import LEAD, Range, Scan, Waiting, scan_rays
+from .sensing import LEAD, Range, Scan, Scanner, Waiting, scan_rays
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""

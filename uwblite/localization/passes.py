@@ -16,7 +16,7 @@ from ..arrays import Bools, Floats, Ints
 from ..sensor_log import SensorLog
 from .known_map import KnownMap
 from .localizer import Localizer
-from .records import Scanner
+from .sensing import Scanner
 
 _SPACING = (0.1, 0.1, 1.0)
 """m, rad and s between poses, and between the scans that are used: nearer ones are redundant."""

@@ -7,17 +7,19 @@ building, the pose counts as found (verdict). From then on that filter tracks, a
 contradict the map, the pose counts as lost, and the search begins again with the measurements since then.
 """
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..config import documented
 from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .known_map import KnownMap
 from .range_likelihood import MOMENTS, bias_effect, range_moments
 from .range_update import RangeFacts, ranged, repeated
-from .records import LocalizerState
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
 from .walls import PER_FACTOR, PER_RAY, Rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
@@ -41,6 +43,35 @@ _MOST, _FORGET = 40, -14.0
 _MOST_PARTS = 4
 """Most parts of the window: a quarter of ten metres is enough for a start."""
 _SCANS_DIFFER = "the scans do not fit the walls any more"
+
+
+@documented
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalizerState:
+    """Present estimate of the robot's pose."""
+
+    stamp: float
+    """s, of the last odometry."""
+    pose: Floats
+    """(3,) T_map_base, of the likeliest hypothesis; nan where there is none."""
+    covariance: Floats
+    """(3, 3) m, m, rad; map frame; of all hypotheses together while there are several."""
+    quality: float
+    """0..1: how likely this pose is against all others, times how well the last measurements agree with the map there."""
+    odometry: Floats
+    """(3,) T_odom_base at the same time, as the wheels have it: pose * odometry^-1 is T_map_odom."""
+    lost: bool
+    """The pose is not known, or not to half a metre; `pose` is the best guess."""
+    reason: str = ""
+    """Why it is not known, for people."""
+    alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(k, 3) other poses that are possible, the likeliest first."""
+    moved_anchors: tuple[str, ...] = ()
+    """Anchors whose ranges have disagreed for long with a pose on which all other measurements agree."""
+    age: float = 0.0
+    """s since anything was measured at all, where that is too long."""
+    silent: dict[str, float] = field(default_factory=dict)
+    """Sensors that send nothing while they should, and for how long, s."""
 
 
 class PoseEstimator:
@@ -268,17 +299,20 @@ class PoseEstimator:
         pose = self._bank.poses[best].copy()
         certain = verdict.needed(fitting, proven)
         undecided = verdict.undecided(self._bank, best, found.complete, certain)
-        agreed = self._agreed(None if undecided else pose)
+        # Agreement from before the part that is used speaks of a place from which the robot was carried away.
+        agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
         fit = float(found.fit[best])
         # Rays that end beyond the map say nothing about it.
         rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
         odds = verdict.map_odds(fit, known, rays, fitting, agreed)
         self._reason = (
             undecided
+            or verdict.imprecise(self._bank.pose_covariances[best])
             or verdict.nowhere(odds, fitting)
             or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
         )
-        if not self._reason and odds.total < certain:
+        # That the robot was carried within the window is as unlikely as what counts as certain.
+        if not self._reason and odds.total < certain + verdict.CERTAIN * (self._parts > 1):
             self._reason = "found; a little more driving will confirm it"
         self._trim(bool(verdict.nowhere(odds, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)

@@ -14,14 +14,13 @@ _RANGES_LOST = 0.25
 """Mean weight of ranges below which the pose is lost."""
 _FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 """Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
-_SEEN = 0.5
-"""Least share of the last scans in known space for their fit to support a pose that ranges contradict."""
-_SOUND_WEIGHT = 0.5
-"""Weight from which on a range supports the pose. The search for a lost robot begins with the measurements after the
-last such range, or after the last scan that fits."""
-_RANGES_SOUND, _RECENT = 0.5, 5.0
-"""Mean weight of ranges, and s since the last of them, with which they support a pose that scans contradict: it is replaced
-only by a better one. Rooms that are only partly in the map, and people around the robot, cause this."""
+_MOST = 0.5
+"""Weight from which on a range supports the pose, mean weight from which on the last ones do, and share of the last scans in
+known space from which on their fit does: more likely than not. The search for a lost robot begins with the measurements after
+the last one that supported the pose. A pose that ranges support and scans contradict is replaced only by a better one: rooms
+that are only partly in the map, and people around the robot, cause this."""
+_RECENT = 5.0
+"""s since the last range, in which ranges still support a pose."""
 _JUMPED = 6.0
 """Log-likelihood, 400 : 1, by which the ranges must be likelier from anywhere than from the pose for it to be lost at once."""
 _DOUBTED = 3.0
@@ -77,7 +76,7 @@ class RunningFit:
         self.trust[anchor] += (_FORGETTING * (weight - self.trust[anchor, 0]), 1.0)
         self.ranges += _FORGETTING_RANGES * (weight - self.ranges)
         self.ranged = max(self.ranged, stamp)
-        if weight > _SOUND_WEIGHT:
+        if weight > _MOST:
             self.sound = max(self.sound, stamp)
 
     def add_scan(self, fit: float, informative: bool, stamp: float) -> None:
@@ -98,7 +97,7 @@ class RunningFit:
 
     def ranges_contradict(self) -> bool:
         """Return whether the ranges contradict the pose, and no scans support it."""
-        return (self.ranges < _RANGES_LOST or self.jumped()) and not (self.seen > _SEEN and self.fit > FIT_SOUND)
+        return (self.ranges < _RANGES_LOST or self.jumped()) and not (self.seen > _MOST and self.fit > FIT_SOUND)
 
     def jumped(self) -> bool:
         """Return whether the ranges, which agreed, now contradict the pose all at once."""
@@ -106,11 +105,11 @@ class RunningFit:
 
     def _jump(self) -> float:
         """Return the log-likelihood by which ranges that agreed before contradict the pose."""
-        return -float(self.against.sum()) if self.before > _RANGES_SOUND else 0.0
+        return -float(self.against.sum()) if self.before > _MOST else 0.0
 
     def ranges_vouch(self, now: float) -> bool:
         """Return whether recent ranges support the pose."""
-        return self.ranges > _RANGES_SOUND and now - self.ranged < _RECENT
+        return self.ranges > _MOST and now - self.ranged < _RECENT
 
     def agreed(self) -> float:
         """Return until when, s, the measurements supported the pose: by chance some still do after a jump."""

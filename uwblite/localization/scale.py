@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats
+from .hypotheses import INDEPENDENT, SLOW_SIGMA, WALL_SIGMA
 from .range_likelihood import range_errors
 from .walls import Rays, Walls
 from .window import Ranges
@@ -21,10 +22,6 @@ _NO_SCALE = 1e-6
 """Prior of distances in the unit of the map."""
 _GATES = ((0.5, 0.3), (0.5, 0.3), (0.4, 0.2), (0.4, 0.15), (0.4, 0.15))
 """m; gate and kernel width of each iteration, wide: in a map 5 % too large the far wall of a room of 5 m is off by 0.25 m."""
-_WALL_SIGMA, _PER_LOOK = 0.03, 20.0
-"""m, of a point about its wall, and points of a scan whose errors are independent, as in hypotheses.matched."""
-_ANCHOR_SIGMA = 0.12
-"""m; common error of all ranges to one anchor."""
 _ITERATIONS = 6
 SCAN_LIMIT, RANGE_LIMIT = 0.03, 0.05
 """Relative error of a lidar or a map: data sheets allow 1 to 3 %; for radios, the delay by walls is added."""
@@ -72,13 +69,13 @@ def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: float) -
     hessian, scaled = information, rays
     for gate, width in _GATES:
         h, _, g, weight = walls.factors((start + x)[None, :3], scaled, gate, width, (rays.origins, beam))
-        share = min(_PER_LOOK * looks / max(float(weight[0]), 1e-9), 1.0) / _WALL_SIGMA**2
+        share = min(INDEPENDENT * looks / max(float(weight[0]), 1e-9), 1.0) / WALL_SIGMA**2
         hessian = information + share * h[0]
         x = x - np.linalg.solve(hessian, share * g[0] + information @ x)
         origins = rays.origins * (1.0 + x[3])
         scaled = Rays(origins + beam * (1.0 + x[4]), origins, rays.hit)
     agreement = float(walls.agreement((start + x)[None, :3], scaled).log_likelihood[0])
-    value = min(len(rays.hit), _PER_LOOK * looks) * agreement - 0.5 * float(x @ information @ x)
+    value = min(len(rays.hit), INDEPENDENT * looks) * agreement - 0.5 * float(x @ information @ x)
     return float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4])), value
 
 
@@ -92,7 +89,7 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
     """
     names, anchor = np.unique(ranges.anchor, return_inverse=True)
     own = np.eye(len(names))[anchor]
-    prior = 1.0 / np.square(np.append(_PRIOR, np.full(len(names), _ANCHOR_SIGMA)))
+    prior = 1.0 / np.square(np.append(_PRIOR, np.full(len(names), SLOW_SIGMA)))
     x, hessian = np.zeros(5 + len(names)), np.diag(prior)
     for _ in range(_ITERATIONS):
         tags = ranges.tags * (1.0 + x[3])
@@ -103,7 +100,7 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
         along = (unit * lever).sum(axis=1) / (1.0 + x[3])
         jacobian = np.column_stack([unit, turned, along, -ranges.values, own])
         weight = _cauchy(error, ranges.sigma) / ranges.sigma**2
-        information = np.diag(prior * np.append(np.ones(5), _cauchy(x[5:], _ANCHOR_SIGMA)))
+        information = np.diag(prior * np.append(np.ones(5), _cauchy(x[5:], SLOW_SIGMA)))
         hessian = information + (jacobian * weight[:, None]).T @ jacobian
         x = x - np.linalg.solve(hessian, information @ x - jacobian.T @ (weight * error))
     return Scale(float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4])))

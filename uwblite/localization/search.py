@@ -11,7 +11,7 @@ The functions are generators that pause after every unit of work and yield its o
 a caller that must keep pace with a lidar does a few units between two scans.
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +19,72 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .likelihood_field import CELL, FARTHEST, LEVELS, Field
 from .range_likelihood import PER_RANGE, range_likelihood, refined_by_ranges
-from .walls import Rays
+from .verdict import FEW_BESIDE, FEW_ENDS
+from .walls import Rays, Walls
 from .window import Ranges
+
+CELL = 0.1
+"""m; cell of the likelihood field."""
+LEVELS = 3
+"""Levels above the field; the coarsest has cells of 0.8 m."""
+_SPREAD = 0.15
+"""m; of a point about its wall: the cell, and 0.05 rad at 3 m."""
+FARTHEST = 12.0
+"""m; points farther away are not matched: 0.05 rad is there 0.6 m."""
+_MOST_FIELD = 3_000_000
+"""Cells of the field (one byte, four levels); a larger map gets coarser ones."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """The walls' likelihood, one byte a cell, and its maxima over squares of cells."""
+
+    cell: float
+    """m."""
+    origin: Floats
+    """(2,) lower left corner, m."""
+    levels: tuple[NDArray[np.uint8], ...]
+    """(rows, cols) each; level k holds the maximum over 2^k x 2^k cells to the upper right."""
+    free: Bools
+    """(rows, cols) cells in which a robot may stand."""
+    margin: int
+    """Cells around the map, so that points outside of it find a cell."""
+    squares: Ints
+    """(k, 2) row and column of the lowest cell of each of the coarsest squares in which a robot may stand."""
+
+
+def field_of(walls: Walls) -> Field:
+    """Return the likelihood field of walls."""
+    g = walls.geometry
+    size = np.array([g.cols, g.rows]) * g.resolution
+    cell = max(CELL, float(np.sqrt((size[0] + 2 * FARTHEST) * (size[1] + 2 * FARTHEST) / _MOST_FIELD)))
+    margin = int(np.ceil(FARTHEST / cell)) + 2 ** (LEVELS + 1)
+    wide, high = (np.ceil(size / cell).astype(int) + 2 * margin).tolist()
+    origin = g.origin - margin * cell
+    x, y = origin[0] + (np.arange(wide) + 0.5) * cell, origin[1] + (np.arange(high) + 0.5) * cell
+    likelihood, free = np.empty((high, wide), np.uint8), np.empty((high, wide), bool)
+    for row in range(high):
+        distance = np.minimum(walls.distances(x, np.full(wide, y[row])), 10.0)
+        likelihood[row] = np.rint(255.0 * np.exp(-0.5 * np.square(distance / max(_SPREAD, cell))))
+        free[row] = walls.state_at(x, np.full(wide, y[row])) == 0
+    levels = [likelihood]
+    for k in range(LEVELS):
+        below, reach = levels[-1], 2**k
+        wider = below.copy()
+        wider[:, :-reach] = np.maximum(below[:, :-reach], below[:, reach:])
+        higher = wider.copy()
+        higher[:-reach] = np.maximum(wider[:-reach], wider[reach:])
+        levels.append(higher)
+    return Field(cell, origin, tuple(levels), free, margin, _squares(free))
+
+
+def _squares(free: Bools) -> Ints:
+    top = 2**LEVELS
+    rows, cols = (n // top for n in free.shape)
+    some = free[: rows * top, : cols * top].reshape(rows, top, cols, top).any(axis=(1, 3))
+    return np.argwhere(some).astype(np.intp) * top
+
 
 _HEADING = 0.05
 """rad; step of the heading."""
@@ -32,8 +94,6 @@ _MOST_NODES = 60_000
 """Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
-_FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
-"""Least number of points of walls for matching; the second where ranges to three anchors determine the place."""
 MOST_PLACES = 32
 """Poses that are returned."""
 
@@ -56,6 +116,12 @@ _PER_POINT, _PER_PLACE = 3, 10
 """Operations for a point of a scan at a place, and for a range to a place."""
 
 
+def units(count: int, each: int) -> Iterator[slice]:
+    """Yield parts of so many items, of a unit of work at most, where an item takes so many operations."""
+    step = max(1, UNIT // max(each, 1))
+    return (slice(start, start + step) for start in range(0, count, step))
+
+
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Search the map.
 
@@ -71,9 +137,9 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
     anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
-    if field is not None and len(seen) >= (_FEWEST_POINTS if anchors < 3 else _FEWEST_BESIDE):
+    if field is not None and len(seen) >= (FEW_ENDS if anchors < 3 else FEW_BESIDE):
         found = yield from _by_scans(field, seen, float(rays.hit.mean()), ranges)
-        if len(seen) >= _FEWEST_POINTS and (len(found.poses) or not len(ranges)):
+        if len(seen) >= FEW_ENDS and (len(found.poses) or not len(ranges)):
             return found
     if anchors < 2:
         return Places(np.zeros((0, 3)), False)
@@ -134,8 +200,7 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     """
     tried, few = poses[:_MOST_RIVALS], _some(ranges)
     weight = _PER_SCORE * scores[: len(tried)]
-    for start in range(0, len(tried), _RANGED_AT_ONCE):
-        part = slice(start, start + _RANGED_AT_ONCE)
+    for part in units(len(tried), PER_RANGE * len(few)):
         weight[part] += range_likelihood(tried[part], few, wider=0.5 * CELL)
         yield PER_RANGE * len(few) * len(tried[part])
     order = np.argsort(-weight, kind="stable")
@@ -166,17 +231,12 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
     """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
-    for start in range(0, len(nodes), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for part in units(len(nodes), _PER_POINT * offsets.shape[1]):
         heading, row, col = nodes[part].T.astype(np.intp)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
         scores[part] = values.sum(axis=1, dtype=np.intp) / (255.0 * offsets.shape[1])
         yield _PER_POINT * values.size
     return scores
-
-
-_AT_ONCE = 4096
-"""Nodes scored at once, a unit of work of 2 ms, so that they fit into the processor's cache."""
 
 
 def _dive(
@@ -201,8 +261,6 @@ def _pause(count: int) -> Generator[int, None, None]:
         yield count
 
 
-_CENTRES_AT_ONCE = UNIT // _PER_PLACE
-"""Places times ranges that are compared at once."""
 _MANY = 20_000
 """Nodes or poses that take a millisecond or so to make, to compare or to sort."""
 
@@ -230,15 +288,15 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[int, None
     if not len(ranges) or not len(centre):
         return np.ones(len(centre), bool)
     cost, moved = np.zeros(len(centre)), np.hypot(*ranges.tags.T)
-    at_once = max(1, _CENTRES_AT_ONCE // len(centre))
-    for k in range(len(ranges)):
-        x, y = (centre - ranges.places[k]).T
-        off = ranges.values[k] - np.sqrt(x * x + y * y)
-        beyond = np.abs(off) - moved[k] - 1.5 * half - 4.0 * ranges.sigma[k]
-        # A range that is one metre off counts like one that is ten metres off.
-        cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
-        if k % at_once == at_once - 1:
-            yield _PER_PLACE * at_once * len(centre)
+    for part in units(len(ranges), _PER_PLACE * len(centre)):
+        some = ranges.rows(np.arange(len(ranges))[part])
+        for place, value, way, sigma in zip(some.places, some.values, moved[part], some.sigma, strict=True):
+            x, y = (centre - place).T
+            off = value - np.sqrt(x * x + y * y)
+            beyond = np.abs(off) - way - 1.5 * half - 4.0 * sigma
+            # A range that is one metre off counts like one that is ten metres off.
+            cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
+        yield _PER_PLACE * len(some) * len(centre)
     return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
 
 
@@ -253,15 +311,13 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
         return Places(np.zeros((0, 3)), False)
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
     few, cost = _some(ranges), np.empty(len(poses))
-    for start in range(0, len(poses), _RANGED_AT_ONCE):
-        part = slice(start, start + _RANGED_AT_ONCE)
+    for part in units(len(poses), PER_RANGE * len(few)):
         cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
         yield PER_RANGE * len(few) * len(cost[part])
     order = np.flatnonzero(cost <= cost.min(initial=np.inf) + _RANGE_RIVAL)
     order = order[np.argsort(cost[order], kind="stable")]
     tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
-    for start in range(0, len(tried), _REFINED_AT_ONCE):
-        part = slice(start, start + _REFINED_AT_ONCE)
+    for part in units(len(tried), _PER_REFINED * len(ranges)):
         tried[part] = refined_by_ranges(tried[part], ranges)
         yield _PER_REFINED * len(tried[part]) * len(ranges)
     return (yield from _distinct(tried, 0 < len(order) <= _MOST_RIVALS))
@@ -274,10 +330,10 @@ def _some(ranges: Ranges) -> Ranges:
 
 _PER_SCORE = 30.0
 """Log-likelihood by which a score of 1 is better than one of 0: of fifteen rays, each about ten times likelier on a wall."""
-_RANGED_AT_ONCE, _MOST_RIVALS = 1024, 4096
-"""Poses that are tried at once, and that may be as good before the search is not complete."""
-_REFINED_AT_ONCE, _PER_REFINED = 8, 8 * 60
-"""Poses that are refined at once, and operations for a range in eight iterations of that."""
+_MOST_RIVALS = 4096
+"""Poses that may be as good before the search is not complete."""
+_PER_REFINED = 8 * 60
+"""Operations for a range in eight iterations of a refinement."""
 _RANGE_RIVAL = 12.0
 """Log-likelihood by which a place may be worse than the best one before it is refined."""
 
@@ -298,4 +354,4 @@ def _distinct(poses: Floats, complete: bool) -> Steps:
 
 
 _SAME = (0.4, 0.2)
-"""m and rad; poses that are closer are one place."""
+"""m and rad; poses that are closer are one place, closer than hypotheses.apart: they are not refined yet."""

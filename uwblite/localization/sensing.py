@@ -6,10 +6,10 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..config import documented
 from ..odometry.attached import beam_origins
 from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting
-from .records import Scanner
 from .walls import Rays
 
 _FARTHEST = 1000.0
@@ -23,6 +23,27 @@ LEAD = 5.0
 One as far behind is not explained by delay."""
 _CONFIRMED = 4
 """Different stamps, all so far ahead, after which the odometry was silent for so long."""
+
+
+@documented
+@dataclass(frozen=True, slots=True)
+class Scanner:
+    """Geometry of a lidar, with the field names of sensor_msgs/LaserScan."""
+
+    angle_min: float
+    """rad."""
+    angle_increment: float
+    """rad."""
+    time_increment: float = 0.0
+    """s between rays."""
+    range_min: float = 0.02
+    range_max: float = 30.0
+    """m."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether it gives the direction of each ray; a broken header does not."""
+        return bool(np.isfinite((self.angle_min, self.angle_increment, self.time_increment)).all())
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,22 +43,27 @@ _UNIT_CLEAR = 0.01
 
 
 def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> str:
-    """Return why another place than the best one, or none in particular, may be right; "" = none may.
+    """Return why another place than the best one may be right; "" = none may.
 
     Parameters
     ----------
     complete : the search left no place out. certain : log-likelihood by which it must be better than any other.
     """
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
-    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     if not complete:
         return "too many places are as likely; drive on"
     if rivals.max(initial=-np.inf) > -certain:
         count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
-    if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
-        return "place or heading is not sure yet; drive on"
     return ""
+
+
+def imprecise(covariance: Floats) -> str:
+    """Return why the only place is not found yet, by its covariance (3, 3), m and rad; "" = it is known well enough."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if max(sigma[0], sigma[1]) <= SIGMA_FOUND[0] and sigma[2] <= SIGMA_FOUND[1]:
+        return ""
+    return "place or heading is not sure yet; drive on"
 
 
 def needed(fitting: "RangeFit", proven: bool) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints, Table, concatenated
+from .hypotheses import BIAS_SIGMA
 from .range_update import RangeFacts
 from .walls import Rays
 
@@ -96,6 +97,10 @@ class Window:
         stamps = [r.stamp for r in self.ranges] + [k.stamp for k in self.looks]
         return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
 
+    def length(self, way: float) -> float:
+        """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
+        return way - min([way, *(r.way for r in self.ranges[:1]), *(k.way for k in self.looks[:1])])
+
     def forget(self, way: float) -> None:
         """Remove measurements from more than LENGTH before, m by the odometer."""
         self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
@@ -142,14 +147,12 @@ class Window:
         ago = np.array([way - r.way for r in rows])
         measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
         level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
-        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + _SLOW**2 + (DRIFT * ago) ** 2)
+        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + BIAS_SIGMA**2 + (DRIFT * ago) ** 2)
         anchor = np.array([r.fact.anchor for r in rows], dtype=np.intp)
         noise = np.array([(r.fact.white, r.fact.length) for r in rows]).reshape(-1, 2).T
         return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma, way - ago, *noise)
 
 
-_SLOW = 0.1
-"""m; common error of ranges to one anchor."""
 DRIFT = 0.03
 """m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 

@@ -83,27 +83,31 @@ class ClearanceMap:
         table = self._nearness(self._unit * np.arange(int(half.max(initial=0)) + 1)).astype(np.float32)
         return np.asarray(np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), np.float32(1.0)) * table[half])
 
-    def at(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return lower bounds (...) of the squared clearance, m^2, and costs of a metre (...), at points (..., 2), m.
+    def bounds(self, points: Floats) -> Floats:
+        """Return lower bounds (n,) of the squared clearance at points (n, 2), m and m^2; outside the map it is 0."""
+        return self._interpolated(points)[0]
 
-        Outside the map the clearance is 0.
-        """
-        grid = self.geometry
-        place = (points - grid.origin) / grid.resolution - 0.5
+    def at(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the same bounds (n,), m^2, and the costs of a metre (n,), at points (n, 2), m."""
+        squared, between, nearest = self._interpolated(points)
+        costs = self._nearness(self._unit * between)
+        return squared, costs if self.refused else np.where(self.dear.ravel()[nearest], UNKNOWN_PRICE, 1.0) * costs
+
+    def _interpolated(self, points: Floats) -> tuple[Floats, Floats, Ints]:
+        """Return `bounds` (n,), `half` (n,) interpolated between the centres around, and the nearest cell (n,)."""
+        grid, flat = self.geometry, self.half.ravel()
+        place = (points.T - grid.origin[:, None]) / grid.resolution - 0.5
         low = np.floor(place)
-        u, v = np.moveaxis(place - low, -1, 0)
-        col, row = np.moveaxis(low.astype(np.intp), -1, 0)
+        u, v = place - low
+        col, row = low.astype(np.intp)
         inside = (row >= 0) & (row < grid.rows - 1) & (col >= 0) & (col < grid.cols - 1)
         first = np.where(inside, row * grid.cols + col, 0)
-        flat = self.half.ravel()
+        above = first + np.where(inside, grid.cols, 0)
         lower = (1.0 - u) * flat[first] + u * flat[first + inside]
-        upper_first = first + inside * grid.cols
-        upper = (1.0 - u) * flat[upper_first] + u * flat[upper_first + inside]
+        upper = (1.0 - u) * flat[above] + u * flat[above + inside]
         between = np.where(inside, (1.0 - v) * lower + v * upper, 0.0)
         squared = self._unit * np.maximum(between - 4.0 * (u * (1.0 - u) + v * (1.0 - v)), 0.0)
-        nearest = row + (v > 0.5), col + (u > 0.5)
-        price = np.where(inside & self.dear[tuple(np.where(inside, n, 0) for n in nearest)], UNKNOWN_PRICE, 1.0)
-        return squared, self._nearness(self._unit * between) * price
+        return squared, between, np.where(v > 0.5, above, first) + (inside & (u > 0.5))
 
     def is_obstacle(self, points: Floats) -> Bools:
         """Return which points (n, 2), m, lie in an obstacle, or outside the map."""
@@ -116,7 +120,7 @@ class ClearanceMap:
 
         Parameters
         ----------
-        points : (n, 2) m. bound : (n,) what `at` says of them, m^2. needed : (n,) m^2.
+        points : (n, 2) m. bound : (n,) `bounds` of them, m^2. needed : (n,) m^2.
         owner : (n,) whose point each is, 0 ... in order; every owner has one.
         """
         grid, kept = self.geometry, np.ones(int(owner.max(initial=-1)) + 1, dtype=np.bool_)
@@ -138,7 +142,7 @@ class ClearanceMap:
 
         Distances that cost nothing count as the radius and COMFORT.
         """
-        squared = self.at(points)[0]
+        squared = self.bounds(points)
         near = np.flatnonzero(squared < self.radius**2)
         squared[near] = np.minimum(self._exact(points[near]), self.radius**2)
         return np.asarray(np.minimum(np.sqrt(squared), self.radius + COMFORT))

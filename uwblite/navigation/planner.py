@@ -12,9 +12,6 @@ from .clearance import ClearanceMap, clearance_map
 from .smoothing import along_lines, sampled, smoothed
 from .steps import StepSearch, step_search
 
-_NOTHING = 1e-9
-"""m; additional cost of a straight path through open space by rounding. No other path costs as little."""
-
 
 class NoPathError(DataError):
     """There is no way to a goal.
@@ -81,8 +78,7 @@ class Planner:
 
     def _leg(self, start: Floats, goal: Floats) -> Floats:
         """Return the corners (k, 2) of the path between two places, the first of which is left out."""
-        straight = along_lines(self.clearance, start[None], goal[None])
-        if straight.clear[0] and straight.costs[0] <= np.hypot(*(goal - start)) + _NOTHING:
+        if along_lines(self.clearance, start[None], goal[None]).open[0]:
             return goal[None]
         way, first = self._entrance(start)
         nodes = self.steps.path(first, last) if (last := self._beside(goal)) >= 0 else None

@@ -5,6 +5,7 @@ whose cheapest path is the new line. It is cut into short pieces and shortened a
 compared by its cost and not by its length, so that the line stays as far from obstacles as the search wanted.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .clearance import ClearanceMap
+from .clearance import COMFORT, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
 """Where clearance and cost of a line are looked up."""
@@ -38,6 +39,8 @@ class Lines(NamedTuple):
     """(n,) in metres of open space."""
     clear: Bools
     """(n,) whether every point of the line keeps the robot's radius from all obstacles."""
+    open: Bools
+    """(n,) whether it is clear, and a metre costs no more than one of open space: no other way is as cheap."""
     crossing: Bools
     """(n,) whether the line leads through an obstacle's cell."""
 
@@ -50,27 +53,56 @@ def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
     begin, end : (n, 2) m, map frame.
     """
     lengths = np.hypot(*(end - begin).T)
-    pieces = np.ceil(lengths * (_SAMPLES_PER_CELL / clearance.geometry.resolution)).astype(np.intp) + 1
+    roomy = _roomy(clearance, begin, end, lengths)
+    found = Lines(lengths.copy(), roomy.copy(), roomy, np.zeros(len(lengths), dtype=np.bool_))
+    for which, count in _parts(~roomy, lengths, clearance.geometry.resolution / _SAMPLES_PER_CELL):
+        part = _along(clearance, begin[which], end[which], lengths[which], count)
+        for whole, values in zip(found, part, strict=True):
+            whole[which] = values
+    return found
+
+
+def _roomy(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats) -> Bools:
+    """Return which lines (n,) are so far from everything that a few of their places show that they are open."""
+    shown = np.zeros(len(lengths), dtype=np.bool_)
+    free, cell = clearance.radius + COMFORT, clearance.geometry.resolution
+    # As far apart as clearances that are cut off a cell beyond `free` allow (see clearance.py), and a quarter of it.
+    apart = np.sqrt(2.0 * cell * (4.0 * free + cell)) * np.array([1.0, 0.25])
+    for step in apart if clearance.refused else ():
+        for which, count in _parts(~shown & (lengths > step), lengths, step):
+            points, _, first = _samples(begin[which], end[which], count)
+            away = np.minimum.reduceat(clearance.bounds(points), first)
+            shown[which] = away >= free**2 + 0.25 * (lengths[which] / count) ** 2
+    return shown
+
+
+def _parts(lines: Bools, lengths: Floats, step: float) -> Iterator[tuple[Ints, Ints]]:
+    """Yield some of the lines (n,) in parts (k,) of bounded work, and how many pieces (k,) each has of at most a step, m."""
+    which = np.flatnonzero(lines)
+    pieces = np.ceil(lengths[which] / step).astype(np.intp) + 1
     ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // _SAMPLES_AT_A_TIME)) + 1
-    found = [
-        _along(clearance, b, e, length, count)
-        for b, e, length, count in zip(*(np.split(a, ends) for a in (begin, end, lengths, pieces)), strict=True)
-    ]
-    return Lines(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    if len(which):
+        yield from zip(np.split(which, ends), np.split(pieces, ends), strict=True)
+
+
+def _samples(begin: Floats, end: Floats, pieces: Ints) -> tuple[Floats, Ints, Ints]:
+    """Return the ends (k, 2) of so many equal pieces (n,) of lines, the line of each (k,), and the first of each line (n,)."""
+    first = np.cumsum(pieces + 1) - (pieces + 1)
+    owner = np.repeat(np.arange(len(pieces)), pieces + 1)
+    share = (np.arange(len(owner)) - first[owner]) / pieces[owner]
+    return begin[owner] + share[:, None] * (end - begin)[owner], owner, first
 
 
 def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats, pieces: Ints) -> Lines:
     """Look up lines (n,) at the ends of so many equal pieces (n,) of each."""
-    first = np.cumsum(pieces + 1) - (pieces + 1)
-    owner = np.repeat(np.arange(len(pieces)), pieces + 1)
-    share = (np.arange(len(owner)) - first[owner]) / pieces[owner]
-    points = begin[owner] + share[:, None] * (end - begin)[owner]
+    points, owner, first = _samples(begin, end, pieces)
     squared, cost = clearance.at(points)
     step = lengths / pieces
     clear = clearance.keeps(points, squared, (clearance.radius**2 + 0.25 * step**2)[owner], owner)
     last = first + pieces
     costs = step * (np.add.reduceat(cost, first) - 0.5 * (cost[first] + cost[last]))
-    return Lines(costs, clear, np.logical_or.reduceat(clearance.is_obstacle(points), first))
+    open_ = clear & (np.maximum.reduceat(cost, first) <= 1.0)
+    return Lines(costs, clear, open_, np.logical_or.reduceat(clearance.is_obstacle(points), first))
 
 
 def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
@@ -112,8 +144,8 @@ def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
     left = np.arange(len(begin))
     for parts in _SIEVE:
         for k in range(1, parts, 2):
-            squared, _ = clearance.at(begin[left] + k / parts * (end - begin)[left])
-            left = left[squared >= clearance.radius**2]
+            places = begin[left] + k / parts * (end - begin)[left]
+            left = left[clearance.bounds(places) >= clearance.radius**2]
     return np.bincount(left, minlength=len(begin)) > 0
 
 

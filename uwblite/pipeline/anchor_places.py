@@ -129,8 +129,8 @@ def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], sta
         figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": next_name}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
-            between = [float(stamps[row] - start) for row in (last + 1, first)]
-            figures |= {"between": between, "way": way, "several": len(task.recordings) > 1}
+            between = [*(float(stamps[row] - start) for row in (last + 1, first)), way]
+            figures |= {"between": between, "several": len(task.recordings) > 1}
         yield Fact("moved-anchor", figures)
 
 

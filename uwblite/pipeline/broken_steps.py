@@ -149,10 +149,13 @@ class BrokenStep:
     def gain(self) -> float:
         """Return by how much its evidence is greater than that of the moves, if a step is broken there."""
         poses = self.estimate.graph.poses
+        worth = [radio.model.worth(each.place) for radio, each in zip(self.radios, self.before, strict=True)]
+        radios = [k for k, radio in enumerate(self.radios) if len(radio.inside(self.begin, self.end))]
+        moved = sum(self.radios[k].model.with_places(self.before[k], worth[k]).evidence for k in radios)
         for _ in range(MovePolicy.laps):
             # Places that a displaced stretch has pulled along hide some of the step, so both are found in turn.
             self.motion, spread = self._fitted()
-            gain = self._evidence()
+            gain = self._evidence(radios, worth) - moved
         gain += spread - 0.5 * float(self.motion @ self.motion) / BreakPolicy.size**2
         return gain - 0.5 * (self._cost(self.displaced(poses)) - self._cost(poses))
 
@@ -183,18 +186,20 @@ class BrokenStep:
         origin = self.estimate.graph.poses[self.begin - 1]
         return np.asarray(se2.compose(se2.compose(origin, self.motion), se2.inverse(origin)))
 
-    def _evidence(self) -> float:
-        """Return by how much the evidence of all ranges is greater than with the moves, the places at their likeliest."""
-        gain, moved = 0.0, self._displacement()
-        for k, radio in enumerate(self.radios):
+    def _evidence(self, radios: Sequence[int], worth: Sequence[Floats]) -> float:
+        """Return the evidence of the ranges of some radios along the path with the stretch moved, places at their likeliest.
+
+        Parameters
+        ----------
+        worth : of the ranges of each radio (m,) with the moves, see PlaceModel.
+        """
+        moved = self._displacement()
+        for k in radios:
+            radio = self.radios[k]
             inside, path = radio.inside(self.begin, self.end), radio.track.path.copy()
-            if len(inside):
-                path[inside] = se2.transform(moved, path[inside])
-                shares = radio.model.worth(self.before[k].place)
-                one = radio.model.with_places(self.before[k], shares)
-                self.found[k] = radio.model.along(path).with_places(self.found[k], shares)
-                gain += self.found[k].evidence - one.evidence
-        return gain
+            path[inside] = se2.transform(moved, path[inside])
+            self.found[k] = radio.model.along(path).with_places(self.found[k], worth[k])
+        return sum(self.found[k].evidence for k in radios)
 
     def _fitted(self) -> tuple[Floats, float]:
         """Return the error (3,) of the step that explains the stretch's ranges best, and the logarithm of what share of its

@@ -166,7 +166,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)
 
     reporter = stages.reporter("occupancy grid")
-    grid = from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
+    grid = from_sweeps(sweeps, config.grid, progress=reporter, announce=announce)
     stages.work[RAYS] += sum(own.scans.ranges.size for own in sweeps)
     if grid.scans_astray:
         stages.note("scans-astray", scans=grid.scans_astray, used=grid.scans_used)

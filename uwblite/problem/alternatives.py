@@ -61,9 +61,11 @@ class Explanation:
 
 
 def explanations(
-    present: Graph, propose: Callable[[Graph], Iterable[Alternative]], solve: Callable[[Graph], Graph],
+    present: Graph,
+    propose: Callable[[Graph], Iterable[Alternative]],
+    solve: Callable[[Graph], Graph],
     evidence: Callable[[Graph], float] = laplace_marginal_likelihood,
-) -> list[Explanation]:  # fmt: skip
+) -> list[Explanation]:
     """Return the explanations of measurements, the likeliest first; the present one, among them, has odds of 1.
 
     Parameters
@@ -97,9 +99,11 @@ def explanations(
 
 
 def compared(
-    present: Graph, alternative: Alternative, solve: Callable[[Graph], Graph],
+    present: Graph,
+    alternative: Alternative,
+    solve: Callable[[Graph], Graph],
     evidence: Callable[[Graph], float] = laplace_marginal_likelihood,
-) -> Explanation | None:  # fmt: skip
+) -> Explanation | None:
     """Return the explanation by one alternative; None where it is the present one, or they are not determined."""
     try:
         found = explanations(present, lambda graph: [alternative] if graph is present else [], solve, evidence)

@@ -44,6 +44,10 @@ def log_density(graph: Graph) -> float:
 def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
     """Return the logarithm of the marginal likelihood of other prior standard deviations, relative to those in use.
 
+    With the posterior N(a, P) under the prior N(0, D), that of N(0, D') is, relative to it,
+
+        2 log Z = h^T J^-1 h - a^T P^-1 a - log|J| - log|P| - log|D'| + log|D|,   J = P^-1 + D'^-1 - D^-1,   h = P^-1 a.
+
     Parameters
     ----------
     mean, covariance : (n,) and (n, n) posterior of the unknowns.
@@ -68,17 +72,17 @@ def prior_sigma(graph: Graph) -> Floats:
     return sigma
 
 
-def with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
-    """Return the graph with other prior standard deviations (c,) of its calibration values."""
-
-    def changed(edges: object) -> bool:
-        return isinstance(edges, PriorEdges) and edges.block == "calibration"
-
-    edges = tuple(
-        replace(e, sqrt_information=(1.0 / sigma[e.index])[:, None, None]) if changed(e) else e  # type: ignore[attr-defined,type-var]
-        for e in graph.edges
-    )
-    return replace(graph, edges=edges)
+def with_prior_sigma(graph: Graph, sigma: Floats, mean: Floats | None = None) -> Graph:
+    """Return the graph with other prior standard deviations (c,) of its calibration values, and other means (c,), nan = as
+    they are."""
+    mean = np.full(len(sigma), np.nan) if mean is None else mean
+    edges = []
+    for e in graph.edges:
+        if isinstance(e, PriorEdges) and e.block == "calibration":
+            value, root = mean[e.index][:, None], (1.0 / sigma[e.index])[:, None, None]
+            e = replace(e, value=np.where(np.isnan(value), e.value, value), sqrt_information=root)
+        edges.append(e)
+    return replace(graph, edges=tuple(edges))
 
 
 _SCATTERS = 60

@@ -1,26 +1,20 @@
 """Covariances with correlated range errors: of anchors where the lidar determines the poses, of all where ranges alone do.
 
-A weight that counts many correlated errors as one treats each of them as a large independent error. That is right for the
-estimate, but the inverse H^-1 = (J^T W J)^-1 is not its covariance: it is too large in directions that few ranges determine,
-and too small where correlated errors all have one sign. With the covariance R of the errors, the covariance of the estimate is
+A weight that counts many correlated errors as one is right for the estimate, but H^-1 = (J^T W J)^-1 is not its covariance: it
+is too large in directions that few ranges determine, and too small where errors all have one sign. With their covariance R it
+is
 
     H^-1 J^T W R W J H^-1
 
-(P. J. Huber, The behavior of maximum likelihood estimates under nonstandard conditions, 1967). One part of the errors is new
-in every range, the other changes only with direction and distance, and the anchor's place absorbs much of it. Their size is
-learnt from the residuals: R is scaled so that it would leave the observed scatter (as in restricted maximum likelihood).
-So an anchor behind obstacles, whose ranges scatter by decimetres, gets a sigma of decimetres although it fits: its ranges are
-all too long, by an exponentially distributed delay whose mean is as large as its scatter.
+(P. J. Huber, The behavior of maximum likelihood estimates under nonstandard conditions, 1967). One part of the errors is new in
+every range, the other changes only with direction and distance, and the anchor's place absorbs much of it. R is scaled so that
+it would leave the scatter of the residuals (as in restricted maximum likelihood). The errors of the poses add the marginal
+covariance of the whole graph minus H^-1, as far as that is positive: the two are linearised at different places.
 
-The errors of the poses add the marginal covariance of the whole graph minus H^-1. This is positive, except that the two are
-linearised at different places; along a line of sight, where the curvature is almost zero, that difference matters.
-
-Without a lidar the poses follow such errors as the anchors do. Then H is that of the whole graph, and R counts in the place of
-W^-1 for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. The path also follows the common error of the ranges to all
-anchors: behind more walls all of them are longer, never shorter, and there are more walls over a longer distance. So half of
-the lasting errors belong to one anchor, by direction and distance, and half are common to all, by distance. Their size is
-learnt from the residuals of all anchors together: a path that is bent towards ranges delayed by the same walls hides half of
-their errors.
+Without a lidar the poses follow such errors as anchors do. Then H is that of the whole graph, and R counts in the place of W^-1
+for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. Behind more walls the ranges to all anchors are longer, and there
+are more walls over a longer distance: half of the lasting errors belong to one anchor, by direction and distance, and half are
+common to all, by distance. Their size is learnt from all anchors together, since a bent path hides half of what walls delay.
 """
 
 from dataclasses import replace
@@ -30,7 +24,7 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, spread, spread_about_median
 from ..graph.graph import Graph, edge_weights
-from ..graph.marginals import CommonErrors, Covariances, Marginals, marginals
+from ..graph.marginals import Covariances, Marginals, marginals
 from ..graph.range_edges import RangeEdges
 from .range_noise import RangeNoiseConfig, distance_sums, steady_sums
 
@@ -154,8 +148,7 @@ def _variance(edges: RangeEdges, weights: Floats) -> Floats:
 
 def _by_each_range(found: Marginals, edges: RangeEdges) -> sparse.csr_matrix:
     """Return W J (m, unknowns): of an error of 1 m in each range."""
-    each = np.arange(len(edges))
-    return found.slopes(CommonErrors(edges, each, each, 1.0 / edges.sigma[:, None], each)).T.tocsr()
+    return found.slopes(edges, sparse.csr_matrix(sparse.diags(1.0 / edges.sigma))).T.tocsr()
 
 
 def _times_correlation(edges: RangeEdges, offsets: Floats, values: Floats) -> Floats:

@@ -25,7 +25,7 @@ from ..graph.solver import SolverConfig
 from ..odometry.slips import with_slips
 from ..problem.alternatives import EvidencePolicy
 from . import nlos_mixture
-from .range_noise import RangeNoise, RangeNoiseConfig, effective_sigma
+from .range_noise import RangeNoiseConfig, independent_shares
 from .slip_search import TagRanges, likeliest_slip, log_prior
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
 
@@ -196,9 +196,11 @@ class Attempt:
         likely = independent = 0.0
         for edges in part.edges:
             if isinstance(edges, RangeEdges):
-                errors, shares = -edges.residuals(part)[:, 0] * edges.sigma, _independent_shares(edges, part.poses)
+                errors = -edges.residuals(part)[:, 0] * edges.sigma
+                groups = [edges.anchor == anchor for anchor in np.unique(edges.anchor)]
+                shares = independent_shares(edges.tag_positions(part.poses), groups, RangeNoiseConfig())
                 independent += float(shares.sum())
-                for own in (edges.anchor == anchor for anchor in np.unique(edges.anchor)):
+                for own in groups:
                     mixture = nlos_mixture.fit(errors[own], self.config.range_sigma)
                     likely += float(shares[own] @ mixture.log_density(errors[own]))
             else:
@@ -388,16 +390,6 @@ class Attempt:
         radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
         alone = Graph(self.poses[low:high], self.anchors, (), self.calibration, work=self.graph.work)
         return alone.with_edges(wheels, radio)
-
-
-def _independent_shares(ranges: RangeEdges, poses: Floats) -> Floats:
-    """Return which share (m,) of each range is independent of its neighbours'."""
-    usual, shares, tags = RangeNoiseConfig(), np.ones(len(ranges)), ranges.tag_positions(poses)
-    noise = RangeNoise(np.sqrt(1.0 - usual.slow_share), np.sqrt(usual.slow_share), usual.correlation_length)
-    for anchor in np.unique(ranges.anchor):
-        own = ranges.anchor == anchor
-        shares[own] = effective_sigma(tags[own], noise) ** -2
-    return shares
 
 
 _SCALES = (20.0, 6.0, 3.0)

@@ -1,14 +1,11 @@
 """Starts for the optimisation of an imported graph: every chain and every anchor gets a place.
 
-Which minimum an optimisation finds depends on its start. Where no certificate (graph/certificate.py) proves that it is the
-global one, further starts may lead to a lower one.
-
-Trajectories of several robots that only ranges and landmarks connect are placed one after another, the best connected first,
-each rigid with the shape of its odometry: for every heading R on a circle of starts, a range d from its point b to a placed
-point a (0 where the chain sees the landmark a at b) means |a - R b - t| = d, which is trilateration of t; squared,
-|p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. Gauss-Newton steps in heading and place follow, with
-Cauchy weights, because odometry drifts and some ranges are wrong. Several hypotheses are kept from chain to chain; the
-optimisation of the whole graph decides between them.
+Which minimum an optimisation finds depends on its start; without a certificate (graph/certificate.py) further starts may lead
+to a lower one. Trajectories of several robots that only ranges and landmarks connect are placed one after another, the best
+connected first, each rigid with the shape of its odometry: for every heading R on a circle of starts, a range d from its point
+b to a placed point a (0 where the chain sees the landmark a at b) means |a - R b - t| = d; squared, |p|^2 - 2 p.t + |t|^2 = d^2
+with p = a - R b is linear in t and |t|^2. Gauss-Newton steps with Cauchy weights follow, because odometry drifts and some
+ranges are wrong. Several hypotheses are kept from chain to chain; the optimisation of the whole graph decides between them.
 """
 
 from collections.abc import Iterator

@@ -1,21 +1,16 @@
 """Incremental optimisation of a graph whose initial values are only locally right: poses are added in time.
 
-Dead reckoning over kilometres drifts so far that no descent from it finds the minimum: with anchors trilaterated on a
-bent path, the start is outside the basin of convergence after a few thousand poses. But the guess of the next hundred poses,
-appended to the estimate so far, is always near. So poses are added in pieces. Each time the last few hundred are optimised
-with older ones fixed; the whole is optimised again when it is longer by half, or when the last part does not fit.
-
-An anchor is added when the ranges so far place it, and removed again when later ranges contradict it: the mirror
-image of an anchor passed on one side is often found, and is recognised only after a turn.
-
-A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, each of
-sqrt(2 / dof). A part that does not fit is tried, in this order, without the anchors that were added last, without
-the anchors most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
+Dead reckoning over kilometres drifts so far that no descent from it finds the minimum, but the guess of the next hundred poses,
+appended to the estimate so far, is always near. Each time the last few hundred are optimised with older ones fixed; the whole
+is optimised again when it is longer by half, or when the last part does not fit: when its chi2 per degree of freedom exceeds
+the usual by five standard deviations, each of sqrt(2 / dof). Such a part is tried, in this order, without the anchors that were
+added last, without those most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
+(The mirror image of an anchor passed on one side is often found, and is recognised only after a turn.)
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -29,32 +24,36 @@ from ..graph.solver import Progress, SolverConfig, SolverSummary, optimize
 from ..graph.unknowns import free_unknowns
 from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
-_PIECE = 100
-"""Poses added at once; over so many the guess may not bend by more than about a radian."""
-_WINDOW = 400
-"""Poses optimised after each piece, older ones fixed."""
-_WIDENING = 4
-"""Factor on the window where it does not fit."""
-_RESOLVE_FACTOR = 1.5
-"""Everything is optimised again when there are so many times the poses."""
-_SIGNIFICANCE = 5.0
-"""Standard deviations by which chi2 may exceed the usual."""
-_PROBATION = 400
-"""Number of poses after which a new anchor is no longer the first to be removed."""
-_MIN_RANGES = 20
-"""Ranges before an anchor is searched."""
-_MAX_POSITION_SIGMA = 0.5
-"""An anchor less certain than this is not added yet, m."""
-_DRIFT = 0.1
-"""Assumed error of the path over the ranges an anchor is searched from, m."""
-_OUTLIER = 4.0
-"""Standard deviations beyond which a range is an outlier."""
-_OUTLIER_SHARE = 0.3
-"""An anchor with a larger share of outliers is removed."""
-_SEARCH = TrilaterationConfig(ambiguity=0.7)
-"""How anchors are searched; stricter than usual, since another try comes soon."""
-_STEP = SolverConfig(max_iterations=30, relative_decrease=1e-4)
-"""Settings of the intermediate optimisations."""
+
+@dataclass(frozen=True, slots=True)
+class IncrementalPolicy:
+    """How poses and anchors are added."""
+
+    piece: ClassVar[int] = 100
+    """Poses added at once; over so many the guess may not bend by more than about a radian."""
+    window: ClassVar[int] = 400
+    """Poses optimised after each piece, older ones fixed; also those after which a new anchor is no longer the first to be
+    removed."""
+    widening: ClassVar[int] = 4
+    """Factor on the window where it does not fit."""
+    resolve_factor: ClassVar[float] = 1.5
+    """Everything is optimised again when there are so many times the poses."""
+    significance: ClassVar[float] = 5.0
+    """Standard deviations by which chi2 may exceed the usual."""
+    ranges: ClassVar[int] = 20
+    """Ranges before an anchor is searched; it is searched again with a fifth more of them."""
+    position_sigma: ClassVar[float] = 0.5
+    """An anchor less certain than this is not added yet, m."""
+    drift: ClassVar[float] = 0.1
+    """Assumed error of the path over the ranges an anchor is searched from, m."""
+    outlier: ClassVar[float] = 4.0
+    """Standard deviations beyond which a range is an outlier."""
+    outlier_share: ClassVar[float] = 0.3
+    """An anchor with a larger share of outliers is removed."""
+    search: ClassVar[TrilaterationConfig] = TrilaterationConfig(ambiguity=0.7)
+    """How anchors are searched; stricter than usual, since another try comes soon."""
+    step: ClassVar[SolverConfig] = SolverConfig(max_iterations=30, relative_decrease=1e-4)
+    """Settings of the intermediate optimisations."""
 
 
 def optimize_incrementally(
@@ -144,9 +143,9 @@ class _Incremental:
             if self.work >= self.allowed:
                 self._lay_on(done, len(self.guess))
                 return
-            now = min(done + _PIECE, len(self.guess))
+            now = min(done + IncrementalPolicy.piece, len(self.guess))
             self._lay_on(done, now)
-            everything = now == len(self.guess) or now >= _RESOLVE_FACTOR * whole
+            everything = now == len(self.guess) or now >= IncrementalPolicy.resolve_factor * whole
             part = self._fit(now, everything)
             self.graph = replace(
                 self.graph,
@@ -174,7 +173,7 @@ class _Incremental:
 
     def _fit(self, now: int, everything: bool) -> _Part:
         """Optimise the last part, or as much more as it takes to fit."""
-        window = now if everything else _WINDOW
+        window = now if everything else IncrementalPolicy.window
         while True:
             low = max(0, now - window)
             part = self._solve(low, now)
@@ -182,11 +181,11 @@ class _Incremental:
                 part = self._without_outliers(part, low, now)
             if part.fits or low == 0:
                 return part
-            window *= _WIDENING
+            window *= IncrementalPolicy.widening
 
     def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
         """Return the part without some anchors if it fits then, and remove these; otherwise return it unchanged."""
-        fresh = self.joined & self.ranged & (self.joined_at >= now - _PROBATION)
+        fresh = self.joined & self.ranged & (self.joined_at >= now - IncrementalPolicy.window)
         for accused in (fresh, None):
             if accused is None:
                 accused = self._outlying(low, now)
@@ -200,14 +199,14 @@ class _Incremental:
 
     def _outlying(self, low: int, now: int) -> Bools:
         """Return the anchors most of whose ranges disagree with the rest, by a robust optimisation."""
-        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", _OUTLIER + 1.0)).graph
+        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", IncrementalPolicy.outlier + 1.0)).graph
         measured, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
         for edges in robust.edges:
             if isinstance(edges, RangeEdges):
-                off = np.abs(edges.residuals(robust)[:, 0]) > _OUTLIER
+                off = np.abs(edges.residuals(robust)[:, 0]) > IncrementalPolicy.outlier
                 measured += np.bincount(edges.anchor, minlength=len(measured))
                 outliers += np.bincount(edges.anchor, off, len(measured))
-        return self.ranged & (outliers > _OUTLIER_SHARE * np.maximum(measured, 1.0))
+        return self.ranged & (outliers > IncrementalPolicy.outlier_share * np.maximum(measured, 1.0))
 
     def _solve(self, low: int, now: int, without: Bools | None = None, kernel: Kernel | None = None) -> _Part:
         """Optimise poses low..now - 1 and the anchors added since; older ones are fixed."""
@@ -223,10 +222,10 @@ class _Incremental:
         )
         if not part.edges or not any(mask.any() for mask in free_unknowns(part).values()):
             return _Part(part, True, float("nan"))
-        solved, summary = optimize(part, _STEP, None, self.allowed - self.work)
+        solved, summary = optimize(part, IncrementalPolicy.step, None, self.allowed - self.work)
         self.work += summary.work
         scatter = np.sqrt(2.0 / max(summary.dof, 1))
-        most = self.usual * (1.0 + _SIGNIFICANCE * scatter)
+        most = self.usual * (1.0 + IncrementalPolicy.significance * scatter)
         return _Part(solved, not summary.chi2_per_dof > most, summary.chi2_per_dof)
 
     def _edges(self, low: int, now: int, use: Bools, kernel: Kernel | None) -> Iterator[Edges]:
@@ -246,12 +245,12 @@ class _Incremental:
         for anchor in np.nonzero(~self.joined)[0]:
             measured = self._measured(int(anchor), now)
             count = sum(len(edges) for edges in measured)
-            if not last and (count < _MIN_RANGES or count < 1.2 * self.tried[anchor]):
+            if not last and (count < IncrementalPolicy.ranges or count < 1.2 * self.tried[anchor]):
                 continue
             self.tried[anchor] = count
-            found = trilaterate(*self._distances(measured), _SEARCH, _DRIFT)
-            clear = bool(found) and not ambiguous(found, _SEARCH)
-            if found and (last or (clear and found[0].position_sigma < _MAX_POSITION_SIGMA)):
+            found = trilaterate(*self._distances(measured), IncrementalPolicy.search, IncrementalPolicy.drift)
+            clear = bool(found) and not ambiguous(found, IncrementalPolicy.search)
+            if found and (last or (clear and found[0].position_sigma < IncrementalPolicy.position_sigma)):
                 anchors[anchor] = found[0].position
                 self.joined[anchor], self.joined_at[anchor] = True, now
         self.graph = replace(self.graph, anchors=anchors)

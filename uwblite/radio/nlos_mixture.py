@@ -11,10 +11,11 @@ weights that then make least squares the maximum-likelihood estimate of the plac
 with psi = -f' / f: positive errors get less weight than negative ones of the same size.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import erfcx, ndtr
+from scipy.special import erfcx
 
 from ..arrays import Floats
 
@@ -23,7 +24,7 @@ _SHORTEST = 2.0
 """Least mean detour, in standard deviations of the core; a shorter one is no tail but a part of the core."""
 _CLEAN = 15.0
 """Prior number of ranges in the core: a few ranges alone determine neither tail nor gross errors."""
-_NARROWED, _PARTS = 5, 32
+_NARROWED, _PARTS = 3, 256
 """Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
 _LEAST_WILD = 1e-3
 """Share of gross errors that no number of ranges without one excludes."""
@@ -52,12 +53,12 @@ class RangeMixture:
 
     def density(self, errors: Floats) -> Floats:
         """Return the probability density (m,) of each error, 1/m."""
-        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
+        normal, late, _ = _densities(errors - self.centre, self.sigma, self.detour)
         return (1.0 - self.tail - self.wild) * normal + self.tail * late + self.wild / self.width + _NEVER
 
     def core(self, errors: Floats) -> Floats:
         """Return the probability (m,) of each error to be of the core."""
-        normal, _ = _densities(errors - self.centre, self.sigma, self.detour)
+        normal, _, _ = _densities(errors - self.centre, self.sigma, self.detour)
         return (1.0 - self.tail - self.wild) * normal / self.density(errors)
 
     def log_density(self, errors: Floats) -> Floats:
@@ -75,14 +76,18 @@ class RangeMixture:
 
     def weights(self, errors: Floats) -> Floats:
         """Return the weights (m,), 0..1, of squared errors about the mode that make them a maximum-likelihood estimate."""
-        off, mode = errors - self.centre, self.mode() - self.centre
+        return self.weights_about(self.mode(), errors)
+
+    def weights_about(self, mode: float, errors: Floats) -> Floats:
+        """Return the same where the mode, m, is known."""
+        off, mode = errors - self.centre, mode - self.centre
         near = np.abs(off - mode) < 1e-3 * self.sigma
         away = np.where(near, mode + 1e-3 * self.sigma, off)
         return np.clip(self.sigma**2 * self._score(away) / (away - mode), 0.0, 1.0)
 
     def _score(self, off: Floats) -> Floats:
         """Return -f' / f at errors (m,) from the core's mean."""
-        normal, late = _densities(off, self.sigma, self.detour)
+        normal, late, _ = _densities(off, self.sigma, self.detour)
         core = (1.0 - self.tail - self.wild) * normal
         slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
         return slope / (core + self.tail * late + self.wild / self.width + _NEVER)
@@ -102,16 +107,17 @@ def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> Range
     tail, detour, wild = 0.2, 4.0 * sigma, 0.05
     for _ in range(_ROUNDS):
         off = errors - centre
-        normal, late = _densities(off, sigma, detour)
-        parts = np.stack([(1.0 - tail - wild) * normal, tail * late, np.full(len(off), wild / width)])
-        parts /= parts.sum(axis=0) + 1e-300
-        core, slow, rest = parts.sum(axis=1)
-        total = core + slow + rest + _CLEAN
-        tail, wild = float(slow / total), float(rest / total)
-        detour = max(float(parts[1] @ _mean_detour(off, sigma, detour)) / max(float(slow), 1e-9), _SHORTEST * sigma)
+        normal, late, expected = _densities(off, sigma, detour)
+        core, slow, rest = (1.0 - tail - wild) * normal, tail * late, wild / width
+        each = 1.0 / (core + slow + (rest + _NEVER))
+        core, slow = core * each, slow * each
+        of_core, of_tail, gross = float(core.sum()), float(slow.sum()), rest * float(each.sum())
+        total = of_core + of_tail + gross + _CLEAN
+        tail, wild = of_tail / total, gross / total
+        detour = max(float(slow @ expected) / max(of_tail, 1e-9), _SHORTEST * sigma)
         before = centre
-        centre += float(parts[0] @ off) / max(float(core), 1e-9)
-        sigma = min(max(float(np.sqrt(parts[0] @ (errors - centre) ** 2 / max(float(core), 1e-9))), least_sigma), most_sigma)
+        centre += float(core @ off) / max(of_core, 1e-9)
+        sigma = min(max(math.sqrt(float(core @ (errors - centre) ** 2) / max(of_core, 1e-9)), least_sigma), most_sigma)
         if abs(centre - before) < 1e-4 * sigma:
             break
     return RangeMixture(centre, sigma, tail, detour, wild, width)
@@ -126,21 +132,23 @@ def shortest_half(values: Floats) -> tuple[float, float]:
     return float(order[first : first + inside].mean()), float(spans[first]) / (2.0 * 0.6745)
 
 
-def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats]:
-    """Return the densities (m,) of the core and of core plus detour at errors from the core's mean."""
-    z = off / sigma
-    bell = np.exp(-0.5 * z**2)
-    normal = bell / (sigma * np.sqrt(2.0 * np.pi))
-    # exp(a) erfc(b) in the form that neither overflows nor loses digits on its side of b = 0.
-    b = (sigma / detour - z) / np.sqrt(2.0)
-    early = bell * erfcx(np.maximum(b, 0.0))
-    late = 2.0 * np.exp(np.minimum(0.5 * (sigma / detour) ** 2 - z * sigma / detour, 0.0)) * ndtr(-b * np.sqrt(2.0))
-    return normal, np.where(b >= 0.0, early, late) / (2.0 * detour)
+def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats, Floats]:
+    """Return the densities (m,) of the core and of core plus detour at errors from the core's mean, and the expected detour.
+
+    A detour, given the error, is normal about off - sigma^2 / detour =: sigma a and cut off at 0: its mean is
+    sigma (a + phi(a) / Phi(a)). Both that and the density come from Phi(a) exp(a^2 / 2) = erfcx(-a / sqrt(2)) / 2, which
+    neither loses digits nor overflows below _SURE; above it, Phi(a) is 1.
+    """
+    z, ratio = off / sigma, sigma / detour
+    a = z - ratio
+    scaled = erfcx(np.minimum(a, _SURE) * -np.sqrt(0.5))
+    bell = np.exp(-0.5 * z * z)
+    late, hazard = bell * scaled, np.sqrt(2.0 / np.pi) / scaled
+    if (sure := a > _SURE).any():
+        late = np.where(sure, 2.0 * np.exp(np.minimum(ratio * (0.5 * ratio - z), 0.0)), late)
+    mean = np.maximum(sigma * (a + hazard), 0.0)
+    return bell / (sigma * np.sqrt(2.0 * np.pi)), late / (2.0 * detour), mean
 
 
-def _mean_detour(off: Floats, sigma: float, detour: float) -> Floats:
-    """Return the expected detour (m,) of late errors: a normal distribution about off - sigma^2 / detour cut off at 0."""
-    a = (off - sigma**2 / detour) / sigma
-    # phi(a) / Phi(a) by the scaled complementary error function, good for large negative a.
-    hazard = np.sqrt(2.0 / np.pi) / erfcx(-np.maximum(np.minimum(a, 20.0), -1e8) / np.sqrt(2.0))
-    return np.maximum(sigma * (a + np.where(a < 20.0, hazard, 0.0)), 0.0)
+_SURE = 20.0
+"""Standard deviations by which an error is longer than the core allows from which on it certainly has a detour."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, runs_of
 from .nlos_mixture import RangeMixture, fit
-from .range_noise import RangeNoise, RangeNoiseConfig, effective_sigma
+from .range_noise import RangeNoiseConfig, independent_shares
 from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
 
 
@@ -122,11 +122,7 @@ class PlaceModel:
         Ranges of one interval from neighbouring places have most of their errors in common. That ranges differ which were made
         at one place at different times is no error of that kind, so intervals count apart.
         """
-        white, slow = np.sqrt(1.0 - self.noise.slow_share), np.sqrt(self.noise.slow_share)
-        correlated, shares = RangeNoise(white, slow, self.noise.correlation_length), np.ones(len(place))
-        for own in [*intervals_of(place), *ways_of(place)]:
-            shares[own] = effective_sigma(self.track.path[own], correlated) ** -2
-        return shares
+        return independent_shares(self.track.path, [*intervals_of(place), *ways_of(place)], self.noise)
 
     def likeliest(self, height: float, parts: Sequence[slice | Bools | Ints]) -> list[AnchorHypothesis]:
         """Return the likeliest place by each of some parts of the ranges, at usual errors."""
@@ -202,7 +198,7 @@ class PlaceModel:
             mixture = replace(fit(error[own], min(max(track.sigma, MovePolicy.finest), most), most), width=self.width)
             mode, relative = mixture.mode(), mixture.centre - (clear[0] if behind else 0.0)
             pulled[own] = error[own] - mode
-            weight[own] = shares[own] * mixture.weights(error[own]) / mixture.sigma**2
+            weight[own] = shares[own] * mixture.weights_about(mode, error[own]) / mixture.sigma**2
             # Of the other four parameters only the number of ranges counts (G. Schwarz 1978), of the constant error its prior.
             count = max(float(shares[own].sum()), 1.0)
             evidence += float(shares[own] @ mixture.log_density(error[own])) - 2.0 * np.log(count)

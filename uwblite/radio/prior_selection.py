@@ -1,26 +1,18 @@
 """Widths of the priors of the radios' errors and of the units of length, chosen by marginal likelihood of the recording.
 
-Most radios are calibrated: their clocks are right to parts of a million and the maker calibrated the antennas to a few
-centimetres. Some are not: scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those
-leaves the others' anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path.
-So the priors' standard deviations are chosen by marginal likelihood, the probability of all measurements with the unknowns
-integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
+Most radios are calibrated: their clocks are right to parts of a million and their antennas to a few centimetres. Some are not:
+scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those leaves the others' anchors and
+the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by marginal
+likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-Units of length: a radio measures times of flight and cannot be wrong by much; a wheel's radius is a setting and can be
-wrong by any factor. For the wheels' unit there are two hypotheses: the likelier one, by posterior odds, is taken, and
-without contradiction this is that all units are right. The scale of the radios and their biases can be wrong by little or much:
-several widths, from calibrated to uncalibrated radios, are tried, and their mean (of the logarithms), weighted by
-marginal likelihood, is taken. A scale that is clearly off gets the widest prior. So a scale stays at its nominal value as long
-as the recording does not show it, is corrected in part where it is uncertain, and is free where the posterior odds are clear.
-Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
-
-With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
-
-    2 log Z = h^T J^-1 h - a^T P^-1 a - log|J| - log|P| - log|D'| + log|D|,   J = P^-1 + D'^-1 - D^-1,   h = P^-1 a.
+A wheel's radius is a setting and can be wrong by any factor: of two hypotheses about the wheels' unit the likelier one is
+taken, without contradiction that all units are right. The scale and the biases of radios can be wrong by little or much: of
+several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the widest where a scale is clearly
+off. Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +20,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
-from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.graph import Edges, Graph
 from ..graph.joint_covariance import calibration_covariance
 from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
@@ -208,11 +200,11 @@ def with_alike_heights(graph: Graph) -> Graph:
         covariance = calibration_covariance(graph)
     except SolverError:
         return graph
-    about = np.zeros(len(sigma))
+    about = np.full(len(sigma), np.nan)
     for group in groups:
         mean, width = _common(graph.calibration.values[group], covariance[np.ix_(group, group)], sigma[group])
         about[group], sigma[group] = mean, width
-    return _with_priors(graph, np.concatenate(groups), about, sigma)
+    return with_prior_sigma(graph, sigma, about)
 
 
 def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, float]:
@@ -241,19 +233,3 @@ def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, f
     # A square cannot be below 0.
     middle = max(float(weight @ mean), 0.0)
     return middle, float(np.sqrt(weight @ (variance + (mean - middle) ** 2) + np.exp(2.0 * weight @ np.log(spread))))
-
-
-def _with_priors(graph: Graph, which: Ints, about: Floats, sigma: Floats) -> Graph:
-    """Return the graph with other priors of some calibration values: about (c,), with standard deviations sigma (c,)."""
-    edges = []
-    for e in graph.edges:
-        if isinstance(e, PriorEdges) and e.block == "calibration":
-            own = np.isin(e.index, which)[:, None]
-            root = (1.0 / sigma[e.index])[:, None, None]
-            e = replace(
-                e,
-                value=np.where(own, about[e.index][:, None], e.value),
-                sqrt_information=np.where(own[:, None], root, e.sqrt_information),
-            )
-        edges.append(e)
-    return replace(graph, edges=tuple(edges))

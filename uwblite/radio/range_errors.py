@@ -15,12 +15,13 @@ far from the path only the anchor's mean is corrected (C. Rasmussen, C. Williams
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from .. import se2
 from ..arrays import Floats, Ints, spread
 from ..graph.graph import Graph
-from ..graph.marginals import CommonErrors, Marginals
+from ..graph.marginals import Marginals
 from ..graph.range_edges import RangeEdges
 from .range_noise import RangeNoise, RangeNoiseConfig, learn
 
@@ -50,9 +51,8 @@ def without_pattern(edges: RangeEdges, graph: Graph, around: Marginals) -> Range
     tags, tag = np.unique(edges.calibration[:, _TAG_X], return_inverse=True)
     each = waves.shape[1]
     edge, error = np.repeat(np.arange(len(edges)), each), each * tag.reshape(-1, 1) + np.arange(each)
-    shift = PATTERN_SIGMA * waves / edges.sigma[:, None]
-    kind = np.zeros(each * len(tags), dtype=np.intp)
-    found = around.estimated(CommonErrors(edges, edge, error.ravel(), shift.reshape(-1, 1), kind))
+    shift, shape = PATTERN_SIGMA * waves / edges.sigma[:, None], (len(edges), each * len(tags))
+    found = around.estimated(edges, sparse.csr_matrix((shift.ravel(), (edge, error.ravel())), shape=shape))
     late = PATTERN_SIGMA * np.sum(waves * found[error], axis=1)
     # The residuals show the remaining pattern where a part was subtracted before.
     return replace(edges, late=late + edges.ranges - edges.corrected)

@@ -7,13 +7,14 @@ anchor's residuals are split into a white part and a slow part that is correlate
 they have the weight of one sample of the slow part.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Ints, spread, unique_rows
+from ..arrays import Bools, Floats, Ints, spread, unique_rows
 from ..config import setting
 from ..graph.robust import Kernel
 
@@ -160,6 +161,19 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
     if noise.slow == 0.0 or len(positions) == 0:
         return np.full(len(positions), max(noise.sigma, 1e-6))
     return np.sqrt(noise.white**2 + noise.slow**2 * _correlation_sum(positions, noise.length, weights))
+
+
+def independent_shares(positions: Floats, groups: Iterable[Ints | Bools], config: RangeNoiseConfig) -> Floats:
+    """Return which share (m,) of each range is independent of its neighbours in its group, by the correlation assumed.
+
+    Parameters
+    ----------
+    positions : (m, 2) tag at the ranges, m. groups : rows of each; a range of none is independent.
+    """
+    noise, shares = assumed(replace(config, sigma=1.0)), np.ones(len(positions))
+    for own in groups:
+        shares[own] = effective_sigma(positions[own], noise) ** -2
+    return shares
 
 
 def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:

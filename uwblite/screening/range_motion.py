@@ -6,7 +6,7 @@ distance driven, and their difference varies, two anchors have one name: multipa
 and a motion that the wheels miss makes ranges jump, but not back.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -223,77 +223,3 @@ def _two_distances(values: Floats, driven: Floats, leaps: Bools, noise: float) -
     low, middle, high = np.quantile(ends[:, 1] - ends[:, 0], [0.1, 0.5, 0.9])
     close = way < _NEXT
     return bool(close.sum() >= _LEAST_LEAPS and steady[close].mean() > _STEADY and high - low > _VARIES * middle)
-
-
-@dataclass(frozen=True, slots=True)
-class DelayPolicy:
-    """When a radio's clock is taken as off by seconds."""
-
-    prior: float = 1e-3
-    """Probability of such a clock."""
-    most: float = 20.0
-    """Largest offset, s; all up to it are equally probable."""
-    step: float = 0.5
-    """Between the offsets that are compared, s."""
-    noise: float = 0.2
-    """Scale of the errors of ranges, m, heavy-tailed, that of a path by wheels alone over a window included."""
-    window: float = 60.0
-    """Time for which wheels alone give the shape of the path, s."""
-    fewest: int = 10
-    """Ranges to one anchor in a window: three give its place."""
-    contradicts: float = 0.03
-    """Odds of the offset of all windows to the likeliest of one, below which that one contradicts it."""
-    wrong: float = 0.1
-    """Share of windows that may contradict the offset: wheels slip in some."""
-
-
-def without_delay(log: SensorLog, policy: DelayPolicy = DelayPolicy()) -> tuple[SensorLog, list[Fact]]:
-    """Move the stamps of a radio whose clock is off by seconds, as its ranges show along the path that the wheels count.
-
-    In each window the ranges to one anchor are those from the path to one place, at the right offset alone. No window alone
-    decides, and windows that each show another offset show that there is none (bad wheels, anchors that were moved).
-    """
-    if log.ranges is None:
-        return log, []
-    begin, end = log.odometry.stamps[[0, -1]] + np.array([policy.most, -policy.most])
-    offsets = np.arange(-policy.most, policy.most + 0.5 * policy.step, policy.step)
-    parts = [np.zeros((1, len(offsets)))]
-    for stamps, ranges in _by_anchor(log):
-        inside = (stamps > begin) & (stamps < end)
-        window = np.where(inside, (stamps - begin) // policy.window, -1.0)
-        for own in (window == k for k in np.unique(window[inside])):
-            if own.sum() >= policy.fewest:
-                places = log.odometry.at((stamps[own] + offsets[:, None]).ravel())[:, :2].reshape(len(offsets), -1, 2)
-                parts.append(_log_likelihoods(places, ranges[own], policy.noise)[None])
-    likely = np.concatenate(parts)
-    total = likely.sum(axis=0)
-    weights, best = np.exp(total - total.max()), likely[:, np.argmax(total)]
-    gains, lost = best - likely[:, len(offsets) // 2], best - likely.max(axis=1)
-    most = gains.sum() - gains.max()
-    if most + np.log(weights.mean() * policy.prior) < 0.0 or np.quantile(lost, policy.wrong) < np.log(policy.contradicts):
-        return log, []
-    by = float(np.average(offsets, weights=weights))
-    moved = replace(log.ranges, stamps=log.ranges.stamps + by)
-    return replace(log, ranges=moved), [Fact.of("late-ranges", late=-by)]
-
-
-def _log_likelihoods(places: Floats, ranges: Floats, noise: float) -> Floats:
-    """Return the log likelihoods (d,) of ranges (n,) from d paths (d, n, 2) to one place each, the best one.
-
-    Squares of ranges are linear in the place and the square of its distance from the middle of the path; errors are Cauchy's.
-    """
-    from_middle = places - places.mean(axis=1, keepdims=True)
-    columns = np.concatenate([-2.0 * from_middle, np.ones((*places.shape[:2], 1))], axis=2)
-    squares = ranges**2 - np.sum(from_middle**2, axis=2)
-    weights = np.ones(squares.shape)
-    for _ in range(_ROUNDS):
-        scaled = columns * (weights / (2.0 * ranges) ** 2)[..., None]
-        normal = np.swapaxes(scaled, 1, 2) @ columns + _RIDGE * np.eye(3)
-        found = np.linalg.solve(normal, np.sum(scaled * squares[..., None], axis=1)[..., None])
-        errors = ((columns @ found)[..., 0] - squares) / (2.0 * ranges)
-        weights = 1.0 / (1.0 + (errors / noise) ** 2)
-    return np.asarray(np.sum(np.log(weights), axis=1))
-
-
-_ROUNDS, _RIDGE = 5, 1e-6
-"""Rounds of reweighting, and what is added to normal equations: a robot that stands shows a distance only."""

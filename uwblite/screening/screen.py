@@ -11,6 +11,7 @@ from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
 from .clocks import with_late_scans_placed
+from .range_explanations import explained_by_ranges
 from .range_motion import without_shared_names
 from .stuck_sensors import without_own_body
 from .wheel_motion import Pairs
@@ -65,7 +66,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     facts += [*spread, *times, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks, without_own_body]
     repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
-    repairs += [range_motion.without_delay, directions.heading_with_the_path]
+    repairs += [explained_by_ranges, directions.heading_with_the_path]
     repairs += [directions.laser_upright] * turn_laser + [with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)

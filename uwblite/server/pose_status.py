@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..localization.live_feed import CONSEQUENCES
-from ..localization.records import LocalizerState
+from ..localization.pose_estimator import LocalizerState
 
 _EVERY = 0.2
 """s between states that are shown."""

@@ -3,8 +3,7 @@
 import pytest
 from helpers.localization_room import known
 
-from uwblite.localization.live_feed import LiveFeed
-from uwblite.localization.silence import Silence
+from uwblite.localization.live_feed import LiveFeed, Silence
 
 
 def heard(silence, name, stamps):

@@ -1,0 +1,160 @@
+"""What explains ranges that do not fit the path: planted clocks, names and wheels, and sound ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import planted
+
+from uwblite import se2
+from uwblite.screening.range_explanations import RangePolicy, _best_place, _best_stretch, _by_way, _traces, explained_by_ranges
+from uwblite.sensor_log import Odometry, SensorLog
+
+CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
+
+
+def late_by(seconds, seed=1, metres=100.0, still=()):
+    """Return a drive of 200 s among four anchors; ranges are stamped late, and wheels count nothing at times, s."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, metres)
+    wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.01, turn_noise=0.01)
+    radio = planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.05, outliers=0.05)
+    log = SensorLog(wheels, replace(radio, stamps=radio.stamps + seconds), None)
+    for begin, end in still:
+        log = redriven(log, begin, end, lambda steps: 0.0 * steps)
+    return log
+
+
+def redriven(log, begin, end, change):
+    """Return a recording whose wheels count changed steps (n, 3) between two times, s."""
+    stamps, poses = log.odometry.stamps, log.odometry.poses
+    steps, own = se2.between(poses[:-1], poses[1:]), (stamps[1:] > begin) & (stamps[1:] <= end)
+    steps[own] = change(steps[own])
+    return replace(log, odometry=Odometry(stamps, se2.chain(poses[0], steps)))
+
+
+def kinds_of(log):
+    return [(fact.kind, fact.figures.get("what", "")) for fact in explained_by_ranges(log)[1]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("late", [-18.0, 5.0])
+def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
+    log = late_by(late, seed)
+    moved, (fact,) = explained_by_ranges(log)
+    assert fact.kind == "late-ranges"
+    assert fact.figures["late"] == pytest.approx(late, abs=1.0)
+    np.testing.assert_allclose(moved.ranges.stamps, log.ranges.stamps - fact.figures["late"])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sound_recording_has_nothing_to_explain(seed):
+    log = late_by(0.0, seed)
+    assert explained_by_ranges(log) == (log, [])
+    nothing = replace(log, ranges=None)
+    assert explained_by_ranges(nothing) == (nothing, [])
+    few = replace(log, ranges=log.ranges.rows(slice(0, 5)))
+    assert explained_by_ranges(few) == (few, [])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("still", [((80.0, 100.0),), ((100.0, 200.0),)])
+def test_wheels_that_stand_still_make_no_clock(seed, still):
+    moved, facts = explained_by_ranges(late_by(0.0, seed, still=still))
+    assert moved.ranges.stamps[0] == late_by(0.0, seed).ranges.stamps[0]
+    assert {fact.kind for fact in facts} <= {"wheels-against-ranges"}
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_wheels_that_turn_at_random_make_no_clock(seed):
+    """Each stretch fits at some other offset; all are no clock."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 200.0)
+    wheels = planted.odometry(stamps, truth, rng, noise=0.05, turn_noise=0.6)
+    log = SensorLog(wheels, planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.15, outliers=0.1), None)
+    assert "late-ranges" not in dict(kinds_of(log))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_names_exchanged_half_way_are_named(seed):
+    log = late_by(0.0, seed)
+    radio = log.ranges
+    other = np.where((radio.stamps > 100.0) & (radio.anchor < 2), 1 - radio.anchor, radio.anchor)
+    (fact,) = explained_by_ranges(replace(log, ranges=replace(radio, anchor=other)))[1]
+    assert fact.kind == "exchanged-names"
+    assert set(fact.figures["anchors"]) == set(radio.anchor_ids[:2])
+    assert fact.figures["at"] == pytest.approx(100.0, abs=10.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ranges_that_are_any_numbers_from_half_time_are_no_fault_of_the_wheels(seed):
+    log, rng = late_by(0.0, seed), np.random.default_rng(seed)
+    radio = log.ranges
+    values = np.where(radio.stamps > 100.0, rng.uniform(0.5, 15.0, len(radio.stamps)), radio.ranges)
+    assert ("exchanged-names", "no distances") in kinds_of(replace(log, ranges=replace(radio, ranges=values)))
+    assert "wheels-against-ranges" not in dict(kinds_of(replace(log, ranges=replace(radio, ranges=values))))
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("what", "begin", "end", "change"),
+    [
+        ("mirrored", 100.0, 200.0, lambda steps: steps * np.array([1.0, -1.0, -1.0])),
+        ("turned", 100.0, 100.1, lambda steps: steps - np.array([0.0, 0.0, 1.5])),
+        ("turns", 100.0, 200.0, lambda steps: steps * np.array([1.0, 1.0, 0.0])),
+        ("ways", 80.0, 130.0, lambda steps: steps * np.array([2.0, 2.0, 1.0])),
+    ],
+)
+def test_what_is_wrong_with_the_wheels_is_named(seed, what, begin, end, change):
+    facts = explained_by_ranges(redriven(late_by(0.0, seed), begin, end, change))[1]
+    assert {fact.kind for fact in facts} == {"wheels-against-ranges"}
+    named = {what, "elsewhere"} if what == "turned" else {what}
+    assert named & {fact.figures["what"] for fact in facts}
+    if what == "turned":
+        assert facts[0].figures["at"] == pytest.approx(100.0, abs=10.0)
+    if what == "ways":
+        assert facts[0].figures["value"] == pytest.approx(2.0, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_anchor_that_is_moved_is_no_fault_of_the_wheels(seed):
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 100.0)
+    wheels = planted.odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
+    moved = CORNERS + np.array([[0.0], [0.0], [3.0], [0.0]])
+    one, other = (planted.ranges(np.random.default_rng(seed), stamps, truth, at, rate=1.0) for at in (CORNERS, moved))
+    radio = replace(one, ranges=np.where(one.stamps > 100.0, other.ranges, one.ranges))
+    assert kinds_of(SensorLog(wheels, radio, None)) == []
+
+
+def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
+    """Against a search over places: Cauchy errors of ranges from one place, the better path the likelier."""
+    rng, policy = np.random.default_rng(0), RangePolicy(noise=(0.2,))
+    paths = rng.normal(size=(2, 30, 2)) * 3.0
+    values = np.hypot(*(paths[0] - [7.0, -4.0]).T) + 0.05 * rng.standard_normal(30)
+    (likely,) = _best_place(paths, values, policy)
+    around = np.stack(np.meshgrid(np.linspace(6.0, 8.0, 81), np.linspace(-5.0, -3.0, 81)), axis=-1).reshape(-1, 1, 2)
+    errors = np.hypot(*np.moveaxis(paths[0] - around, -1, 0)) - values
+    best = -np.log(np.pi * 0.2 * (1.0 + (errors / 0.2) ** 2)).sum(axis=1)
+    assert likely[0] + 1.5 * np.log(30) == pytest.approx(best.max(), abs=0.1)
+    assert likely[1] < likely[0] - 10.0
+
+
+def test_the_density_of_changes_by_way_is_a_density():
+    """Over all values of the second range it integrates to 1, by the prior of the first."""
+    policy = RangePolicy(noise=(0.1,))
+    trace = _traces(late_by(0.0), policy)[0].between(0.0, 5.0)
+    trace = replace(trace, ranges=trace.ranges[:2], way=trace.way[:2])
+    values, step = np.linspace(-100.0, 110.0, 10501, retstep=True)
+    each = [_by_way(replace(trace, ranges=np.array([5.0, v])), 10.0, policy)[0] for v in values]
+    assert np.exp(each).sum() * step * 10.0 == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_best_stretch_is_that_of_a_search():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        gains = rng.normal(size=int(rng.integers(1, 9)))
+        spans = [(gains[a:b].sum(), a, b) for a in range(len(gains)) for b in range(a + 1, len(gains) + 1)]
+        total, a, b = _best_stretch(gains)
+        assert total == pytest.approx(max(spans)[0])
+        assert gains[a:b].sum() == pytest.approx(total)
