@@ -11,6 +11,7 @@ from uwblite.lidar.object_likelihood import ObjectLikelihood, ObjectPolicy, matc
 from uwblite.lidar.registration import Prior, Registration, RegistrationConfig, of_fallible
 from uwblite.lidar.scan_matching import PairPoints, pair_points
 from uwblite.lidar.visibility import nearest_by_bearing
+from uwblite.odometry.slips import FalseMotions
 
 SIGMA = 0.02
 SOUND, SLIPPED = np.array([0.01, 0.01, 0.01]), np.array([0.4, 0.4, 0.3])
@@ -38,7 +39,7 @@ def test_clouds_tell_a_slip_from_none(room, slip, sign):
     step = se2.between(truth[0], truth[1])
     *_, found = registered(clouds, step + slip)
     # As sure as a pair of clouds can be: it is wrong with the probability `useless`.
-    assert sign * found.log_odds[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
+    assert sign * found.log_odds()[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
     (pose,) = found.chosen(np.array([float(sign > 0)])).pose
     assert np.abs(se2.between(step, pose)).max() < 0.015
 
@@ -48,7 +49,7 @@ def test_a_search_is_no_wider_than_clouds_can_overlap(room):
     truth, clouds = room
     step = se2.between(truth[0], truth[1])
     *_, found = registered(clouds, np.array([24.0, -3.0, 0.4]), slipped=np.array([24.5, 24.5, 0.6]))
-    assert found.log_odds[0] > 0.0
+    assert found.log_odds()[0] > 0.0
     assert np.abs(se2.between(step, found.slipped.pose[0])).max() < 0.015
 
 
@@ -92,7 +93,7 @@ def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
     after = scanned(truth[1:], np.concatenate([walls, thing + np.array([0.06, 0.0, 0.06, 0.0])]), 0.005, 2)
     clouds = joined([before, after])
     registration, points, _, found = registered(clouds, truth[1])
-    assert found.log_odds[0] < 0.0
+    assert found.log_odds()[0] < 0.0
     assert np.abs(se2.between(truth[1], found.sound.pose[0])).max() < 0.01
     one = np.array([0])
     moving = registration.objects.moving(one, one + 1, points, found.sound.pose, found.sound.covariance)
@@ -135,10 +136,23 @@ def test_how_often_things_move_is_learnt(moving, seen):
     assert judge.moves == pytest.approx(seen, abs=3.0 * np.sqrt(max(seen, 1e-3) / 580))
 
 
+def test_the_other_steps_of_a_slip_place_a_cloud_where_its_surfaces_do_not():
+    """Along a wall nothing shows the way: it is what the wheels count, or what they counted too much just before and after."""
+    wall = np.array([[-50.0, 1.0, 50.0, 1.0]])
+    clouds = scanned(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), wall)
+    registration, points, prior, found = registered(clouds, np.array([0.4, 0.0, 0.2]))
+    assert found.slipped.pose[0, 0] == pytest.approx(0.4, abs=0.05)
+    sigma = np.sqrt(np.diag(prior.slipped[0]))
+    matrix = 400.0 * np.eye(3)[None]
+    expected = FalseMotions(matrix @ (np.array([-0.3, 0.0, -0.2]) / sigma), matrix)
+    again = registration.placed_again(np.array([0]), points, found, prior, expected)
+    assert np.abs(again.slipped.pose[0] - [0.1, 0.0, 0.0]).max() < 0.02
+
+
 def test_clouds_without_surfaces_leave_the_prior_as_it_is():
     truth = np.zeros((2, 3))
     *_, found = registered(scanned(truth, ROOM + 100.0), [0.3, 0.0, 0.1])
-    assert found.log_odds.tolist() == [0.0]
+    assert found.log_odds().tolist() == [0.0]
     np.testing.assert_allclose(found.sound.pose, [[0.3, 0.0, 0.1]])
     np.testing.assert_allclose(found.sound.covariance[0], np.diag(SOUND**2), rtol=1e-9)
     assert not found.sound.measured(SIGMA**2)[1].any()

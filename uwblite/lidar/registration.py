@@ -10,13 +10,14 @@ where the sum is that of object_likelihood. Two clouds may also show nothing of 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
+from ..odometry.slips import FalseMotions
 from .cloud_rasters import CloudRasters, rasterize
 from .clouds import Clouds
 from .correlative_matching import search
@@ -126,8 +127,36 @@ class Placement:
     """(s,) pairs that may lie elsewhere."""
     slipped: Placed
     """Of these, where the wheels slipped."""
-    log_odds: Floats
-    """(e,) log of the evidence for a slip by that against it; 0 where the clouds say nothing."""
+    bound: Floats
+    """(e,) most that the log of the evidence for a slip by that against it can be, for the others."""
+
+    def log_odds(self, more: Floats | float = 0.0) -> Floats:
+        """Return the log of the evidence (e,) for a slip by that against it; 0 where the clouds say nothing.
+
+        Parameters
+        ----------
+        more : (e,) what adds to the evidence of a slip over each.
+        """
+        none, rows, odds = np.log(RegistrationConfig.useless), self.searched, self.bound.copy()
+        more = np.broadcast_to(more, odds.shape)[rows]
+        odds[rows] = np.logaddexp(self.slipped.evidence + more, none) - np.logaddexp(self.sound.evidence[rows], none)
+        return of_fallible(odds, RegistrationConfig.useless)
+
+    def false_motions(self, prior: Prior, variance: float) -> FalseMotions:
+        """Return what the matches show of the wheels' false motions; nothing of pairs that were not searched.
+
+        Parameters
+        ----------
+        prior : with which they were placed. variance : of a match, m^2.
+        """
+        own, motions = prior.rows(self.searched), FalseMotions(np.zeros_like(prior.mean), np.zeros_like(prior.slipped))
+        sigma = np.sqrt(np.einsum("eii->ei", own.slipped))
+        hessian = self.slipped.factors.hessian / (variance * ObjectPolicy.correlation)
+        # Matches and prior hold the pose in balance.
+        pull = np.einsum("eij,ej->ei", hessian + np.linalg.inv(own.slipped), _difference(self.slipped.pose, own.mean))
+        motions.vector[self.searched] = sigma * pull
+        motions.matrix[self.searched] = sigma[:, :, None] * hessian * sigma[:, None, :]
+        return motions
 
     def chosen(self, probability: Floats) -> Placed:
         """Return the likelier mode of each pair, slips having a probability (e,)."""
@@ -177,9 +206,23 @@ class Registration:
             lost = rows[poor]
             found = self._from_best(i, points, prior, lost, further(i[lost], j[lost], prior.rows(lost)))
             slipped = _replaced(slipped, poor, found, found.evidence > slipped.evidence[poor])
-        none = np.log(c.useless)
-        log_odds[rows] = np.logaddexp(slipped.evidence, none) - np.logaddexp(sound.evidence[rows], none)
-        return Placement(sound, rows, slipped, of_fallible(log_odds, c.useless))
+        return Placement(sound, rows, slipped, log_odds)
+
+    def placed_again(self, i: Ints, points: PairPoints, found: Placement, prior: Prior, expected: FalseMotions) -> Placement:
+        """Return a placement whose slipped pairs are placed with what their neighbours show of the wheels' false motions.
+
+        Parameters
+        ----------
+        i, points, prior : see register. found : of these. expected : see FalseMotions.by_neighbours.
+        """
+        rows = found.searched
+        own, sigma = prior.rows(rows), np.sqrt(np.einsum("eii->ei", prior.slipped[rows]))
+        spread = np.linalg.inv(expected.matrix[rows])
+        mean = own.mean + sigma * np.einsum("eij,ej->ei", spread, expected.vector[rows])
+        covariance = sigma[:, :, None] * spread * sigma[:, None, :] + own.covariance
+        some = PairPoints(points.row[rows])
+        slipped = _best([self._descend(i[rows], some, start, mean, covariance) for start in (found.slipped.pose, mean)])
+        return replace(found, slipped=slipped)
 
     def _from_best(self, i: Ints, points: PairPoints, prior: Prior, rows: Ints, starts: Sequence[Floats]) -> Placed:
         """Place some pairs (r,) whose wheels slipped, from the best of several starts (r, 3)."""

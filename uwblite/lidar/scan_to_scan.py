@@ -50,6 +50,8 @@ class TrackingConfig:
     """Standard deviation of a match, m."""
     correlation: ClassVar[float] = 8.0
     """Matches that together weigh as one."""
+    laps: ClassVar[int] = 3
+    """Times that steps with slips tell their neighbours."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,11 +146,17 @@ def follow(
     found = registration.register(i, i + 1, points, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
     prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
-    slips = posterior(found.log_odds + prior_odds, wheels.duration)
+    log_odds, motions = found.log_odds(), found.false_motions(prior, sigma**2)
+    chain = posterior(log_odds + prior_odds, wheels.duration)
+    for _ in range(TrackingConfig.laps):
+        expected = motions.by_neighbours(chain, wheels.duration)
+        chain = posterior(found.log_odds(motions.log_marginal(expected)) + prior_odds, wheels.duration)
+    slips = chain.probability
+    found = registration.placed_again(i, points, found, prior, expected)
     placed = found.chosen(slips)
     edges, searched = _measured_near(clouds, raster, steps, certain, tight, config)
     # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.
-    rejected = _contradicted(edges, noise, graph) & (found.log_odds < 0.0)
+    rejected = _contradicted(edges, noise, graph) & (log_odds < 0.0)
     edges = edges.rows(np.flatnonzero(~rejected[np.searchsorted(i, edges.i)]))
     learnt = with_uncounted_ways(noise, edges, graph)
     lasting = (slips > 0.5) & (placed.factors.matched >= _FEWEST)

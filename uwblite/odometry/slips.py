@@ -2,15 +2,16 @@
 
 A slip lasts for seconds, over many steps, in every direction at once. So the evidence of one step, for or against a slip,
 tells of its neighbours, too: the posterior of each step follows from that of all by the forward-backward algorithm of a
-two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989).
+two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989). And wheels that spin count the same
+false motion all the while: see FalseMotions.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges
 
@@ -19,6 +20,10 @@ EVERY, LASTS = 600.0, 2.0
 SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as
 people walk. They count at most all of their motion too much."""
+STEADY = 10.0
+"""Time over which the false motion of a slip changes, s: while wheels spin, the robot's speed is as commanded."""
+_HARDLY = 1e-3
+"""Probability of a slip below which a step tells nothing of its neighbours' slips."""
 
 
 def slip_sigma(wheels: OdometryEdges) -> Floats:
@@ -38,8 +43,20 @@ def covariance_of(wheels: OdometryEdges, graph: Graph) -> Floats:
     return np.asarray(turn @ inverse @ np.swapaxes(inverse, 1, 2) @ np.swapaxes(turn, 1, 2))
 
 
-def posterior(log_odds: Floats, duration: Floats) -> Floats:
-    """Return the probability (e,) that the wheels slip in each of following steps.
+@dataclass(frozen=True, slots=True, eq=False)
+class SlipChain:
+    """Probabilities of slips over e steps that follow each other."""
+
+    probability: Floats
+    """(e,) that the wheels slip over each."""
+    before: Floats
+    """(e,) that they slip over the step before each, if they do over this one."""
+    after: Floats
+    """(e,) the same of the step after it."""
+
+
+def posterior(log_odds: Floats, duration: Floats) -> SlipChain:
+    """Return the probabilities that the wheels slip in each of following steps.
 
     Parameters
     ----------
@@ -51,8 +68,9 @@ def posterior(log_odds: Floats, duration: Floats) -> Floats:
     starts, ends = share * settled, (1.0 - share) * settled
     likelihood = np.exp(np.stack([np.minimum(-log_odds, 0.0), np.minimum(log_odds, 0.0)], axis=1))
     steps = np.stack([np.stack([1.0 - starts, starts], axis=1), np.stack([ends, 1.0 - ends], axis=1)], axis=1)
-    before = np.array([1.0 - share, share])
+    stationary = np.array([1.0 - share, share])
     forward, backward = np.empty((len(log_odds), 2)), np.ones((len(log_odds), 2))
+    before = stationary
     for k in range(len(log_odds)):
         before = likelihood[k] * (before @ steps[k])
         before /= before.sum()
@@ -60,8 +78,68 @@ def posterior(log_odds: Floats, duration: Floats) -> Floats:
     for k in range(len(log_odds) - 2, -1, -1):
         after = steps[k + 1] @ (likelihood[k + 1] * backward[k + 1])
         backward[k] = after / after.sum()
+    # From either state of the step before to a slip, and from a slip to either state of the step after.
+    into = np.concatenate([stationary[None], forward])[:-1] * steps[:, :, 1]
+    out = (steps[:, 1] * likelihood * backward)[1:]
+    after = np.append(out[:, 1] / out.sum(axis=1), 1.0 - share)[: len(log_odds)]
     both = forward * backward
-    return np.asarray(both[:, 1] / both.sum(axis=1))
+    return SlipChain(*(np.asarray(each) for each in (both[:, 1] / both.sum(axis=1), into[:, 1] / into.sum(axis=1), after)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FalseMotions:
+    """What was measured of the false motion of wheels over e steps, in standard deviations of a slip."""
+
+    vector: Floats
+    """(e, 3) information vector."""
+    matrix: Floats
+    """(e, 3, 3) information matrix."""
+
+    def by_neighbours(self, chain: SlipChain, duration: Floats) -> "FalseMotions":
+        """Return what the other steps of a slip tell of its motion over each of its steps, the prior included.
+
+        Wheels count the same false motion for as long as they slip: a stationary Gauss-Markov process, which steps on either
+        side that belong to the same slip show as well. So a slip of ten steps pays for its unknown motion once.
+
+        Parameters
+        ----------
+        duration : (e,) s.
+        """
+        near = np.maximum(chain.probability, np.append(chain.probability[1:], 0.0)) > _HARDLY
+        vector, matrix = self._predicted(chain.before, duration, near)
+        back = FalseMotions(self.vector[::-1], self.matrix[::-1])
+        near = np.maximum(chain.probability, np.append(0.0, chain.probability[:-1])) > _HARDLY
+        after, others = back._predicted(chain.after[::-1], duration[::-1], near[::-1])
+        # Both sides hold the prior.
+        return FalseMotions(vector + after[::-1], matrix + others[::-1] - np.eye(3))
+
+    def _predicted(self, same: Floats, duration: Floats, near: Bools) -> tuple[Floats, Floats]:
+        """Return the information vector (e, 3) and matrix (e, 3, 3) of the false motion over each step by the steps before it.
+
+        Parameters
+        ----------
+        same : (e,) probability that the step before each belongs to the same slip. near : (e,) steps that may be in a slip.
+        """
+        vectors, matrices = np.zeros_like(self.vector), np.tile(np.eye(3), (len(self.vector), 1, 1))
+        keeps = same * np.exp(-0.5 * (duration + np.roll(duration, 1)) / STEADY)
+        for k in np.flatnonzero(near[:-1]).tolist():
+            covariance, kept = np.linalg.inv(matrices[k] + self.matrix[k]), keeps[k + 1]
+            mean = covariance @ (vectors[k] + self.vector[k])
+            matrices[k + 1] = np.linalg.inv(kept**2 * covariance + (1.0 - kept**2) * np.eye(3))
+            vectors[k + 1] = matrices[k + 1] @ (kept * mean)
+        return vectors, matrices
+
+    def log_marginal(self, prior: "FalseMotions") -> Floats:
+        """Return by how much the log evidence (e,) of a slip is greater under a prior than under that of a lone step."""
+        alone = FalseMotions(np.zeros_like(self.vector), np.broadcast_to(np.eye(3), self.matrix.shape))
+        return np.asarray(self._log_marginal(prior) - self._log_marginal(alone))
+
+    def _log_marginal(self, prior: "FalseMotions") -> Floats:
+        """Return the log marginal likelihood (e,) under a prior, but for what does not depend on it."""
+        vector, matrix = self.vector + prior.vector, self.matrix + prior.matrix
+        squared = np.einsum("ei,ei->e", vector, np.linalg.solve(matrix, vector[..., None])[..., 0])
+        known = np.einsum("ei,ei->e", prior.vector, np.linalg.solve(prior.matrix, prior.vector[..., None])[..., 0])
+        return np.asarray(0.5 * (squared - known + np.linalg.slogdet(prior.matrix)[1] - np.linalg.slogdet(matrix)[1]))
 
 
 def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
@@ -74,7 +152,7 @@ def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
 def slipped(wheels: OdometryEdges, graph: Graph) -> Floats:
     """Return the probability (e,) that wheels, whose noise is that of sound ones, slip over each step at a graph's poses."""
     sound, slipping = _of_either(wheels, graph)
-    return posterior(slipping - sound, wheels.duration)
+    return posterior(slipping - sound, wheels.duration).probability
 
 
 def _of_either(wheels: OdometryEdges, graph: Graph) -> tuple[Floats, Floats]:
