@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from uwblite import se2
 from uwblite.constraints import Clock, Constraints, ForbiddenClosure, GivenAnchor, GivenClosure, GivenDistance, GivenPose
 from uwblite.errors import ConfigError, FormatError
-from uwblite.graph.distance_edges import AnchorDistanceEdges
 from uwblite.graph.graph import Graph, PriorEdges
+from uwblite.graph.point_edges import AnchorDistanceEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize

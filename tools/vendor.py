@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "uwblite"
 
-_SOLVER = ("graph.solver", "graph.pose_edges", "graph.range_edges", "graph.point_edges", "graph.distance_edges")
+_SOLVER = ("graph.solver", "graph.pose_edges", "graph.range_edges", "graph.point_edges")
 PARTS = {
     "map": ("mapping", "io.carmen", "io.results", "config"),
     "solve": _SOLVER,

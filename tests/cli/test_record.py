@@ -20,11 +20,11 @@ REFUSED = {
     "over before it begins": ["--lidar", "/dev/null", "--duration", "-1"],
     "sync": ["--lidar", "/dev/null", "--sync", "-1"],
     "part size": ["--lidar", "/dev/null", "--rotate", "5X"],
-    "steps backwards": ["--lidar", "/dev/null", "--lidar-steps", "700:100"],
-    "steps that are none": ["--lidar", "/dev/null", "--lidar-steps", "a:b"],
-    "cluster": ["--lidar", "/dev/null", "--lidar-cluster", "0"],
-    "skip": ["--lidar", "/dev/null", "--lidar-skip", "10"],
-    "lidar baud": ["--lidar", "/dev/null", "--lidar-baud", "7"],
+    "steps backwards": ["--lidar", "/dev/null?steps=700:100"],
+    "steps that are none": ["--lidar", "/dev/null?steps=a:b"],
+    "cluster": ["--lidar", "/dev/null?cluster=0"],
+    "skip": ["--lidar", "/dev/null?skip=10"],
+    "lidar baud": ["--lidar", "/dev/null?baud=7"],
     "mounting": ["--lidar", "/dev/null", "--laser-pose", "nan,0,0"],
     "tag": ["--uwb", "/dev/null", "--tag", "1,2"],
     "height": ["--uwb", "/dev/null", "--anchor-height", "inf"],
@@ -48,7 +48,7 @@ REFUSED = {
     "a packed log": ["--lidar", "/dev/null", "--out", "run.log.gz"],
     "page without a port": ["--lidar", "/dev/null", "--watch", "robot"],
     "page beyond all ports": ["--lidar", "/dev/null", "--watch", "0.0.0.0:70000"],
-    "steps of no laser": ["--lidar", "/dev/null", "--lidar-steps", "5000:99999"],
+    "steps of no laser": ["--lidar", "/dev/null?steps=5000:99999"],
 }
 
 
@@ -178,7 +178,7 @@ def test_devices_refuses_what_is_no_port_and_reports_what_does_not_answer(tmp_pa
     assert "cannot open" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["map", "x.log", "--out", "y", "--jobs"], ["record", "--out", "y", "--lidar-skip"]])
+@pytest.mark.parametrize("words", [["map", "x.log", "--out", "y", "--jobs"], ["plan-anchors", "--map", "y", "--count"]])
 def test_numbers_beyond_all_measure_are_usage_errors(words, capfd):
     assert main([*words, "1" + "0" * 400]) == 2
     assert "is not a whole number" in capfd.readouterr().err

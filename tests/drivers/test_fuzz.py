@@ -58,6 +58,20 @@ def test_options_that_are_no_text_are_wrong_options(query):
         open_device("uwb", f"tlv:/dev/null?{query}")
 
 
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [("time_unit=0.5", None), ("time_unit=", "not a number"), ("baud=9600.5", "not a whole"), ("baud=", "not a number")],
+)
+def test_an_option_is_a_number_a_fraction_only_where_it_may_be_one(option, why):
+    """And one without a value is none that was not given."""
+    url = f"line:/dev/null?columns=t,x,y,theta&{option}"
+    if why is None:
+        assert open_device("odometry", url)
+    else:
+        with pytest.raises(ConfigError, match=why):
+            open_device("odometry", url)
+
+
 def memory(value):
     """Return the bytes that a protocol holds, in whatever it is made of."""
     if isinstance(value, bytearray | bytes):

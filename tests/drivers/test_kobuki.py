@@ -115,6 +115,12 @@ def test_encoders_wrap_both_ways():
     assert pose.y == 0.0
 
 
+def test_speed_is_the_way_by_the_time_that_it_took():
+    """A packet every 20 ms, one of them lost: the way of two is of 40 ms."""
+    speeds = [pose.speed for pose in poses(drive(feedback(k, 50 * k, 50 * k) for k in (0, 1, 2, 4, 5)))]
+    assert speeds[1:] == pytest.approx([50 * kobuki.TICK / 0.02] * 4)
+
+
 def test_gyro_heading_is_relative_to_the_first_and_wraps():
     pose = poses(drive((feedback(k, 0, 0, h) for k, h in enumerate((3.0, 3.1, -3.1, -3.0))), (1.0, 2.0, 0.5)))[-1]
     assert pose.theta == pytest.approx(0.5 + (2 * math.pi - 6.0))

@@ -9,9 +9,8 @@ from scipy import sparse
 
 from uwblite import se2
 from uwblite.graph.certificate import TangentForm, _gap, _is_positive, certificate_matrix, certify
-from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from uwblite.graph.graph import Graph, PriorEdges
-from uwblite.graph.point_edges import LandmarkEdges
+from uwblite.graph.point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize

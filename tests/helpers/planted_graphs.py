@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from uwblite import se2
-from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.graph.point_edges import LandmarkEdges
+from uwblite.graph.point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel

@@ -48,10 +48,10 @@ def standing(count=1, **options) -> Recordings:
     return recordings_of(np.zeros((2 * count, 3)), None, np.repeat(np.arange(count), 2), **options)
 
 
-def task_of(recordings=None, config=None, given=None, *, lidar=False, stages=None) -> Task:
+def task_of(recordings=None, config=None, constraints=None, *, lidar=False, stages=None) -> Task:
     """Return the task of recordings, by default of one of a robot that stands."""
     recordings = standing(lidar=lidar) if recordings is None else recordings
-    return Task(recordings, config or MappingConfig(), given or Constraints(), stages or Stages(None, None))
+    return Task(recordings, config or MappingConfig(), constraints or Constraints(), stages or Stages(None, None))
 
 
 def estimate_of(graph, *, placed=None, anchor_ids=None, odometry=None, ranges=None, **more) -> Estimate:

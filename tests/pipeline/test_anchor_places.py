@@ -23,7 +23,7 @@ from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
-from uwblite.sensor_log import SensorLog
+from uwblite.sensor_log import SensorLog, SensorMounting
 
 
 @pytest.mark.slow
@@ -66,12 +66,13 @@ PLACES = np.array([[-7.0, -6.0], [7.5, -5.0], [6.0, 7.0], [-6.5, 6.0]])
 NAMES = ("A", "B", "C", "D")
 
 
-def planted(seeds=(0,), moves=(), held=True, given=None, names=None, metres=80.0):
+def planted(seeds=(0,), moves=(), held=True, given=None, names=None, metres=80.0, height=None):
     """Return an estimate of true poses, and its task: four anchors around a room of 10 x 10 m.
 
     moves : (recording, anchor, metres (2,), time in s, time in s until which it is carried). held : scans hold the path.
+    height : of the anchors, m, where it is given.
     """
-    logs, truths = [], []
+    logs, truths, mounting = [], [], SensorMounting(anchor_height=height)
     for number, seed in enumerate(seeds):
         rng = np.random.default_rng(seed)
         stamps, truth = wander(rng, metres)
@@ -82,7 +83,7 @@ def planted(seeds=(0,), moves=(), held=True, given=None, names=None, metres=80.0
             share = np.clip((radio.stamps - since) / max(until - since, 1e-3), 0.0, 1.0)[:, None] * np.asarray(by)
             longer = np.hypot(*(PLACES[anchor] + share - tag).T) - np.hypot(*(PLACES[anchor] - tag).T)
             measured += longer * ((radio.anchor == anchor) & (of == number))
-        logs.append(SensorLog(odometry(stamps, truth), replace(radio, ranges=measured, anchor_ids=NAMES)))
+        logs.append(SensorLog(odometry(stamps, truth), replace(radio, ranges=measured, anchor_ids=NAMES), mounting=mounting))
         truths.append((stamps, truth))
     task = Task(gather(logs, KeyframeConfig()), MappingConfig(), given or Constraints(), Stages(None, None))
     estimates = []
@@ -159,7 +160,7 @@ def torn(estimate, task, at, by, visits=False):
 @pytest.mark.parametrize("by", [(1.5, 0.0, 0.0), (0.3, 0.2, -0.8)])
 def test_where_the_path_is_torn_no_anchor_is_moved(by):
     """One step of the path explains the ranges to all anchors."""
-    estimate, task = planted()
+    estimate, task = planted(height=0.0)
     found = decide_places(torn(estimate, task, 80.0, np.array(by)), task)
     assert found.anchor_ids == NAMES
     assert warned(task.stages) == []
@@ -172,7 +173,7 @@ def test_where_the_path_is_torn_no_anchor_is_moved(by):
 def test_what_other_visits_saw_says_that_the_path_is_whole():
     """All anchors are moved as one: the path was broken, but for the scans that see the same walls before and after."""
     together = [(0, k, (2.0, -1.0), 80.0, 80.0) for k in range(4)]
-    estimate, task = planted(moves=together)
+    estimate, task = planted(moves=together, height=0.0)
     found = decide_places(torn(estimate, task, 80.0, np.zeros(3), visits=True), task)
     assert found.anchor_ids == (*NAMES, *(f"{name}@2" for name in NAMES))
     assert doubted(task.stages) == []

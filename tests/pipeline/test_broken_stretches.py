@@ -28,16 +28,17 @@ from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
 from uwblite.pipeline.radio_tracks import range_evidence
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
-from uwblite.sensor_log import SensorLog
+from uwblite.sensor_log import SensorLog, SensorMounting
 
 ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
-SLIP = 30.0
+SLIP = 40.0
 
 
 def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
     """Return an estimate at the true poses, all clouds matched, its task and the true poses.
 
-    The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift.
+    The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift;
+    heights are then given.
     """
     estimate, task, true = walked_once(shift, moved)
     task = replace(task, stages=Stages(None, None))
@@ -48,7 +49,7 @@ def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
 @cache
 def walked_once(shift, moved):
     rng = np.random.default_rng(3)
-    stamps, truth = wander(rng, 30.0, half_width=4.0)
+    stamps, truth = wander(rng, 40.0, half_width=4.0)
     motion = se2.between(truth[:-1], truth[1:])
     motion[(stamps[:-1] >= SLIP) & (stamps[:-1] < SLIP + 1.0)] *= [0.0, 0.0, 1.0]
     radio = ranges(rng, stamps, truth, ANCHORS, rate=0.75, sigma=0.05)
@@ -59,6 +60,7 @@ def walked_once(shift, moved):
     log = SensorLog(
         odometry(stamps, chain(truth[0], motion)), replace(radio, ranges=measured),
         scans(stamps, truth, HALL, rate=4.0, sweep=0.0, range_max=6.0, noise=0.01, rng=rng),
+        SensorMounting() if shift == (0.0, 0.0) else SensorMounting(anchor_height=0.0),
     )  # fmt: skip
     task = Task(gather([log], KeyframeConfig()), MappingConfig(), Constraints(), Stages(None, None))
     estimate, true = (

@@ -224,7 +224,7 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
     """
     calibration = Calibration((UnknownKey("odometry_scale", recording=0),), np.array([factor - 1.0]))
     given = Constraints(anchors=tuple(GivenAnchor(name, (0.0, 0.0)) for name in "AB"[:given]))
-    task = task_of(standing(lidar=lidar is not None, each=[{"screening": screened(lidar)}]), given=given)
+    task = task_of(standing(lidar=lidar is not None, each=[{"screening": screened(lidar)}]), constraints=given)
     stages, other = task.stages, None if height is None else OtherHeights(height, taken=False, apart=1.0)
     estimate = estimate_of(Graph(np.zeros((2, 3)), calibration=calibration), other_heights=other)
     factors = odometry_unit_factors(estimate, task)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from uwblite import build_map, se2
 from uwblite.constraints import Constraints, GivenLandmark, GivenLandmarkDistance
 from uwblite.errors import ConfigError
-from uwblite.graph.distance_edges import PointDistanceEdges
 from uwblite.graph.graph import Graph
+from uwblite.graph.point_edges import PointDistanceEdges
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
@@ -226,7 +226,7 @@ def test_a_cloud_s_own_column_is_what_it_saw_near_the_place():
 def test_a_distance_off_by_more_than_three_sigma_is_a_warning(length, named):
     edges = PointDistanceEdges(*(np.array([k]) for k in (0, 1)), *np.zeros((2, 1, 2)), np.array([3.0]), np.array([0.1]))
     distance = GivenLandmarkDistance(("a", "b"), 3.0, 0.1)
-    task = task_of(given=Constraints(landmark_distances=(distance,)))
+    task = task_of(constraints=Constraints(landmark_distances=(distance,)))
     graph = Graph(np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]))
     (figures,) = outcome(task, Ties(edges, np.array([0])), graph)
     assert figures == {"landmarks": "a - b", "measured": 3.0, "map": length}

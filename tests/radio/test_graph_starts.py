@@ -12,8 +12,8 @@ from uwblite import se2
 from uwblite.cli import main
 from uwblite.errors import FormatError
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.graph.distance_edges import PointDistanceEdges
 from uwblite.graph.graph import Graph
+from uwblite.graph.point_edges import PointDistanceEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.graph_file import chained_poses

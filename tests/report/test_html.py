@@ -148,11 +148,8 @@ def test_text_of_a_log_stays_text():
     assert Page(titled).tags.count("script") == 1
 
 
-def test_same_result_same_bytes_unless_timings_are_asked_for():
+def test_same_result_same_bytes_however_long_it_took():
     assert page(seconds=1.0) == page(seconds=2.0)
-    one, two = (render(small_result(seconds=s), Heading("a", "b"), timings=True) for s in (1.0, 2.0))
-    assert one != two
-    assert "seconds" in one
 
 
 def test_works_without_lidar_and_without_radio():

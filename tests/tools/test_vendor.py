@@ -19,7 +19,7 @@ SOLVE = """
 import numpy as np
 from acme._copy.graph.graph import Graph
 from acme._copy.graph.pose_edges import RelativePoseEdges
-from acme._copy.graph import distance_edges, point_edges, range_edges
+from acme._copy.graph import point_edges, range_edges
 from acme._copy.graph.solver import optimize
 edges = RelativePoseEdges([0, 1, 0], [1, 2, 2], [[1, 0, 0], [1, 0, 0], [2, 0, 0]], [np.eye(3)] * 3)
 solved, summary = optimize(Graph(np.zeros((3, 3)), edges=(edges,)))

@@ -101,7 +101,6 @@ def make(
         seconds=0.0 if args.no_timings else reading + time.perf_counter() - began,
         reading_seconds=reading,
         peak_rss_bytes=peak_memory(),
-        timings_in_report=args.report_timings,
         scale_map=args.scale_map,
     )
     names = write_result(args.out, kept, result, record)

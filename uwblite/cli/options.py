@@ -161,7 +161,6 @@ OPTIONS = {
     "start": "uwblite convert run.log after.log --start",
     "end": "uwblite convert run.log before.log --end",
     "folder": "--out",
-    "steps": "--lidar-steps",
     "shell": "--uwb shell:PORT",
 }
 """What sets on the command line what a text of the library has in backticks, alone or with its value."""

@@ -27,8 +27,8 @@ def run(args: argparse.Namespace) -> int:
     grid, anchors = read_space(args.map, warnings)
     console.note_of(args.map, warnings)
     try:
-        planner = make_planner(grid, args.radius, unknown=args.unknown)
-        path = planner.plan(np.array(args.start), [np.array(p) for p in (*args.via, args.goal)], step=args.step)
+        places = [np.array(p) for p in (args.start, *args.via, args.goal)]
+        path = make_planner(grid, args.radius, unknown=args.unknown).plan(places[0], places[1:], step=args.step)
     except NoPathError as error:
         if args.json:
             console.say_json({"error": str(error), "nearest": error.nearest, "exit_code": 1})

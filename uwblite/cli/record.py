@@ -171,15 +171,13 @@ def status_text(recorder: Recorder) -> str:
 
 def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list[Link]:
     """Return the devices that the command line names; pose is where the odometry goes on."""
-    names = ("steps", "cluster", "skip", "narrow", "baud")
-    lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}", None)) is not None}
     links = []
     for sensor in reversed(SENSORS):
         specs = getattr(args, sensor) or []
         if len(specs) > MOST[sensor]:
             raise ConfigError(f"--{sensor} is given {len(specs)} times; a log keeps {MOST[sensor]} apart")
         for k, spec in enumerate(specs, start=1):
-            session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else {})
+            session, url = open_device(sensor, spec, Setup(pose))
             links.append(Link(sensor, url, session, k))
     for link in links:
         check_url(link.url)

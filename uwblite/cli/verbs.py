@@ -60,7 +60,6 @@ MAP_OPTIONS = (
         option("--crop X0,Y0,X1,Y1", "keep this part of the grid, m: short for --set crop=[...]", numbers(4)),
         option("--scale-map", "write the probabilities too: map_scale.png (mode: scale)"),
         option("--no-timings", "leave timings out of report.json: same run, same bytes"),
-        option("--report-timings", "show the stages' seconds in report.html too"),
     ),
     group(
         "known beforehand",
@@ -279,6 +278,7 @@ examples:
   uwblite record --odometry "line:/dev/ttyUSB0?columns=t,left,right&tick=1.2e-4&wheel_base=0.3&time_unit=0.001" \\
                  --uwb shell:/dev/ttyACM0 --out run.log --duration 600
   uwblite record --lidar socket://robot.local:2001 --odometry kobuki:socket://robot.local:2002 --out run.log
+  uwblite record --lidar "/dev/ttyUSB1?steps=128:640&cluster=2" ...   a Hokuyo on slow RS-232
   uwblite record ... --out run.log --append           go on after a crash
   uwblite record ... --out run.log --watch 0.0.0.0:8000  the map while it grows, on every phone in the network
   uwblite record --uwb tlv:/dev/ttyACM0 --tag 0.2,0,0.6 --uwb tlv:/dev/ttyACM1 --tag=-0.2,0,0.6 --odometry ...
@@ -318,14 +318,6 @@ computer's monotonic clock, s).
                 page_address,
                 **PAGE,
             ),
-        ),
-        group(
-            "lidar",
-            option("--lidar-steps A:B", "first and last step, e.g. 128:640 (all: 44:725)"),
-            option("--lidar-cluster N", "steps merged into one reading (1)", number(1, 99, whole=True)),
-            option("--lidar-skip N", "scans left out between two (0)", number(0, 9, whole=True)),
-            option("--lidar-narrow", "2-character readings up to 4.095 m, for slow RS-232", action="store_const", const=1),
-            option("--lidar-baud N", "bit/s to try first on RS-232 (115200)", number(whole=True)),
         ),
         group(
             "mounting, for the log",

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
@@ -319,9 +318,7 @@ DEFAULT = {"uwb": "tlv", "lidar": "scip"}
 ALIASES = {("uwb", "dwm1001"): "tlv", ("uwb", "line"): "uwb-line", ("gyro", "line"): "gyro-line"}
 
 
-def open_device(
-    sensor: str, spec: str, setup: Setup = Setup(), more: Mapping[str, str] = MappingProxyType({})
-) -> tuple[Session, str]:
+def open_device(sensor: str, spec: str, setup: Setup = Setup()) -> tuple[Session, str]:
     """Return the session for what a user wrote, and the URL of its port.
 
     Parameters
@@ -329,7 +326,6 @@ def open_device(
     sensor : one of SENSORS.
     spec : ``[NAME:]PORT[?option=value&...]``.
     setup : what the driver gets besides its options.
-    more : options from elsewhere; those of `spec` win.
 
     Raises
     ------
@@ -353,7 +349,7 @@ def open_device(
         # What the device does not know may be meant for the port: rfc2217://host:port?ign_set_control
         of_port = {name: texts.pop(name) for name in list(texts) if name not in kind.options}
         port += "?" + urlencode(of_port) if of_port else ""
-    driver = kind.driver({**more, **texts}, setup)
+    driver = kind.driver(texts, setup)
     if not port:
         raise ConfigError(f"--{sensor} {spec}: it names no port, as {kind.name}:/dev/ttyUSB0 does")
     return Session(driver), port

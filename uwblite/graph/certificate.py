@@ -35,11 +35,10 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from .elimination import PER_COMPLEX, work_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
-from .point_edges import LandmarkEdges
+from .point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges
 from .pose_edges import RelativePoseEdges
 from .problem_checks import floating_components
 from .range_edges import RangeEdges

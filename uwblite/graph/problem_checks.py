@@ -4,9 +4,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, connected
 from ..errors import SolverError
-from .distance_edges import PointDistanceEdges
 from .graph import Edges, EdgeTable, Graph, Linearization, PriorEdges
-from .point_edges import LandmarkEdges
+from .point_edges import LandmarkEdges, PointDistanceEdges
 from .range_edges import RangeEdges
 from .unknowns import free_unknowns
 

@@ -15,9 +15,8 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
-from ..graph.point_edges import LandmarkEdges, seen_anchors
+from ..graph.point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.problem_checks import floating_components, given_anchors, tied_chains
 from ..graph.range_edges import RangeEdges

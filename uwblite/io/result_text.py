@@ -43,8 +43,6 @@ class RunRecord:
     """Wall time of the whole run; 0 = not to be recorded."""
     reading_seconds: float = 0.0
     peak_rss_bytes: int = 0
-    timings_in_report: bool = False
-    """Show the stages' seconds in report.html too; it then differs from run to run."""
     scale_map: bool = False
     """Write the map as probabilities too: map_scale.png and its YAML."""
 

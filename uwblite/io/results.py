@@ -131,7 +131,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
         write_text(waiting / "graph_stamps.csv", stamps_csv(result))
         write_text(waiting / "config.toml", record.config)
         heading = Heading(_title(logs), record.command, _lead(logs, result), _facts(logs, result, record))
-        page = render(result, heading, grid_png, timings=record.timings_in_report)
+        page = render(result, heading, grid_png)
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
         write_text(waiting / "report.json", json_lines(summary(logs, result, record, hashes)))

@@ -21,8 +21,8 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..constraints import Clock, Constraints, GivenAnchor, GivenLandmark
 from ..errors import ConfigError
-from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.point_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import optimize

@@ -69,7 +69,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         estimate = _match_neighbours(replace(estimate, odometry=track.wheels), track, task)
     else:
         estimate = _match_neighbours(replace(estimate, odometry=track.slipped), replace(track, steps=track.with_slips), task)
-    if not np.any(track.slips > NeighbourPolicy.likely):
+    if estimate.ranges is None or not np.any(track.slips > NeighbourPolicy.likely):
         return estimate
     return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), task.following(estimate))
 
@@ -117,6 +117,7 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
+    Without ranges nothing tells a crowd in a corridor from a slip, and the steps as measured stay.
 
     Parameters
     ----------

@@ -17,9 +17,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.chordal_start import chordal_start
-from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
-from ..graph.point_edges import LandmarkEdges, seen_anchors
+from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
 from .trilateration import TrilaterationConfig, trilaterate

@@ -41,13 +41,12 @@ class Heading:
     """(name, value): input hash, version, settings."""
 
 
-def render(result: MapResult, heading: Heading, grid_png: bytes | None = None, *, timings: bool = False) -> str:
+def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -> str:
     """Return the page.
 
     Parameters
     ----------
     grid_png : picture of the bare grid, one pixel a cell, highest y first.
-    timings : whether to show the seconds of each stage; the page then differs from run to run.
     """
     again = f"<p>{escape(_WHERE.format(heading.title))}</p><pre>{escape(heading.command)}</pre>"
     table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in heading.facts)
@@ -58,7 +57,7 @@ def render(result: MapResult, heading: Heading, grid_png: bytes | None = None, *
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
         _section("Loop closures", _closure_table(result)),
-        _section("Stages", _stage_table(result, timings)),
+        _section("Stages", _stage_table(result)),
         _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
     body = f"<h1>{escape(heading.title)}</h1>" + "".join(sections)
@@ -170,16 +169,16 @@ def _closure_table(result: MapResult) -> str:
     return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
 
 
-def _stage_table(result: MapResult, timings: bool) -> str:
-    head = ("stage", *(("seconds",) if timings else ()), "\u03c7\u00b2 / degrees of freedom", "figures")
+def _stage_table(result: MapResult) -> str:
+    head = ("stage", "\u03c7\u00b2 / degrees of freedom", "figures")
     rows = []
     for stage in result.stages:
         chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
         ratio = f"{chi2:.0f} / {dof} = {number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
         values = {name: value for name, value in stage.figures.items() if isinstance(value, int | float) and value}
         shown = ", ".join(text.format(values[name]) for name, text in _FIGURES.items() if name in values)
-        if ratio or shown or timings:
-            rows.append((stage.name, *((f"{stage.seconds:.2f}",) if timings else ()), ratio, shown))
+        if ratio or shown:
+            rows.append((stage.name, ratio, shown))
     return f"<details><summary>{len(rows)} stages</summary>{_table(head, rows, '')}<p class=hint>{_ABOUT_STAGES}</p></details>"
 
 

@@ -13,7 +13,7 @@ from .units import CLEARLY, heading_reading
 from .wheel_motion import Pairs
 
 _TURNS = 300
-"""Least number of scan pairs from which it is decided whether the laser is upside down."""
+"""Pairs of scans, at most, by whose turns it is decided whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
 """Angle by which a laser points elsewhere than given, difference up to which directions of motion agree, both rad, and share
 of them that must agree. Along bare walls a match stays at the wheels' guess, whichever way the laser looks."""

@@ -321,7 +321,8 @@ errors, m, by which readings are weighted."""
 
 def _by_way(trace: Trace, longest: float, policy: RangePolicy) -> Floats:
     """Return log likelihoods (g,) of the ranges of a trace if the robot drove its way, or twice that, in any direction."""
-    change, way = np.diff(trace.ranges), np.diff(trace.way)
+    # A way shorter than the errors of ranges is lost in them.
+    change, way = np.diff(trace.ranges), np.maximum(np.diff(trace.way), policy.noise[0])
     scales = 2.0 * np.array(policy.noise)[:, None]
 
     def within(most: Floats) -> Floats:
