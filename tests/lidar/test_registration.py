@@ -9,7 +9,7 @@ from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
 from uwblite.lidar.object_likelihood import ObjectLikelihood, matched_by_chance, objects, pairs_of
-from uwblite.lidar.registration import Prior, RegistrationConfig, of_fallible, placed_again, register
+from uwblite.lidar.registration import Gaussian, Prior, RegistrationConfig, of_fallible, placed_again, register, search
 from uwblite.odometry.slips import FalseMotions
 
 SIGMA = 0.02
@@ -43,6 +43,15 @@ def test_clouds_tell_a_slip_from_none(room, slip, sign):
     # As sure as a pair of clouds can be: it is wrong with the probability `useless`.
     assert sign * found.log_odds()[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
     (pose,) = found.chosen(np.array([float(sign > 0)])).pose
+    assert np.abs(se2.between(step, pose)).max() < 0.015
+
+
+@pytest.mark.parametrize("missed", [(0.0, 0.0, 0.7), (0.6, -0.3, -0.5)])
+def test_a_place_far_from_the_prior_s_mean_is_found(room, missed):
+    truth, clouds = room
+    step = se2.between(truth[0], truth[1])
+    mean = se2.compose(step, np.array(missed))
+    (pose,) = search(*compared(clouds, mean), Gaussian(mean[None], np.eye(3)[None])).pose
     assert np.abs(se2.between(step, pose)).max() < 0.015
 
 

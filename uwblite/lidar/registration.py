@@ -245,6 +245,11 @@ def placed_again(
     return replace(found, slipped=found.slipped.replaced(rows, slipped, np.ones(len(rows), dtype=bool)))
 
 
+def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Placed:
+    """Place the sources of pairs (e,) in their targets, wherever the prior allows."""
+    return _from_best(objects, pairs, prior, _searched)
+
+
 def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:
     """Place pairs (e,), each from the best of several starts."""
     placed = [descend(objects, pairs, start, prior) for start in starts(objects, pairs, prior)]

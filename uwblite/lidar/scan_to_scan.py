@@ -1,9 +1,9 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
 Neighbouring clouds are aligned from the odometry's guess, all at once; that shows the calibration and the noise of the wheels.
-A pair that then shares few points is searched for in the local sub-map of the keyframes before. Each step is also registered
-with the possibility that the wheels slipped. A slip lasts: the evidence of all steps together decides (see slips). Where the
-wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
+Each step is registered with the possibility that the wheels slipped, and where few points match, that a message of the odometry
+was lost. A slip lasts: the evidence of all steps together decides (see slips). A lost message shows in clouds before it, too.
+Where the wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
 """
 
 from dataclasses import dataclass, replace
@@ -16,15 +16,25 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.slips import covariance_of, posterior, slip_sigma, with_slips
+from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .object_likelihood import ObjectLikelihood, ObjectPolicy, pairs_of
+from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy, pairs_of
 from .pair_alignment import align_pairs
-from .registration import Placed, Prior, RegistrationConfig, of_fallible, placed_again, register
+from .registration import (
+    Gaussian,
+    Placed,
+    Placement,
+    Prior,
+    RegistrationConfig,
+    descend,
+    of_fallible,
+    placed_again,
+    register,
+    search,
+)
 from .scan_matching import match, measured, pair_points
-from .step_search import StepSearch
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +43,6 @@ class TrackingConfig:
 
     on: bool = True
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
-    distance: ClassVar[float] = 0.4
-    """Half-width of the search beyond twice the motion by the odometry, m: wheels may count backwards as forwards."""
-    angle: ClassVar[float] = 0.45
-    """Half-width of the search in heading beyond half the turn by the odometry, rad."""
     min_points: ClassVar[int] = 30
     """Clouds with fewer points with a normal measure nothing."""
     fewest: ClassVar[int] = 6
@@ -51,12 +57,12 @@ class TrackingConfig:
     """What one step in a thousand exceeds by chance, of such a chi2."""
     elsewhere: ClassVar[float] = 0.12
     """m or rad; an error that a step of faultless odometry never has."""
-    least_share: ClassVar[float] = 0.4
-    """Share of matching points from which on descent from the odometry's guess measures a step."""
-    most_through: ClassVar[float] = 0.04
-    """Share of points in free space up to which it measures one; one point in twenty-five may be a foot or a leaf."""
     laps: ClassVar[int] = 3
     """Times that steps with slips tell their neighbours."""
+    lost: ClassVar[float] = 1e-3
+    """Probability that a message of the odometry is lost over a step, or the robot carried."""
+    views: ClassVar[int] = 6
+    """Clouds before a doubtful step with which the one after it is compared: they still see the same."""
     steps_back: ClassVar[int] = 4
     """Steps over which objects that move are sought: a second or two."""
     longest_run: ClassVar[int] = 3
@@ -123,7 +129,7 @@ def match_plainly(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, 
 
 def descended_edges(clouds: Clouds, raster: CloudRasters, steps: Steps) -> RelativePoseEdges:
     """Return the steps that descent measured, without a search, as edges."""
-    shown = steps.enough & (steps.share >= TrackingConfig.least_share)
+    shown = steps.enough & (steps.share >= RegistrationConfig.least_share)
     return _edges(clouds, raster, steps.i[shown], steps.pose[shown], ObjectPolicy.gate)[0]
 
 
@@ -157,18 +163,28 @@ def follow(
     slips = chain.probability
     found = placed_again(objects, pairs, found, prior, expected)
     placed = found.chosen(slips)
-    edges, searched = _measured_near(clouds, raster, steps, certain)
-    # What the clouds show, a crowd or the ground before a robot that tilts, is likelier where the wheels count it.
-    rejected = _contradicted(edges, noise, graph) & (log_odds < 0.0)
-    edges = edges.rows(np.flatnonzero(~rejected[np.searchsorted(i, edges.i)]))
+    # Where neighbours share few points, clouds some steps before say where they lie.
+    variance, poor = sigma**2 * ObjectPolicy.correlation, steps.enough & ~good
+    lost = Gaussian(mean, usual + lost_sigma(noise)[:, :, None] ** 2 * np.eye(3))
+    # A slip that lasts is known from the steps around.
+    odds = np.maximum(np.log(TrackingConfig.lost), logit(np.clip(slips, 1e-9, 1.0 - 1e-9)) - log_odds)
+    mode, tempting = _decided(objects, pairs, found, steps.pose, lost, np.where(poor, odds, -np.inf))
+    # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
+    stays = np.where(poor, np.all(mode.pose == found.sound.pose, axis=1), log_odds < 0.0)
+    captured = np.flatnonzero(poor & stays & (tempting.share > found.sound.share))
+    matched = certain.followed_by(_as_edges(i, tempting, captured, variance))
+    rejected = _contradicted(matched, noise, graph) & stays
+    edges = certain.rows(np.flatnonzero(~rejected[np.searchsorted(i, certain.i)]))
+    edges = edges.followed_by(_as_edges(i, mode, np.flatnonzero(poor & _shown(mode) & ~rejected), variance))
+    edges = edges.rows(np.argsort(edges.i))
     learnt = with_uncounted_ways(noise, edges, graph)
     seen, steady = np.flatnonzero((slips > 0.5) & _shown(placed)), ~np.isin(edges.i, i[slips > 0.5])
-    slid = _as_edges(i, placed, seen, sigma**2 * ObjectPolicy.correlation)
+    slid = _as_edges(i, placed, seen, variance)
     both = edges.rows(np.flatnonzero(steady)).followed_by(slid)
     miss, moving = _miss(clouds, noise), _moving(objects, i, placed)
     return ScanOdometry(
         edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
-        float(np.median(miss)) if len(miss) else 0.0, searched, slips, moving, rejected,
+        float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving, rejected,
     )
 
 
@@ -195,60 +211,67 @@ def _as_edges(first: Ints, placed: Placed, rows: Ints, variance: float) -> Relat
 
 
 def _shown(placed: Placed) -> Bools:
-    """Return which placements (e,) are likelier than that the clouds show nothing of each other's place."""
-    likelier = placed.evidence > np.log(RegistrationConfig.useless)
-    return np.asarray((placed.factors.matched >= TrackingConfig.fewest) & likelier)
+    """Return which clouds (e,) are likelier to lie there than in space that nobody has seen."""
+    return np.asarray((placed.factors.matched >= TrackingConfig.fewest) & (placed.likelihood > 0.0))
 
 
-def _measured_near(
-    clouds: Clouds, raster: CloudRasters, steps: Steps, certain: RelativePoseEdges
-) -> tuple[RelativePoseEdges, int]:
-    """Return the steps as wheels that do not slip allow, and how many were searched.
+def _decided(
+    objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, near: Floats, lost: Gaussian, odds: Floats
+) -> tuple[Placed, Placed]:
+    """Return the likeliest place of each step (e,), and of doubtful ones the place other than the wheels' with the largest
+    evidence: they slipped, a message was lost, or the robot carried, in no time by the stamps.
 
-    Neighbours that share few points are searched for in the local sub-map of the keyframes before; where that finds nothing, or
-    two equally good places, the step is left to the odometry.
+    One pair of clouds does not tell. The best of many places fits some surface by chance, and then in all pairs: so the prior's
+    part of the evidence counts whole, and the likelihood of each pair as far as one can be trusted.
+
+    Parameters
+    ----------
+    near : (e, 3) where plain matching ended. lost : prior of steps over which a message was lost.
+    odds : (e,) log odds of another place beforehand; -inf where that is not asked.
     """
-    good = steps.enough & (steps.share >= RegistrationConfig.good_share)
-    pose, lost, searched = _searched(clouds, steps.i, steps, steps.enough & ~good)
-    further = steps.enough & ~lost & ~good
-    measured_steps = certain.followed_by(_edges(clouds, raster, steps.i[further], pose[further], ObjectPolicy.gate)[0])
-    measured_steps = measured_steps.rows(np.argsort(measured_steps.i))
-    return measured_steps, searched
+    rows, c = np.flatnonzero(np.isfinite(odds)), RegistrationConfig
+    some, wide, sound = pairs.rows(rows), lost.rows(rows), found.sound.rows(rows)
+    other, ended = found.slipped.rows(rows), descend(objects, some, near[rows], wide)
+    other = other.replaced(np.arange(len(rows)), ended, ended.evidence > other.evidence)
+    chain, moved = near.copy(), np.zeros(len(rows), dtype=bool)
+    chain[rows] = sound.pose
+    for number, row in enumerate(rows.tolist()):
+        one = np.array([number])
+        here = _seen(objects, pairs, chain, row, sound.pose[number])
+        few = max(other.share[number], sound.share[number]) < c.least_share
+        if few and of_fallible(here, c.useless).sum() <= 0.0:
+            anywhere = search(objects, some.rows(one), wide.rows(one))
+            other = other.replaced(one, anywhere, anywhere.evidence > other.evidence[one])
+        there = _seen(objects, pairs, chain, row, other.pose[number])
+        volume = other.evidence - other.likelihood - sound.evidence + sound.likelihood
+        # It must be likelier than that the clouds show nothing, too.
+        least = min(volume[number] + _support(here, there), other.evidence[number])
+        moved[number] = odds[row] + least > 0.0
+        chain[row] = (other if moved[number] else sound).pose[number]
+    return found.sound.replaced(rows, other, moved), found.sound.replaced(rows, other, np.ones(len(rows), dtype=bool))
 
 
-def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools) -> tuple[Floats, Bools, int]:
-    """Search for doubtful steps (e,), each against the sub-map of those before it.
+def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, row: int, pose: Floats) -> Floats:
+    """Return the log likelihood (v,) of the cloud at the end of a step, which is a pose (3,), in those before it in a chain."""
+    at, placed = [], pose
+    for back in range(min(TrackingConfig.views, row + 1)):
+        if pairs.i[row - back] != pairs.i[row] - back:
+            break
+        placed = se2.compose(chain[row - back], placed) if back else placed
+        at.append(placed)
+    compared = replace(pairs.rows(np.full(len(at), row)), i=pairs.i[row] - np.arange(len(at)))
+    return objects.log_likelihood(compared, np.array(at))
 
-    With noise of decimetres, foliage or few beams, every step has few matches. Where these are enough to measure the step, and
-    no surface stands in free space, no search is needed.
 
-    Returns
-    -------
-    Poses of all steps (e, 3), which were not found (e,), and how many were searched for.
-    """
-    pose, lost, searched = steps.pose.copy(), np.zeros(len(i), dtype=bool), 0
-    searching = StepSearch(clouds, TrackingConfig.distance, TrackingConfig.angle)
-    chain = np.zeros((len(clouds), 3))
-    chain[i] = pose
-    # Sub-maps begin after the last step that was not measured.
-    blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
-    first = 0
-    for row in np.flatnonzero(doubtful).tolist():
-        k, before = int(i[row]), blind[blind < i[row]]
-        first = max(first, int(before[-1]) + 1 if len(before) else 0)
-        guess, ended = steps.guess[row], steps.pose[row]
-        matched = steps.share[row] >= TrackingConfig.least_share
-        if matched and searching.through(k, ended[None])[0] <= TrackingConfig.most_through:
-            continue
-        searched += 1
-        found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
-        # Where no search is clear, descent near the odometry's guess still measures the directions that the surfaces determine.
-        lost[row] = not found.clear and (found.contradicts or steps.share[row] < TrackingConfig.least_share)
-        if found.clear:
-            chain[k] = pose[row] = found.pose
-        elif lost[row]:
-            first = k + 1
-    return pose, lost, searched
+def _support(here: Floats, there: Floats) -> float:
+    """Return the log odds for a place at which views have log likelihoods there (v,) against one at which they have others."""
+    # A pair may show one place and contradict the other, or show both and one of them better: what says more counts.
+    by_each, useless = there - here, RegistrationConfig.useless
+    apart, better = of_fallible(there, useless) - of_fallible(here, useless), of_fallible(by_each, useless)
+    odds = float(np.where(np.abs(apart) > np.abs(better), apart, better).sum())
+    # They see the same surfaces: together they say no more of these than the one that sees most.
+    most = float(np.abs(by_each).max(initial=0.0))
+    return float(np.clip(odds, -most, most))
 
 
 def _moving(objects: ObjectLikelihood, first: Ints, placed: Placed) -> Bools:

@@ -28,9 +28,21 @@ _HARDLY = 1e-3
 
 def slip_sigma(wheels: OdometryEdges) -> Floats:
     """Return the standard deviation (e, 3) of steps of the odometry over which the wheels slip, m, m, rad."""
-    way, turned = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]), np.abs(wheels.motion[:, 2])
     # A slip does not last as long as a pause.
-    lasts = -LASTS * np.expm1(-wheels.duration / LASTS)
+    return _uncounted(wheels, -LASTS * np.expm1(-wheels.duration / LASTS))
+
+
+def lost_sigma(wheels: OdometryEdges) -> Floats:
+    """Return the standard deviation (e, 3) of steps over which messages are lost or the robot is carried, m, m, rad.
+
+    The stamps need not show it: what was lost may be as long as a slip.
+    """
+    return _uncounted(wheels, np.full(len(wheels), LASTS))
+
+
+def _uncounted(wheels: OdometryEdges, lasts: Floats) -> Floats:
+    """Return the standard deviation (e, 3) of steps whose wheels miss what happens in some time (e,), s, or count too much."""
+    way, turned = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]), np.abs(wheels.motion[:, 2])
     place = way + SPEED * lasts
     return np.stack([place, place, turned + TURN_RATE * lasts], axis=1)
 
