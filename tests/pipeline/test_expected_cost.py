@@ -30,7 +30,7 @@ def test_work_grows_with_path_ranges_and_readings(log):
 
 @pytest.mark.parametrize("place", range(4))
 def test_memory_grows_with_path_scans_beams_and_cells(place):
-    few, many = [100.0, 5000, 682, 100_000], [100.0, 5000, 682, 100_000]
+    few, many = [100.0, 5000, 682, 2_000_000], [100.0, 5000, 682, 2_000_000]
     many[place] *= 2
     assert 50 < cost.expected_megabytes(*few) < cost.expected_megabytes(*many)
 
