@@ -74,7 +74,7 @@ def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_map,
     assert one == two
 
 
-def test_the_command_in_the_report_makes_the_same_map(short_log, tmp_path, monkeypatch, capsys):
+def test_the_command_in_the_report_gives_the_same_bytes(short_log, tmp_path, monkeypatch, capsys):
     """It is pasted from the page, in the folder of the recording, where nothing but the recording is."""
     import html
     import shlex
