@@ -55,6 +55,12 @@ class RangePolicy:
     """Motion that sound wheels miss over twice such a way, m and rad: the map takes it up."""
     turn: float = 0.05
     """Between the turns that are compared, rad."""
+    rounds: int = 5
+    """Of reweighting of the readings of a place."""
+    usual_error: float = 0.2
+    """Scale of errors by which readings are weighted there, m."""
+    ridge: float = 1e-6
+    """Added to normal equations: a robot that stands shows a distance only."""
 
 
 _SAME = np.zeros(3)
@@ -305,18 +311,13 @@ def _best_place(paths: Floats, ranges: Floats, policy: RangePolicy) -> Floats:
     columns = np.concatenate([-2.0 * (paths - middle), np.ones((*paths.shape[:2], 1))], axis=2)
     squares = ranges**2 - np.sum((paths - middle) ** 2, axis=2)
     weights, scales = np.ones(squares.shape), np.array(policy.noise)[:, None, None]
-    for _ in range(_ROUNDS):
+    for _ in range(policy.rounds):
         scaled = columns * (weights / (2.0 * ranges) ** 2)[..., None]
-        normal = np.swapaxes(scaled, 1, 2) @ columns + _RIDGE * np.eye(3)
+        normal = np.swapaxes(scaled, 1, 2) @ columns + policy.ridge * np.eye(3)
         found = np.linalg.solve(normal, np.sum(scaled * squares[..., None], axis=1)[..., None])
         errors = ((columns @ found)[..., 0] - squares) / (2.0 * ranges)
-        weights = 1.0 / (1.0 + (errors / _USUAL) ** 2)
+        weights = 1.0 / (1.0 + (errors / policy.usual_error) ** 2)
     return np.asarray(-np.sum(np.log(np.pi * scales * (1.0 + (errors / scales) ** 2)), axis=2) - 1.5 * np.log(len(ranges)))
-
-
-_ROUNDS, _RIDGE, _USUAL = 5, 1e-6, 0.2
-"""Rounds of reweighting, what is added to normal equations (a robot that stands shows a distance only), and the scale of
-errors, m, by which readings are weighted."""
 
 
 def _by_way(trace: Trace, longest: float, policy: RangePolicy) -> Floats:
