@@ -290,8 +290,11 @@ class Moment:
         turns = np.arange(-np.pi, np.pi, policy.turn)
         usual = np.abs(turns) < policy.usual_motion
         small, any_turn = turns[usual, None] * turn, turns[:: len(turns) // 12, None] * turn
+        sound = float(self.alone.sum(axis=0).max()) - EvidencePolicy.very_strong
+        if float(self.likely(small).max()) > sound:
+            return
         still, null = self.refined(small, policy.usual_motion)
-        if float(self.alone.sum(axis=0).max()) - null < EvidencePolicy.very_strong:
+        if null > sound:
             return
         large = self.likely(turns[~usual, None] * turn)
         turned = float(np.logaddexp.reduce(large)) - np.log(len(large))
