@@ -237,7 +237,7 @@ def test_no_module_has(rule):
 
 
 def run_python(*words, cwd=None, path=PACKAGE.parent):
-    environment = {"PATH": "/usr/bin:/bin", "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {"PATH": "/usr/bin:/bin"}
     if path:
         environment["PYTHONPATH"] = str(path)
     return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)

@@ -111,6 +111,7 @@ def same_bytes(one, other) -> None:
     assert one.grid.log_odds.tobytes() == other.grid.log_odds.tobytes()
     assert [c.reason for c in one.closures] == [c.reason for c in other.closures]
     assert [s.figures for s in one.stages] == [s.figures for s in other.stages]
+    assert [s.work for s in one.stages] == [s.work for s in other.stages]
     assert one.warnings == other.warnings
 
 
