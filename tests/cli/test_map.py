@@ -18,16 +18,9 @@ from uwblite.sensor_log import SensorMounting
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory, room_log):
-    """Folder with the map of the sample recording, and what was said."""
-    import contextlib
-    import io
-
-    folder = tmp_path_factory.mktemp("room") / "map"
-    output = io.StringIO()
-    with contextlib.redirect_stdout(output):
-        code = main(["map", str(room_log), "--out", str(folder), "--corrected-log", str(folder.parent / "corrected.log")])
-    return folder, code, output.getvalue()
+def mapped(room_map):
+    """Folder with the map of the sample recording, the exit code, and what was said."""
+    return room_map / "map", int((room_map / "code").read_text()), (room_map / "said.txt").read_text()
 
 
 def test_the_sample_is_mapped_with_every_file(mapped):
