@@ -212,7 +212,7 @@ def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_la
 @pytest.mark.parametrize("radio_scale", [1.0, pytest.param(1.08, marks=pytest.mark.slow)])
 def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
     """Without a lidar nothing shows which of the two is wrong, but that they differ is plain: yards explain it."""
-    result = build_map(run(radio_scale=radio_scale)[2])
+    result = build_map(run(radio_scale=radio_scale, metres=80.0)[2])
     assert stated(result.warnings, "relative error of all ranges") == []
     reported = stated(result.doubts, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)

@@ -46,7 +46,7 @@ class Place:
     anchors: tuple = ()
     start: tuple = (-2.6, -2.0, 0.0)
     lidar: float = 12.0
-    scans: tuple = (2.5, 120)
+    scans: tuple = (2.0, 120)
     """1/s, and beams of each."""
     radio: float = np.inf
     silent: tuple = (np.inf, np.inf)
@@ -130,7 +130,7 @@ ROWS = {
         ),
     ),
     "the first part once more": (
-        Place(CORRIDOR, start=(-7.0, -6.0, 0.0), lidar=6.0, scans=(4.0, 180), silent=(34.0, 60.0)),
+        Place(CORRIDOR, start=(-7.0, -6.0, 0.0), lidar=6.0, scans=(3.0, 180), silent=(34.0, 60.0)),
         OUT,
         [*OUT, *BACK],
         (

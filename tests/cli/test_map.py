@@ -213,7 +213,7 @@ def radio_only(tmp_path_factory):
     folder = tmp_path_factory.mktemp("radio")
     rng = np.random.default_rng(7)
     level = SensorMounting(anchor_height=0.0)
-    stamps, truth = wander(rng, 60.0)
+    stamps, truth = wander(rng, 40.0)
     around = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
     wheels = odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
     write_log(folder / "around.log", recording(wheels, ranges(rng, stamps, truth, around), mounting=level))

@@ -37,8 +37,7 @@ def kinds_of(log):
     return [(fact.kind, fact.figures.get("what", "")) for fact in explained_by_ranges(log)[1]]
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("late", [-18.0, 5.0])
+@pytest.mark.parametrize(("seed", "late"), [(0, -18.0), (1, 5.0)])
 def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
     log = late_by(late, seed)
     moved, (fact,) = explained_by_ranges(log)
@@ -69,7 +68,7 @@ def test_wheels_that_stand_still_make_no_clock(seed, still):
 def test_wheels_that_turn_at_random_make_no_clock(seed):
     """Each stretch fits at some other offset; all are no clock."""
     rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, 120.0)
+    stamps, truth = planted.wander(rng, 80.0)
     wheels = planted.odometry(stamps, truth, rng, noise=0.05, turn_noise=0.6)
     log = SensorLog(wheels, planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.15, outliers=0.1), None)
     assert "late-ranges" not in dict(kinds_of(log))
