@@ -198,7 +198,7 @@ def test_equal_input_gives_equal_bytes(two):
 
 
 def test_a_list_of_one_is_that_one(two):
-    log = two[0][0].crop(end=8.0)
+    log = two[0][0].crop(end=4.0)
     assert build_map([log]).trajectory.tobytes() == build_map(log).trajectory.tobytes()
 
 
