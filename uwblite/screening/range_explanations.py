@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaln
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SensorLog, plausible
@@ -99,6 +99,8 @@ class Explanation:
     begin: float = 0.0
     end: float = np.inf
     """Way, m, on which it changes something."""
+    names: dict[str, str] = field(default_factory=dict)
+    """What anchors are called before the moment by what they are called after it."""
 
 
 def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> tuple[SensorLog, list[Fact]]:
@@ -112,8 +114,34 @@ def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> 
         left = _at_moments(in_time, _traces(in_time, policy), policy)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
-            return in_time, [Fact.of(late.kind, **late.figures), *_facts(left, in_time)]
-    return log, _facts([ways, *moments], log)
+            return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left, policy), in_time)]
+    return log, _facts([ways, *_with_names_undone(log, moments, policy)], log)
+
+
+def _with_names_undone(log: SensorLog, rows: list[Explanation], policy: RangePolicy) -> list[Explanation]:
+    """Return the rows without those that the exchange of names explains: with the names exchanged back they are no more.
+
+    An exchange contradicts the path, too, at moments somewhat before it and after it, where it is on one side: what holds there
+    of two explanations of the same readings shows in what either leaves.
+    """
+    exchanges = [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong]
+    for row in sorted(exchanges, key=lambda row: -row.log_odds):
+        near = [other for other in rows if other.begin < row.end and row.begin < other.end]
+        undone = _with_names(log, 0.5 * (row.begin + row.end), row.names)
+        left = _at_moments(undone, _traces(undone, policy), policy, row)
+        if row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+            rows = [row, *left, *(other for other in rows if other not in near)]
+            log = undone
+    return rows
+
+
+def _with_names(log: SensorLog, way: float, names: dict[str, str]) -> SensorLog:
+    """Return the recording with anchors of other names from a moment on, given by the way, m."""
+    ranges = log.ranges
+    assert ranges is not None
+    at = np.interp(way, log.odometry.travelled, log.odometry.stamps)
+    others = np.array([ranges.anchor_ids.index(names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
+    return replace(log, ranges=replace(ranges, anchor=np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)))
 
 
 def _most(rows: Sequence[Explanation]) -> float:
@@ -188,14 +216,22 @@ def _over_stretches(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy
     return clock, Explanation(odds - null + float(costs), "wheels-against-ranges", other_ways, float(edges[a]), end)
 
 
-def _at_moments(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy) -> list[Explanation]:
+def _at_moments(
+    log: SensorLog, traces: Sequence[Trace], policy: RangePolicy, near: Explanation | None = None
+) -> list[Explanation]:
     """Return names that are exchanged, and paths that go on elsewhere, from a moment on.
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment.
+
+    Parameters
+    ----------
+    near : only moments whose stretches overlap with those of this one.
     """
     odometry, half, every = log.odometry, policy.stretch, 0.25 * policy.stretch
     longest, found = max(float(trace.ranges.max(initial=0.0)) for trace in traces), list[Explanation]()
-    for at in np.arange(half, float(odometry.travelled[-1]) - half, every):
+    for at in np.arange(half, float(odometry.travelled[-1]) - half, every).tolist():
+        if near is not None and (at + half <= near.begin or near.end <= at - half):
+            continue
         origin = se2.inverse(odometry.at(np.array([np.interp(at, odometry.travelled, odometry.stamps)]))[0])
         sides = [(trace.between(at - half, at, origin), trace.between(at, at + half, origin)) for trace in traces]
         sides = [side for side in sides if min(len(trace.ranges) for trace in side) >= policy.fewest]
@@ -235,9 +271,11 @@ class Moment:
         """(a, g) log likelihoods of the readings to two places each."""
         return np.asarray(self.sides.sum(axis=0))
 
-    def likely(self, motions: Floats, sign: float = 1.0) -> Floats:
-        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not."""
-        each = np.stack([self.same(k, k, motions, sign) for k in range(len(self.before))])
+    def likely(self, motions: Floats, sign: float = 1.0, names: Ints | None = None) -> Floats:
+        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not, and of anchors that are others
+        (a,) after the moment."""
+        to = range(len(self.before)) if names is None else names.tolist()
+        each = np.stack([self.same(k, other, motions, sign) for k, other in enumerate(to)])
         return np.asarray(each.sum(axis=0).max(axis=0))
 
     def same(self, k: int, other: int, motions: Floats, sign: float = 1.0) -> Floats:
@@ -246,17 +284,28 @@ class Moment:
         moved = se2.transform(motions[:, None], two.places * np.array([1.0, sign]))
         paths = np.concatenate([np.broadcast_to(one.places, (len(motions), *one.places.shape)), moved], axis=1)
         likely = _best_place(paths, np.concatenate([one.ranges, two.ranges]), self.policy)
-        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + self.alone[k][:, None]))
+        apart = self.sides[0, k] + self.sides[1, other]
+        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + apart[:, None]))
 
-    def refined(self, motions: Floats, size: float, sign: float = 1.0) -> tuple[Floats, float]:
+    def refined(self, motions: Floats, size: float, sign: float = 1.0, names: Ints | None = None) -> tuple[Floats, float]:
         """Return the best motion (3,) about the best of some (m, 3), within a size, m, coarse to fine; its log likelihood."""
-        best = motions[np.argmax(self.likely(motions, sign))]
+        best = motions[np.argmax(self.likely(motions, sign, names))]
         around = np.stack(np.meshgrid(*3 * [np.array([-0.5, 0.0, 0.5])]), axis=-1).reshape(-1, 3)
         for reach in size * 0.5 ** np.arange(np.log2(size / self.policy.usual_motion) + 3.0):
             tried = best + around * reach
-            likely = self.likely(tried, sign)
+            likely = self.likely(tried, sign, names)
             best = tried[np.argmax(likely)]
         return best, float(likely.max())
+
+    def exchanged(self, motions: Floats) -> tuple[Ints, float]:
+        """Return which anchor each is after the moment (a,), as the path that goes on by some motion (m, 3) shows, refined."""
+        count = len(self.before)
+        pairs = np.array([[self.same(k, other, motions).max(axis=0) for other in range(count)] for k in range(count)])
+        orders = [linear_sum_assignment(-pairs[:, :, m])[1] for m in range(len(motions))]
+        gains = [float(pairs[np.arange(count), order, m].sum()) for m, order in enumerate(orders)]
+        best = int(np.argmax(gains))
+        names = orders[best]
+        return names, self.refined(motions[best : best + 1], self.policy.usual_motion, names=names)[1]
 
     def rows(self) -> Iterator[Explanation]:
         """Yield what explains a change; nothing where nothing could: with all anchors at any place the path is no likelier."""
@@ -264,7 +313,7 @@ class Moment:
         turns = np.arange(-np.pi, np.pi, policy.turn)
         usual = np.abs(turns) < policy.usual_motion
         small, any_turn = turns[usual, None] * turn, turns[:: len(turns) // 12, None] * turn
-        still, null = self.refined(small, policy.usual_motion)
+        null = self.refined(small, policy.usual_motion)[1]
         if float(self.alone.sum(axis=0).max()) - null < EvidencePolicy.very_strong:
             return
         large = self.likely(turns[~usual, None] * turn)
@@ -280,17 +329,17 @@ class Moment:
             prior = policy.exchanged if what == "mirrored" else policy.wheels
             figures = {"what": what, "value": value}
             yield Explanation(gain - null + float(np.log(prior)), "wheels-against-ranges", figures)
-        pairs = np.array([[self.same(k, other, still[None])[:, 0] for other in range(count)] for k in range(count)])
-        to = linear_sum_assignment(-pairs.max(axis=2))[1]
+        to, gain = self.exchanged(small)
         changed = [trace.anchor for k, trace in zip(to, self.before, strict=True) if self.after[k].anchor != trace.anchor]
         # The number of cycles of so many of the anchors.
-        cycles = gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
-        gain = float(pairs[np.arange(count), to].sum(axis=0).max() - cycles)
+        gain -= gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
         unordered = (self.nothing[:1, :, None] + self.sides[1:], self.sides[:1] + self.nothing[1:, :, None])
         nowhere = float(np.concatenate(unordered).sum(axis=1).max())
-        for what, odds in (("exchanged", gain if changed else -np.inf), ("no distances", nowhere)):
-            named = {"what": what, "anchors": changed}
-            yield Explanation(odds - null + float(np.log(policy.exchanged)), "exchanged-names", named)
+        prior, kind = float(np.log(policy.exchanged)) - null, "exchanged-names"
+        if changed:
+            names = {self.after[k].anchor: trace.anchor for k, trace in zip(to, self.before, strict=True)}
+            yield Explanation(gain + prior, kind, {"what": "exchanged", "anchors": changed}, names=names)
+        yield Explanation(nowhere + prior, kind, {"what": "no distances", "anchors": changed})
 
 
 def _best_stretch(gains: Floats) -> tuple[float, int, int]:
