@@ -1,12 +1,19 @@
 """What all tests share: the slow marker, one BLAS thread, hypothesis without clocks, recordings kept elsewhere."""
 
+import gc
 import os
 import signal
+import sys
 import time
 from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests start Python some hundred times; compiling everything each time is a sixth of their work.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+# All that is collected lives to the end: looking for cycles in it over and over would be a tenth of the work.
+gc.disable()
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -47,6 +54,11 @@ def pytest_collection_modifyitems(config, items):
     kept = set(map(id, chosen))
     config.hook.pytest_deselected(items=[item for item in items if id(item) not in kept])
     items[:] = chosen
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_configure(config):
