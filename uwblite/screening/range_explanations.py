@@ -325,8 +325,8 @@ class Moment:
     def exchanged(self, motions: Floats) -> tuple[Ints, float]:
         """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3); its log likelihood."""
         each = np.arange(len(self.names))
-        pairs = self.same(*np.indices((len(each), len(each))).reshape(2, -1), motions).max(axis=0)
-        pairs = pairs.reshape(len(each), len(each), len(motions))
+        k, other = np.indices((len(each), len(each))).reshape(2, -1)
+        pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
         orders = [linear_sum_assignment(-pairs[:, :, m])[1] for m in range(len(motions))]
         best = int(np.argmax([pairs[each, order, m].sum() for m, order in enumerate(orders)]))
         return orders[best], self.refined(motions[best : best + 1], self.policy.usual_motion, names=orders[best])[1]
