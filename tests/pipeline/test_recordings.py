@@ -23,7 +23,7 @@ ROOM = box(14, 11)
 LEVEL = SensorMounting(anchor_height=0.0)
 
 
-def drive(seed, places=PLACES, *, lidar=True, start=0.0, turn=0.0, length=28.0, mounting=LEVEL):
+def drive(seed, places=PLACES, *, lidar=True, start=0.0, turn=0.0, length=22.0, mounting=LEVEL):
     """A recording of the room and its truth; its odometry begins in a frame of its own."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, length)
