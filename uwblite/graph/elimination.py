@@ -34,7 +34,7 @@ MOST_WORK = 4e9
 """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
 any poses and any others, however few, fill the whole matrix."""
 _LITTLE_WORK = 4e8
-"""Multiplications in the envelope of a band up to which those of a sparser order are not counted, which takes as long as half of a
+"""Multiplications in the envelope of a band up to which those of a sparser order are not counted: that takes half as long as a
 factorisation."""
 PER_COMPLEX = 4
 """Multiplications in one of complex numbers."""

@@ -223,7 +223,7 @@ class Placement:
         return motions
 
     def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
-        """Return the likelier place (e) of each pair, by sound wheels or after a slip, its covariance (e, 3, 3) and probability (e,).
+        """Return of each pair the likelier place (e), of sound wheels or after a slip, covariance (e, 3, 3), probability (e,).
 
         Parameters
         ----------
@@ -370,7 +370,7 @@ def of_fallible(log_odds: Floats, wrong: float) -> Floats:
 
 
 def odds_by_views(here: Floats, there: Floats) -> Floats:
-    """Return the log odds (n,) for places against one, by the log of their evidence there (v, n) and of its here (v, 1) in views.
+    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views.
 
     A view may show nothing of either, and favour the false one.
     """
