@@ -86,6 +86,21 @@ def test_names_exchanged_half_way_are_named(seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
+def test_names_exchanged_on_a_path_that_drifts_are_no_fault_of_the_wheels(seed):
+    """Moments before and after the exchange see it on one side, where no path explains it; it is one cause."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 120.0)
+    wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.02, turn_noise=0.08)
+    anchors = np.concatenate([CORNERS[:, :2], [[3.0, -6.0], [-5.0, 2.0]]])
+    radio = planted.ranges(rng, stamps, truth, anchors, rate=2.0, sigma=0.05, outliers=0.1)
+    other = np.where(radio.stamps > 60.0, (radio.anchor + 1) % len(anchors), radio.anchor)
+    facts = explained_by_ranges(SensorLog(wheels, replace(radio, anchor=other), None))[1]
+    exchanged = [fact for fact in facts if fact.kind == "exchanged-names"]
+    assert [set(fact.figures["anchors"]) for fact in exchanged] == [set(radio.anchor_ids)]
+    assert [fact for fact in facts if abs(fact.figures["at"] - 60.0) < 15.0] == exchanged
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_ranges_that_are_any_numbers_from_half_time_are_no_fault_of_the_wheels(seed):
     log, rng = late_by(0.0, seed), np.random.default_rng(seed)
     radio = log.ranges

@@ -74,8 +74,8 @@ class Backlog:
 
     def deadline(self) -> float | None:
         """Return the time at which events that wait need not do so any longer, s."""
-        latest_first = (held for held in reversed(self._waiting[-MEMORY:]) if held.spacing is not None)
-        frames = [(held.event.stamp, held.spacing) for held in islice(latest_first, FAST)]
+        latest_first = reversed(self._waiting[-MEMORY:])
+        frames = list(islice(((held.event.stamp, held.spacing) for held in latest_first if held.spacing is not None), FAST))
         if not frames:
             return None
         return float(frames[-1][0] + min(LOOK * frames[0][1], MOST_LOOK))

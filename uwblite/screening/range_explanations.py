@@ -99,6 +99,8 @@ class Explanation:
     begin: float = 0.0
     end: float = np.inf
     """Way, m, on which it changes something."""
+    names: dict[str, str] = field(default_factory=dict)
+    """What anchors are called before the moment by what they are called after it."""
 
 
 def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> tuple[SensorLog, list[Fact]]:
@@ -112,8 +114,34 @@ def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> 
         left = _at_moments(in_time, _traces(in_time, policy), policy)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
-            return in_time, [Fact.of(late.kind, **late.figures), *_facts(left, in_time)]
-    return log, _facts([ways, *moments], log)
+            return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left, policy), in_time)]
+    return log, _facts([ways, *_with_names_undone(log, moments, policy)], log)
+
+
+def _with_names_undone(log: SensorLog, rows: list[Explanation], policy: RangePolicy) -> list[Explanation]:
+    """Return the rows without those that the exchange of names explains: with the names exchanged back they are no more.
+
+    An exchange contradicts the path, too, at moments somewhat before it and after it, where it is on one side: what holds there
+    of two explanations of the same readings shows in what either leaves.
+    """
+    exchanges = [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong]
+    for row in sorted(exchanges, key=lambda row: -row.log_odds):
+        near = [other for other in rows if other.begin < row.end and row.begin < other.end]
+        undone = _with_names(log, 0.5 * (row.begin + row.end), row.names)
+        left = _at_moments(undone, _traces(undone, policy), policy, row)
+        if row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+            rows = [row, *left, *(other for other in rows if other not in near)]
+            log = undone
+    return rows
+
+
+def _with_names(log: SensorLog, way: float, names: dict[str, str]) -> SensorLog:
+    """Return the recording with anchors of other names from a moment on, given by the way, m."""
+    ranges = log.ranges
+    assert ranges is not None
+    at = np.interp(way, log.odometry.travelled, log.odometry.stamps)
+    others = np.array([ranges.anchor_ids.index(names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
+    return replace(log, ranges=replace(ranges, anchor=np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)))
 
 
 def _most(rows: Sequence[Explanation]) -> float:
@@ -188,14 +216,22 @@ def _over_stretches(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy
     return clock, Explanation(odds - null + float(costs), "wheels-against-ranges", other_ways, float(edges[a]), end)
 
 
-def _at_moments(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy) -> list[Explanation]:
+def _at_moments(
+    log: SensorLog, traces: Sequence[Trace], policy: RangePolicy, near: Explanation | None = None
+) -> list[Explanation]:
     """Return names that are exchanged, and paths that go on elsewhere, from a moment on.
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment.
+
+    Parameters
+    ----------
+    near : only moments whose stretches overlap with those of this one.
     """
     odometry, half, every = log.odometry, policy.stretch, 0.25 * policy.stretch
     longest, found = max(float(trace.ranges.max(initial=0.0)) for trace in traces), list[Explanation]()
-    for at in np.arange(half, float(odometry.travelled[-1]) - half, every):
+    for at in np.arange(half, float(odometry.travelled[-1]) - half, every).tolist():
+        if near is not None and (at + half <= near.begin or near.end <= at - half):
+            continue
         origin = se2.inverse(odometry.at(np.array([np.interp(at, odometry.travelled, odometry.stamps)]))[0])
         sides = [(trace.between(at - half, at, origin), trace.between(at, at + half, origin)) for trace in traces]
         sides = [side for side in sides if min(len(trace.ranges) for trace in side) >= policy.fewest]
@@ -259,10 +295,11 @@ class Moment:
         """(a, g) log likelihoods of the readings to two places each."""
         return np.asarray(self.sides.sum(axis=0))
 
-    def likely(self, motions: Floats, sign: float = 1.0) -> Floats:
-        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not."""
+    def likely(self, motions: Floats, sign: float = 1.0, names: Ints | None = None) -> Floats:
+        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not, and of anchors that are others
+        (a,) after the moment."""
         each = np.arange(len(self.names))
-        return np.asarray(self.same(each, each, motions, sign).sum(axis=1).max(axis=0))
+        return np.asarray(self.same(each, each if names is None else names, motions, sign).sum(axis=1).max(axis=0))
 
     def same(self, k: Ints, other: Ints, motions: Floats, sign: float = 1.0) -> Floats:
         """Return log likelihoods (g, p, m) of anchors k (p,) before the moment being others (p,) after it, moved or not."""
@@ -272,17 +309,27 @@ class Moment:
         ranges = np.concatenate([one.ranges[k], two.ranges[other]], axis=1)[:, None]
         counted = np.concatenate([one.counted[k], two.counted[other]], axis=1)[:, None]
         likely = _best_place(np.concatenate([still, moved], axis=2), ranges, counted, self.policy)
-        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + self.alone[k].T[:, :, None]))
+        apart = self.sides[0, k] + self.sides[1, other]
+        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + apart.T[:, :, None]))
 
-    def refined(self, motions: Floats, size: float, sign: float = 1.0) -> tuple[Floats, float]:
+    def refined(self, motions: Floats, size: float, sign: float = 1.0, names: Ints | None = None) -> tuple[Floats, float]:
         """Return the best motion (3,) about the best of some (m, 3), within a size, m, coarse to fine; its log likelihood."""
-        best = motions[np.argmax(self.likely(motions, sign))]
+        best = motions[np.argmax(self.likely(motions, sign, names))]
         around = np.stack(np.meshgrid(*3 * [np.array([-0.5, 0.0, 0.5])]), axis=-1).reshape(-1, 3)
         for reach in size * 0.5 ** np.arange(np.log2(size / self.policy.usual_motion) + 3.0):
             tried = best + around * reach
-            likely = self.likely(tried, sign)
+            likely = self.likely(tried, sign, names)
             best = tried[np.argmax(likely)]
         return best, float(likely.max())
+
+    def exchanged(self, motions: Floats) -> tuple[Ints, float]:
+        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3); its log likelihood."""
+        each = np.arange(len(self.names))
+        k, other = np.indices((len(each), len(each))).reshape(2, -1)
+        pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
+        orders = [linear_sum_assignment(-pairs[:, :, m])[1] for m in range(len(motions))]
+        best = int(np.argmax([pairs[each, order, m].sum() for m, order in enumerate(orders)]))
+        return orders[best], self.refined(motions[best : best + 1], self.policy.usual_motion, names=orders[best])[1]
 
     def rows(self) -> Iterator[Explanation]:
         """Yield what explains a change; nothing where nothing could: with all anchors at any place the path is no likelier."""
@@ -293,7 +340,7 @@ class Moment:
         sound = float(self.alone.sum(axis=0).max()) - EvidencePolicy.very_strong
         if float(self.likely(small).max()) > sound:
             return
-        still, null = self.refined(small, policy.usual_motion)
+        null = self.refined(small, policy.usual_motion)[1]
         if null > sound:
             return
         large = self.likely(turns[~usual, None] * turn)
@@ -301,7 +348,7 @@ class Moment:
         rows = [("turned", turned, float(np.degrees(turns[~usual][np.argmax(large)])))]
         unknown = (self.driven[:1] + self.sides[1:], self.sides[:1] + self.driven[1:], self.driven.sum(axis=0)[None])
         rows += [("turns", float(np.concatenate(unknown).sum(axis=1).max()), 0.0)]
-        rows += [("mirrored", float(self.likely(small, -1.0).max()), 0.0)]
+        rows += [("mirrored", self.refined(small, policy.usual_motion, -1.0)[1], 0.0)]
         free = 1.5 * np.log(self.before.counted.sum() + self.after.counted.sum())
         rows += [("elsewhere", self.refined(any_turn, policy.stretch)[1] - free, 0.0)]
         rows += [("mirrored", self.refined(any_turn, policy.stretch, -1.0)[1] - free, 0.0)]
@@ -309,17 +356,17 @@ class Moment:
             prior = policy.exchanged if what == "mirrored" else policy.wheels
             figures = {"what": what, "value": value}
             yield Explanation(gain - null + float(np.log(prior)), "wheels-against-ranges", figures)
-        pairs = self.same(*np.indices((count, count)).reshape(2, -1), still[None]).reshape(-1, count, count)
-        to = linear_sum_assignment(-pairs.max(axis=0))[1]
+        to, gain = self.exchanged(small)
         changed = [name for k, name in zip(to, self.names, strict=True) if self.names[k] != name]
         # The number of cycles of so many of the anchors.
-        cycles = gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
-        gain = float(pairs[:, np.arange(count), to].sum(axis=1).max() - cycles)
+        gain -= gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
         unordered = (self.nothing[:1, :, None] + self.sides[1:], self.sides[:1] + self.nothing[1:, :, None])
         nowhere = float(np.concatenate(unordered).sum(axis=1).max())
-        for what, odds in (("exchanged", gain if changed else -np.inf), ("no distances", nowhere)):
-            named = {"what": what, "anchors": changed}
-            yield Explanation(odds - null + float(np.log(policy.exchanged)), "exchanged-names", named)
+        prior, kind = float(np.log(policy.exchanged)) - null, "exchanged-names"
+        if changed:
+            names = {self.names[k]: name for k, name in zip(to, self.names, strict=True)}
+            yield Explanation(gain + prior, kind, {"what": "exchanged", "anchors": changed}, names=names)
+        yield Explanation(nowhere + prior, kind, {"what": "no distances", "anchors": changed})
 
 
 def _best_stretch(gains: Floats) -> tuple[float, int, int]:
