@@ -29,10 +29,9 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     former = np.concatenate([_former(a, b, config, old.delay) for a, b in pairs])
     changed = [np.flatnonzero(former[b.rows] < 0) for b in after.each]
     parts = [p for r, which in zip(after.each, changed, strict=True) for p in _blocks(r, which, config, old.delay)]
-    new = _with_raster(replace(clouds.joined(parts), work=old.clouds.work), config, old.delay)
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
-    both = replace(clouds.joined([old.clouds, new.clouds]), work=old.clouds.work).chosen(place)
-    return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay)
+    both = clouds.joined([old.clouds, *parts]).chosen(place)
+    return _with_raster(replace(both, work=old.clouds.work), config, old.delay)
 
 
 def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
