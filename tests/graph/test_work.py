@@ -14,11 +14,11 @@ from uwblite.mapping import build_map
 
 USUAL = {
     "all sensors": {
-        "factorisations": 134, "factor entries": 2_567_443, "products": 5_474_907, "points": 85_360,
+        "factorisations": 122, "factor entries": 2_567_443, "products": 5_116_798, "points": 85_360,
         "look-ups": 1_693_870, "rays": 749_090,
     },
     "no lidar": {
-        "factorisations": 69, "factor entries": 680_480, "products": 1_889_153,
+        "factorisations": 59, "factor entries": 591_590, "products": 1_666_339,
     },
     "no ranges": {
         "points": 89_882, "products": 1_031_901, "look-ups": 1_936_910, "factorisations": 41,
