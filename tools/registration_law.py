@@ -1,7 +1,8 @@
 """The law of registration: of placements that are called right with probability p, a share p is right.
 
 Pairs of clouds of one recording are registered with priors drawn about their true relative poses: most within the noise of the
-wheels, some where these slipped. Each placement has a probability; the truth says whether it is right.
+wheels, some where these slipped. Each placement has a probability; the truth says whether it is right. Clouds that show nothing
+of each other there are not placed: the prior stands.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from trials import table
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.object_likelihood import ObjectLikelihood, pairs_of
+from uwblite.lidar.object_likelihood import ObjectLikelihood, ObjectPolicy, pairs_of
+from uwblite.lidar.pair_alignment import align_pairs
 from uwblite.lidar.registration import Prior, register
 
 Floats = NDArray[np.float64]
@@ -36,6 +38,8 @@ class Placements:
     """(e,) of being right."""
     right: NDArray[np.bool_]
     """(e,)."""
+    unplaced: int
+    """Number of pairs that show nothing of each other."""
 
     def lines(self, name: str) -> list[list[object]]:
         """Return for each bin: the name, the bin, pairs, mean probability and the share that is right."""
@@ -64,19 +68,22 @@ def placements(clouds: Clouds, truth: Floats, apart: int, rng: np.random.Generat
     sound = np.broadcast_to(np.diag(SOUND**2), (len(i), 3, 3)).copy()
     pairs = pairs_of(clouds, i, i + apart)
     objects = ObjectLikelihood.of(clouds, rasterize(clouds, 0.1, 0.5), 0.02, pairs, step)
-    found = register(objects, pairs, Prior(mean, sound, sound + np.diag(SLIPPED**2)), mean)
-    posterior = found.posterior(SLIPS)
-    placed = found.chosen((posterior[1] > posterior[0]).astype(np.float64))
+    ended = align_pairs(clouds, objects.raster, i, mean, pairs.points, 0.5, ObjectPolicy.gate).pose
+    objects = objects.learnt(pairs, ended)
+    wide = np.broadcast_to(SLIPPED, mean.shape)
+    prior = Prior.about(mean, sound, wide, wide)
+    placed, covariance, probability = register(objects, pairs, prior, ended).posterior(SLIPS)
     off = se2.between(step, placed.pose)
-    covariance = placed.covariance + error**2 * np.eye(3)
-    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0])
-    return Placements(posterior[:2].max(axis=0), squared < CHI2)
+    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance + error**2 * np.eye(3), off[:, :, None])[:, :, 0])
+    return Placements(probability[placed.shown], squared[placed.shown] < CHI2, int(np.sum(~placed.shown)))
 
 
 def report(rows: list[tuple[str, Placements]]) -> str:
     """Return the calibration curve of recordings by name, of all together, and the log scores."""
-    every = Placements(*(np.concatenate([getattr(p, name) for _, p in rows]) for name in ("probability", "right")))
+    parts = (np.concatenate([getattr(p, name) for _, p in rows]) for name in ("probability", "right"))
+    every = Placements(*parts, sum(p.unplaced for _, p in rows))
     lines = [line for name, each in [*rows, ("all", every)] for line in each.lines(name)]
     scores = ", ".join(f"{name} {each.log_score:.3f}" for name, each in [*rows, ("all", every)])
     head = ["recording", "called right with", "pairs", "mean of that", "share right"]
-    return f"{table(head, lines)}\nLog score: {scores}.\n"
+    unplaced = ", ".join(f"{name} {each.unplaced}" for name, each in [*rows, ("all", every)])
+    return f"{table(head, lines)}\nPairs that show nothing of each other: {unplaced}.\n\nLog score: {scores}.\n"

@@ -9,7 +9,16 @@ from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
 from uwblite.lidar.object_likelihood import ObjectLikelihood, matched_by_chance, objects, pairs_of
-from uwblite.lidar.registration import Gaussian, Prior, RegistrationConfig, of_fallible, placed_again, register, search
+from uwblite.lidar.registration import (
+    Gaussian,
+    Prior,
+    RegistrationConfig,
+    odds_by_views,
+    of_fallible,
+    register,
+    search,
+    with_neighbours,
+)
 from uwblite.odometry.slips import FalseMotions
 
 SIGMA = 0.02
@@ -25,8 +34,13 @@ def compared(clouds, mean):
 def registered(clouds, mean, sound=SOUND, slipped=SLIPPED):
     """Register cloud 1 in cloud 0 where the odometry counts a motion."""
     (seen, pairs), covariance = compared(clouds, mean), np.diag(sound**2)[None]
-    prior = Prior(np.array([mean]), covariance, covariance + np.diag(slipped**2))
-    return seen, pairs, prior, register(seen, pairs, prior, prior.mean)
+    prior = Prior.about(np.array([mean]), covariance, slipped[None], slipped[None])
+    return seen, pairs, prior, register(seen, pairs, prior, prior.sound.mean)
+
+
+def after_slip(found):
+    """Return where the source lies if the wheels slipped."""
+    return found.likeliest(found.prior.slipped)[0].pose[0]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +56,7 @@ def test_clouds_tell_a_slip_from_none(room, slip, sign):
     *_, found = registered(clouds, step + slip)
     # As sure as a pair of clouds can be: it is wrong with the probability `useless`.
     assert sign * found.log_odds()[0] == pytest.approx(np.log(1.0 / RegistrationConfig.useless - 1.0), rel=1e-3)
-    (pose,) = found.chosen(np.array([float(sign > 0)])).pose
+    pose = after_slip(found) if sign > 0 else found.sound.pose[0]
     assert np.abs(se2.between(step, pose)).max() < 0.015
 
 
@@ -61,7 +75,7 @@ def test_a_search_is_no_wider_than_clouds_can_overlap(room):
     step = se2.between(truth[0], truth[1])
     *_, found = registered(clouds, np.array([24.0, -3.0, 0.4]), slipped=np.array([24.5, 24.5, 0.6]))
     assert found.log_odds()[0] > 0.0
-    assert np.abs(se2.between(step, found.slipped.pose[0])).max() < 0.015
+    assert np.abs(se2.between(step, after_slip(found))).max() < 0.015
 
 
 def test_what_is_measured_leaves_the_prior_out(room):
@@ -79,18 +93,19 @@ def test_the_evidence_is_that_of_numerical_integration(room):
     """Laplace's approximation, within half a unit of the sum over a grid; the likelihood's constant cancels in neither."""
     truth, clouds = room
     seen, pairs, prior, found = registered(clouds, se2.between(truth[0], truth[1]))
-    mode, spread = found.sound.pose[0], np.sqrt(np.diag(found.sound.covariance[0]))
+    mode, covariance = found.sound.pose[0], found.sound.covariance(prior.sound)[0]
     axis = np.linspace(-5.0, 5.0, 13)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    shifts = grid @ np.linalg.cholesky(found.sound.covariance[0]).T
+    shifts = grid @ np.linalg.cholesky(covariance).T
     log = seen.log_likelihood(pairs.rows(np.zeros(len(grid), dtype=np.intp)), mode + shifts)
-    off = mode + shifts - prior.mean
-    information = np.linalg.inv(prior.covariance[0])
+    off = mode + shifts - prior.sound.mean
+    information = np.linalg.inv(prior.sound.covariance[0])
     log -= 0.5 * np.einsum("gi,ij,gj->g", off, information, off) + 1.5 * np.log(2.0 * np.pi)
-    log -= 0.5 * np.linalg.slogdet(prior.covariance[0])[1]
-    cell = (axis[1] - axis[0]) ** 3 * np.sqrt(np.linalg.det(found.sound.covariance[0]))
-    assert found.sound.evidence[0] == pytest.approx(np.log(np.sum(np.exp(log - log.max())) * cell) + log.max(), abs=0.7)
-    assert spread.max() < SOUND.max()
+    log -= 0.5 * np.linalg.slogdet(prior.sound.covariance[0])[1]
+    cell = (axis[1] - axis[0]) ** 3 * np.sqrt(np.linalg.det(covariance))
+    whole = np.log(np.sum(np.exp(log - log.max())) * cell) + log.max()
+    assert found.sound.evidence(prior.sound)[0] == pytest.approx(whole, abs=0.7)
+    assert np.sqrt(np.diag(covariance)).max() < SOUND.max()
 
 
 def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
@@ -101,10 +116,10 @@ def test_a_near_thing_that_moves_does_not_take_the_step_with_it():
     before = scanned(truth[:1], np.concatenate([walls, thing]), 0.005, 1)
     after = scanned(truth[1:], np.concatenate([walls, thing + np.array([0.06, 0.0, 0.06, 0.0])]), 0.005, 2)
     clouds = joined([before, after])
-    seen, pairs, _, found = registered(clouds, truth[1])
+    seen, pairs, prior, found = registered(clouds, truth[1])
     assert found.log_odds()[0] < 0.0
     assert np.abs(se2.between(truth[1], found.sound.pose[0])).max() < 0.01
-    moving = seen.moving(pairs, found.sound.pose, found.sound.covariance)
+    moving = seen.moving(pairs, found.sound.pose, found.sound.covariance(prior.sound))
     x = clouds.points[:, 0] + truth[clouds.owner, 0]
     on_thing = (clouds.owner == 1) & (np.abs(x - 1.26) < 0.05) & (np.abs(clouds.points[:, 1]) < 0.85)
     assert moving[on_thing].mean() > 0.9
@@ -147,20 +162,20 @@ def test_the_other_steps_of_a_slip_place_a_cloud_where_its_surfaces_do_not():
     wall = np.array([[-50.0, 1.0, 50.0, 1.0]])
     clouds = scanned(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), wall)
     seen, pairs, prior, found = registered(clouds, np.array([0.4, 0.0, 0.2]))
-    assert found.slipped.pose[0, 0] == pytest.approx(0.4, abs=0.05)
-    sigma = np.sqrt(np.diag(prior.slipped[0]))
+    assert after_slip(found)[0] == pytest.approx(0.4, abs=0.05)
+    sigma = np.sqrt(np.diag(prior.slipped.covariance[0]))
     matrix = 400.0 * np.eye(3)[None]
     expected = FalseMotions(matrix @ (np.array([-0.3, 0.0, -0.2]) / sigma), matrix)
-    again = placed_again(seen, pairs, found, prior, expected)
-    assert np.abs(again.slipped.pose[0] - [0.1, 0.0, 0.0]).max() < 0.02
+    again = with_neighbours(seen, pairs, found, expected)
+    assert np.abs(after_slip(again) - [0.1, 0.0, 0.0]).max() < 0.02
 
 
 def test_clouds_without_surfaces_leave_the_prior_as_it_is():
     truth = np.zeros((2, 3))
-    *_, found = registered(scanned(truth, ROOM + 100.0), [0.3, 0.0, 0.1])
+    *_, prior, found = registered(scanned(truth, ROOM + 100.0), [0.3, 0.0, 0.1])
     assert found.log_odds().tolist() == [0.0]
     np.testing.assert_allclose(found.sound.pose, [[0.3, 0.0, 0.1]])
-    np.testing.assert_allclose(found.sound.covariance[0], np.diag(SOUND**2), rtol=1e-9)
+    np.testing.assert_allclose(found.sound.covariance(prior.sound)[0], np.diag(SOUND**2), rtol=1e-9)
     assert not found.sound.measured(SIGMA**2)[1].any()
 
 
@@ -201,16 +216,42 @@ def test_of_placements_called_right_with_a_probability_that_share_is_right():
     assert registration_law.report([("walk", law)]).count("walk |") >= 2
 
 
-def test_probabilities_of_modes_are_those_of_their_evidence(room):
-    """They add up to one; the likelier mode has most, and none of them more than one pair of clouds can be trusted."""
+def test_the_likelier_place_has_the_probability_of_its_evidence(room):
+    """No more than one pair of clouds can be trusted; where clouds show nothing, that of the prior."""
     truth, clouds = room
-    step = se2.between(truth[0], truth[1])
-    for slip, mode in ((np.zeros(3), 0), (np.array([0.25, 0.0, 0.2]), 1)):
+    step, certain = se2.between(truth[0], truth[1]), 1.0 - RegistrationConfig.useless
+    for slip in (np.zeros(3), np.array([0.25, 0.0, 0.2])):
         *_, found = registered(clouds, step + slip)
-        probability = found.posterior(0.01)[:, 0]
-        assert probability.sum() == pytest.approx(1.0)
-        assert np.argmax(probability) == mode
-        assert probability[mode] == pytest.approx(1.0 - RegistrationConfig.useless, abs=0.01)
+        place, _, probability = found.posterior(0.01)
+        assert np.abs(se2.between(step, place.pose[0])).max() < 0.015
+        assert probability[0] == pytest.approx(certain, abs=0.01)
+    *_, found = registered(scanned(np.zeros((2, 3)), ROOM + 100.0), step)
+    place, _, probability = found.posterior(0.2)
+    assert not place.shown[0]
+    assert probability[0] == pytest.approx(0.8 * certain**2, abs=0.01)
+
+
+def test_along_a_wall_of_scattered_normals_no_place_is_certain():
+    """The scatter feigns information along it, by which a place half a metre off the truth would be certain to centimetres."""
+    clouds = scanned(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), np.array([[-50.0, 1.0, 50.0, 1.0]]), 0.02, 3)
+    *_, found = registered(clouds, np.array([0.4, 0.0, 0.1]))
+    place, _ = found.likeliest(found.prior.slipped)
+    sigma = np.sqrt(np.diag(place.covariance(found.prior.slipped)[0]))
+    assert sigma[0] > 0.9 * np.hypot(SLIPPED[0], SOUND[0])
+    assert sigma[1:].max() < 0.02
+    assert place.pose[0, 0] == pytest.approx(0.4, abs=0.05)
+
+
+def test_views_outweigh_the_prior_each_by_itself():
+    """A place that fits by chance in all of them loses; a false view counts as one; they say no more than the best of them."""
+    here, bound = np.full((6, 1), -5.0), np.log(1.0 / RegistrationConfig.useless - 1.0)
+    chance, place, one = np.full(6, -8.0), np.full(6, 30.0), np.array([30.0, -8.0, -8.0, -8.0, -8.0, -8.0])
+    odds = odds_by_views(here, np.stack([chance, place, one], axis=1))
+    assert odds[0] < 0.0
+    assert odds[1] == pytest.approx(6.0 * bound, rel=1e-3)
+    assert odds[2] < bound
+    # Six views that each tell the places apart by one unit see the same.
+    assert odds_by_views(np.full((6, 1), 1.0), np.full((6, 1), 2.0))[0] == pytest.approx(1.0, abs=0.05)
 
 
 def test_evidence_that_may_be_wrong_is_bounded_and_keeps_its_sign():

@@ -98,6 +98,32 @@ def test_slips_are_found_by_a_search(walk):
     assert np.all(np.einsum("eii->ei", wheels.sqrt_information) < np.einsum("eii->ei", before))
 
 
+def test_of_steps_called_slipped_with_a_probability_that_share_slipped():
+    """Slips of six steps, each as long as others by luck or by a quarter of a metre; and placed clouds lie where they say."""
+    probability, slipped, squared = [], [], []
+    for seed in (20, 21):
+        truth, _, clouds = walked(seed, HALL, 40.0)
+        exact, rng = se2.between(truth[:-1], truth[1:]), np.random.default_rng(seed)
+        stated, slips = exact + rng.standard_normal(exact.shape) * NOISE, np.zeros(len(exact), dtype=bool)
+        for first in rng.integers(0, len(exact) - 8, 4):
+            stated[first : first + 6] += rng.standard_normal(3) * [0.25, 0.25, 0.2]
+            slips[first : first + 6] = True
+        found = tracked(truth, clouds, stated)
+        steps = found.steps
+        error = np.einsum("eij,ej->ei", steps.sqrt_information, se2.between(exact[steps.i], steps.T_i_j))
+        squared.append(np.sum(error**2, axis=1))
+        probability.append(found.slips)
+        slipped.append(slips)
+    p, slips = np.concatenate(probability), np.concatenate(slipped)
+    sure = p > 0.9
+    # Three standard deviations of a share.
+    assert slips[sure].mean() > p[sure].mean() - 3.0 * np.sqrt(0.05 * 0.95 / sure.sum())
+    assert sure[slips].mean() > 0.8
+    # What is missed is hardly larger than the noise of the wheels.
+    assert slips[p < 0.5].mean() < 0.03
+    assert np.mean(np.concatenate(squared) < 16.27) > 0.99
+
+
 def test_a_lost_message_is_told_by_the_clouds_before(walk):
     """Over one step of 10 ms the odometry misses 0.7 rad, more than any slip may last; the others are right."""
     truth, clouds, exact = walk

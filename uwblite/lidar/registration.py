@@ -20,6 +20,7 @@ from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..odometry.slips import FalseMotions
 from . import correlative_matching
 from .cloud_rasters import rasterize
+from .degeneracy import measured_part
 from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy
 from .raster_search import Window, best_poses
 from .scan_matching import PairFactors, nondegenerate_step, pair_points
@@ -31,6 +32,8 @@ class RegistrationConfig:
 
     first_gate: ClassVar[float] = 0.5
     """Farthest match at the beginning of the descent, m; the reach of the rasters."""
+    fewest: ClassVar[int] = 6
+    """Matches from which on a pose is measured: twice its unknowns."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
     same: ClassVar[float] = 16.27
@@ -65,25 +68,35 @@ class RegistrationConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prior(Table):
-    """What is known of e relative poses before their clouds are compared."""
+class Gaussian(Table):
+    """What is known of e relative poses before their clouds are compared, or one part of that."""
 
     mean: Floats
     """(e, 3) T_i_j."""
     covariance: Floats
-    """(e, 3, 3) of x, y, heading, where the odometry holds."""
-    slipped: Floats
-    """(e, 3, 3) where the wheels slipped."""
+    """(e, 3, 3) of x, y, heading."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gaussian(Table):
-    """One part of such a prior."""
+class Prior(Table):
+    """The parts of it."""
 
-    mean: Floats
-    """(e, 3) T_i_j."""
-    covariance: Floats
-    """(e, 3, 3)."""
+    sound: Gaussian
+    """Where the odometry holds."""
+    slipped: Gaussian
+    """Where the wheels slipped."""
+    lost: Gaussian
+    """Where a message of the odometry was lost, or the robot was carried."""
+
+    @classmethod
+    def about(cls, mean: Floats, sound: Floats, slip: Floats, loss: Floats) -> "Prior":
+        """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3).
+
+        Parameters
+        ----------
+        slip, loss : (e, 3) standard deviations of what is not counted while wheels slip or messages are lost, m, m, rad.
+        """
+        return cls(*(Gaussian(mean, sound + more[:, :, None] ** 2 * np.eye(3)) for more in (np.zeros_like(slip), slip, loss)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,19 +107,36 @@ class Placed(Table):
     """(e, 3) T_i_j."""
     factors: PairFactors
     """Of the matches there, objects that move left out."""
-    covariance: Floats
-    """(e, 3, 3) of the pose by matches and prior."""
-    evidence: Floats
-    """(e,) log marginal likelihood."""
+    information: Floats
+    """(e, 3, 3) of the pose by the matches, without what the scatter of normals feigns."""
     likelihood: Floats
     """(e,) log likelihood of the source there, by that in unknown space."""
-    evidence_lost: Floats
-    """(e,) by how much the log likelihood is below that of surfaces that all agree at the prior's mean."""
+    most: Floats
+    """(e,) the same where every point agreed."""
 
     @property
     def share(self) -> Floats:
         """(e,) share of the points looked up that match, 0..1."""
         return self.factors.matched / np.maximum(self.factors.asked, 1)
+
+    @property
+    def shown(self) -> Bools:
+        """(e,) whether so many points match that a pose follows from them."""
+        return np.asarray(self.factors.matched >= RegistrationConfig.fewest)
+
+    def covariance(self, prior: Gaussian) -> Floats:
+        """Return the covariance (e, 3, 3) of the poses by matches and prior."""
+        return np.asarray(np.linalg.inv(self.information + np.linalg.inv(prior.covariance)), dtype=np.float64)
+
+    def log_prior(self, prior: Gaussian) -> Floats:
+        """Return the log of a prior's density (e,), summed over the poses that the matches leave open."""
+        off = _difference(self.pose, prior.mean)
+        volume = np.linalg.slogdet(np.eye(3) + prior.covariance @ self.information)[1]
+        return np.asarray(-0.5 * (np.einsum("ei,ei->e", off, _solved(prior.covariance, off)) + volume))
+
+    def evidence(self, prior: Gaussian) -> Floats:
+        """Return the log marginal likelihood (e,) of the sources under a prior, by Laplace."""
+        return self.likelihood + self.log_prior(prior)
 
     def replaced(self, rows: Ints, others: "Placed", better: Bools) -> "Placed":
         """Return placements some rows (r,) of which are replaced by others (r,) where these are better (r,)."""
@@ -133,16 +163,40 @@ class Placed(Table):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """The modes of e pairs, one for each part of the prior; where a slip was not worth a search, both are the same."""
+    """Candidates for the places of e pairs."""
 
-    sound: Placed
-    """Where the odometry holds."""
-    slipped: Placed
-    """Where the wheels slipped."""
+    prior: Prior
+    """Of the pairs."""
+    candidates: Placed
+    """(n) places; the first of each pair, in their order, is that where the odometry holds."""
+    pair: Ints
+    """(n,) whose they are."""
     bound: Floats
     """(e,) most that the log of the evidence for a slip by that against it can be, for pairs for which none was sought."""
     searched: Ints
     """Pairs (s,) for which a slip was sought."""
+
+    @property
+    def sound(self) -> Placed:
+        """(e) where the odometry holds."""
+        return self.candidates.rows(slice(0, len(self.bound)))
+
+    def followed_by(self, pair: Ints, candidates: Placed) -> "Placement":
+        """Return the placement with further candidates (m) of some pairs (m,)."""
+        return replace(
+            self, candidates=concatenated([self.candidates, candidates]), pair=np.concatenate([self.pair, pair])
+        )
+
+    def best(self, score: Floats) -> Ints:
+        """Return the candidate (e,) of each pair with the largest of some scores (n,)."""
+        order = np.lexsort((np.arange(len(score)), -score, self.pair))
+        return np.asarray(order[np.searchsorted(self.pair[order], np.arange(len(self.bound)))])
+
+    def likeliest(self, part: Gaussian) -> tuple[Placed, Floats]:
+        """Return the likeliest candidates (e) under a part of the prior, and the log of their evidence (e,)."""
+        evidence = self.candidates.evidence(part.rows(self.pair))
+        which = self.best(evidence)
+        return self.candidates.rows(which), evidence[which]
 
     def log_odds(self, more: Floats | float = 0.0) -> Floats:
         """Return the log of the evidence (e,) for a slip by that against it; 0 where the clouds say nothing.
@@ -151,54 +205,42 @@ class Placement:
         ----------
         more : (e,) what adds to the evidence of a slip over each.
         """
-        none, rows, odds = np.log(RegistrationConfig.useless), self.searched, self.bound.copy()
-        more = np.broadcast_to(more, odds.shape)[rows]
-        slipped, sound = self.slipped.evidence[rows] + more, self.sound.evidence[rows]
-        odds[rows] = np.logaddexp(slipped, none) - np.logaddexp(sound, none)
-        return of_fallible(odds, RegistrationConfig.useless)
+        sound, slipped = (self.likeliest(part)[1] for part in (self.prior.sound, self.prior.slipped))
+        odds = of_fallible(self.bound, RegistrationConfig.useless)
+        odds[self.searched] = odds_by_views(sound[None], (slipped + more)[None])[self.searched]
+        return odds
 
-    def false_motions(self, prior: Prior, variance: float) -> FalseMotions:
-        """Return what the matches show of the wheels' false motions; nothing of pairs that were not searched.
-
-        Parameters
-        ----------
-        prior : with which they were placed. variance : of a match, m^2.
-        """
-        own, slipped = prior.rows(self.searched), self.slipped.rows(self.searched)
-        motions = FalseMotions(np.zeros_like(prior.mean), np.zeros_like(prior.slipped))
-        sigma = np.sqrt(np.einsum("eii->ei", own.slipped))
-        hessian = slipped.factors.hessian / (variance * ObjectPolicy.correlation)
+    def false_motions(self) -> FalseMotions:
+        """Return what the matches show of the wheels' false motions; nothing of pairs that were not searched."""
+        rows, part = self.searched, self.prior.slipped.rows(self.searched)
+        slipped = self.likeliest(self.prior.slipped)[0].rows(rows)
+        motions = FalseMotions(np.zeros_like(self.prior.slipped.mean), np.zeros_like(self.prior.slipped.covariance))
+        sigma = np.sqrt(np.einsum("eii->ei", part.covariance))
         # Matches and prior hold the pose in balance.
-        pull = np.einsum("eij,ej->ei", hessian + np.linalg.inv(own.slipped), _difference(slipped.pose, own.mean))
-        motions.vector[self.searched] = sigma * pull
-        motions.matrix[self.searched] = sigma[:, :, None] * hessian * sigma[:, None, :]
+        hessian = slipped.information + np.linalg.inv(part.covariance)
+        motions.vector[rows] = sigma * np.einsum("eij,ej->ei", hessian, _difference(slipped.pose, part.mean))
+        motions.matrix[rows] = sigma[:, :, None] * slipped.information * sigma[:, None, :]
         return motions
 
-    def posterior(self, slips: float) -> Floats:
-        """Return the probabilities (3, e) that pairs lie at the sound mode, at that of a slip if that is another place, and at
-        none of these.
+    def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
+        """Return the likelier place (e) of each pair, sound or slipped, with its covariance (e, 3, 3) and probability (e,).
 
         Parameters
         ----------
         slips : probability of a slip beforehand.
         """
         useless = RegistrationConfig.useless
-        parts = np.stack([
-            np.log((1.0 - useless) * (1.0 - slips)) + self.sound.evidence,
-            np.log((1.0 - useless) * slips) + self.slipped.evidence,
-            np.full(len(self.bound), np.log(useless)),
-        ])
+        (sound, usual), (slipped, wide) = (self.likeliest(part) for part in (self.prior.sound, self.prior.slipped))
+        of_sound, of_slip = np.log1p(-slips) + usual, np.log(slips) + wide
+        every = np.logaddexp(np.logaddexp(of_sound, of_slip), np.log(useless / (1.0 - useless)))
+        narrow, broad = sound.covariance(self.prior.sound), slipped.covariance(self.prior.slipped)
+        off, slid = _difference(slipped.pose, sound.pose), of_slip > of_sound
+        spread = np.linalg.solve(narrow, broad + off[:, :, None] * off[:, None, :])
+        same = np.einsum("eii->e", spread) < RegistrationConfig.same
+        likely = np.where(same, np.logaddexp(of_sound, of_slip), np.maximum(of_sound, of_slip)) - every
+        place = sound.replaced(np.arange(len(same)), slipped, slid)
         # Any of them may be favoured falsely, however much.
-        likely = np.exp(parts - np.logaddexp.reduce(parts, axis=0))
-        off = _difference(self.slipped.pose, self.sound.pose)
-        both = self.sound.covariance + self.slipped.covariance
-        same = np.einsum("ei,ei->e", off, np.linalg.solve(both, off[:, :, None])[:, :, 0]) < RegistrationConfig.same
-        likely[:2] = np.where(same, np.stack([likely[:2].sum(axis=0), np.zeros(len(same))]), likely[:2])
-        return np.asarray((1.0 - useless) * likely + useless * np.array([[0.0], [0.0], [1.0]]))
-
-    def chosen(self, probability: Floats) -> Placed:
-        """Return the likelier mode of each pair, slips having a probability (e,)."""
-        return self.sound.replaced(np.arange(len(probability)), self.slipped, probability > 0.5)
+        return place, np.where(slid[:, None, None], broad, narrow), (1.0 - useless) * np.exp(likely)
 
 
 Starts = Callable[[ObjectLikelihood, CloudPairs, Gaussian], list[Floats]]
@@ -213,36 +255,36 @@ def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: 
     other : (e, 3) further poses to start from.
     """
     c = RegistrationConfig
-    sound = descend(objects, pairs, prior.mean, Gaussian(prior.mean, prior.covariance))
-    log_odds = np.where(sound.factors.asked > 0, _most_odds(objects, sound, prior), 0.0)
-    rows = np.flatnonzero((log_odds > np.log(c.worth)) & (sound.factors.asked > 0))
-    some, wide = pairs.rows(rows), Gaussian(prior.mean[rows], prior.slipped[rows])
+    sound = descend(objects, pairs, prior.sound.mean, prior.sound)
+    bound = np.where(sound.factors.asked > 0, _most_odds(sound, prior), 0.0)
+    rows = np.flatnonzero((bound > np.log(c.worth)) & (sound.factors.asked > 0))
+    some, wide = pairs.rows(rows), prior.slipped.rows(rows)
     slipped = descend(objects, some, other[rows], wide)
     for least, starts in ((c.good_share, _shares), (c.least_share, _searched)):
         poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
-        found = _from_best(objects, some.rows(poor), wide.rows(poor), starts)
-        slipped = slipped.replaced(poor, found, found.evidence > slipped.evidence[poor])
-    slipped = sound.replaced(rows, slipped, np.ones(len(rows), dtype=bool))
-    return Placement(sound, slipped, log_odds, rows)
+        found, part = _from_best(objects, some.rows(poor), wide.rows(poor), starts), wide.rows(poor)
+        slipped = slipped.replaced(poor, found, found.evidence(part) > slipped.rows(poor).evidence(part))
+    return Placement(prior, sound, np.arange(len(pairs)), bound, rows).followed_by(rows, slipped)
 
 
-def placed_again(
-    objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, prior: Prior, expected: FalseMotions
-) -> Placement:
-    """Return a placement whose slipped pairs are placed with what their neighbours show of the wheels' false motions.
+def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, expected: FalseMotions) -> Placement:
+    """Return a placement with what their neighbours show of the wheels' false motions in the prior of slips, and places there.
 
     Parameters
     ----------
-    pairs, prior : see register. found : of these. expected : see FalseMotions.by_neighbours.
+    pairs : see register. found : of these. expected : see FalseMotions.by_neighbours.
     """
-    rows = found.searched
-    own, sigma = prior.rows(rows), np.sqrt(np.einsum("eii->ei", prior.slipped[rows]))
+    rows, slipped = found.searched, found.prior.slipped
+    sigma = np.sqrt(np.einsum("eii->ei", slipped.covariance[rows]))
     spread = np.linalg.inv(expected.matrix[rows])
-    mean = own.mean + sigma * np.einsum("eij,ej->ei", spread, expected.vector[rows])
-    wide = Gaussian(mean, sigma[:, :, None] * spread * sigma[:, None, :] + own.covariance)
-    one, other = (descend(objects, pairs.rows(rows), start, wide) for start in (found.slipped.pose[rows], mean))
-    slipped = one.replaced(np.arange(len(rows)), other, other.evidence > one.evidence)
-    return replace(found, slipped=found.slipped.replaced(rows, slipped, np.ones(len(rows), dtype=bool)))
+    mean, covariance = slipped.mean.copy(), slipped.covariance.copy()
+    mean[rows] += sigma * np.einsum("eij,ej->ei", spread, expected.vector[rows])
+    covariance[rows] = sigma[:, :, None] * spread * sigma[:, None, :] + found.prior.sound.covariance[rows]
+    near = found.likeliest(slipped)[0].pose
+    found = replace(found, prior=replace(found.prior, slipped=Gaussian(mean, covariance)))
+    for start in (near, mean):
+        found = found.followed_by(rows, descend(objects, pairs.rows(rows), start[rows], found.prior.slipped.rows(rows)))
+    return found
 
 
 def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Placed:
@@ -253,7 +295,7 @@ def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Pla
 def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:
     """Place pairs (e,), each from the best of several starts."""
     placed = [descend(objects, pairs, start, prior) for start in starts(objects, pairs, prior)]
-    best = np.argmax([each.evidence for each in placed], axis=0)
+    best = np.argmax([each.evidence(prior) for each in placed], axis=0)
     return concatenated(placed).rows(best * len(pairs) + np.arange(len(pairs)))
 
 
@@ -285,11 +327,12 @@ def _searched(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> 
     return list(starts)
 
 
-def _most_odds(objects: ObjectLikelihood, placed: Placed, prior: Prior) -> Floats:
+def _most_odds(placed: Placed, prior: Prior) -> Floats:
     """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
-    hessian = placed.factors.hessian / (objects.sigma**2 * ObjectPolicy.correlation)
-    here, there = (np.linalg.slogdet(np.eye(3) + cov @ hessian)[1] for cov in (prior.covariance, prior.slipped))
-    return np.asarray(placed.evidence_lost + 0.5 * (here - there))
+    off = _difference(placed.pose, prior.sound.mean)
+    lost = placed.most - placed.likelihood + 0.5 * np.einsum("ei,ei->e", off, _solved(prior.sound.covariance, off))
+    here, there = (np.linalg.slogdet(np.eye(3) + p.covariance @ placed.information)[1] for p in (prior.sound, prior.slipped))
+    return np.asarray(lost + 0.5 * (here - there))
 
 
 def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: Gaussian) -> Placed:
@@ -299,9 +342,9 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
     pose, gate, temper, left = start.copy(), c.first_gate, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
         factors, _ = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)
-        hessian = factors.hessian / scale + information[left]
+        matches, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
         pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
-        step = -np.linalg.solve(hessian, (factors.gradient / scale + pull)[..., None])[..., 0]
+        step = -np.linalg.solve(matches / scale + information[left], (gradient / scale + pull)[..., None])[..., 0]
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / c.farthest[0], np.abs(step[:, 2]) / c.farthest[1])
         step /= np.maximum(reach, 1.0)[:, None]
         pose[left] += step
@@ -311,12 +354,8 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     factors, judged = objects.match(pairs, pose, ObjectPolicy.gate)
     likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
-    hessian = factors.hessian / scale + information
-    off = _difference(pose, prior.mean)
-    distance = 0.5 * np.einsum("ei,eij,ej->e", off, information, off)
-    volume = -0.5 * (np.linalg.slogdet(prior.covariance)[1] + np.linalg.slogdet(hessian)[1])
-    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
-    return Placed(pose, factors, covariance, likelihood - distance + volume, likelihood, distance + most - likelihood)
+    matches = measured_part(factors.hessian, factors.spurious, factors.gradient)[0] / scale
+    return Placed(pose, factors, matches, likelihood, most)
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:
@@ -330,7 +369,24 @@ def of_fallible(log_odds: Floats, wrong: float) -> Floats:
     return np.asarray(np.log(right) - np.log1p(-right))
 
 
+def odds_by_views(here: Floats, there: Floats) -> Floats:
+    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views.
+
+    A view may show nothing of either, and favour the false one.
+    """
+    none = np.log(RegistrationConfig.useless)
+    each = np.logaddexp(there, none) - np.logaddexp(here, none)
+    # They see the same surfaces: together they say no more of these than the one that sees most.
+    most = np.abs(each).max(axis=0, initial=0.0)
+    return np.asarray(np.clip(of_fallible(each, RegistrationConfig.useless).sum(axis=0), -most, most))
+
+
 def _difference(pose: Floats, mean: Floats) -> Floats:
     off = pose - mean
     off[:, 2] = se2.wrap_angle(off[:, 2])
     return off
+
+
+def _solved(matrix: Floats, vector: Floats) -> Floats:
+    """Return the solutions (e, 3) of symmetric systems (e, 3, 3)."""
+    return np.asarray(np.linalg.solve(matrix, vector[..., None])[..., 0])

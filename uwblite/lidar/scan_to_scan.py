@@ -23,16 +23,16 @@ from .clouds import Clouds
 from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy, pairs_of
 from .pair_alignment import align_pairs
 from .registration import (
-    Gaussian,
     Placed,
     Placement,
     Prior,
     RegistrationConfig,
     descend,
+    odds_by_views,
     of_fallible,
-    placed_again,
     register,
     search,
+    with_neighbours,
 )
 from .scan_matching import match, measured, pair_points
 
@@ -45,8 +45,6 @@ class TrackingConfig:
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     min_points: ClassVar[int] = 30
     """Clouds with fewer points with a normal measure nothing."""
-    fewest: ClassVar[int] = 6
-    """Matches from which on a step is measured: twice its unknowns."""
     sigma: ClassVar[float] = 0.03
     """Standard deviation of a match where no step shows it, m."""
     least_sigma: ClassVar[float] = 0.02
@@ -63,6 +61,8 @@ class TrackingConfig:
     """Probability that a message of the odometry is lost over a step, or the robot carried."""
     views: ClassVar[int] = 6
     """Clouds before a doubtful step with which the one after it is compared: they still see the same."""
+    doubtful: ClassVar[float] = 0.02
+    """Probability of a slip from which on a step is doubtful."""
     steps_back: ClassVar[int] = 4
     """Steps over which objects that move are sought: a second or two."""
     longest_run: ClassVar[int] = 3
@@ -74,9 +74,7 @@ class ScanOdometry:
     """Steps between neighbouring keyframes."""
 
     steps: RelativePoseEdges
-    """Those that were measured, as wheels that do not slip allow."""
-    with_slips: RelativePoseEdges
-    """The same, with those over which the wheels slipped where their clouds lie."""
+    """Those that were measured."""
     wheels: OdometryEdges
     """With the noise learnt from the measured steps, as if they had not slipped."""
     slipped: OdometryEdges
@@ -150,41 +148,37 @@ def follow(
     pairs, mean = pairs_of(clouds, i, i + 1), noise.corrected(graph)
     objects = ObjectLikelihood.of(clouds, raster, sigma, pairs, mean)
     objects = objects.learnt(pairs.rows(steps.enough), steps.pose[steps.enough])
-    usual, wide = covariance_of(noise, graph), slip_sigma(noise)[:, :, None] ** 2 * np.eye(3)
-    prior = Prior(mean, usual, usual + wide)
+    prior = Prior.about(mean, covariance_of(noise, graph), slip_sigma(noise), lost_sigma(noise))
     found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
-    prior_odds = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
-    log_odds, motions = found.log_odds(), found.false_motions(prior, sigma**2)
-    chain = posterior(log_odds + prior_odds, wheels.duration)
+    by_ranges = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
+    log_odds, motions = found.log_odds(), found.false_motions()
+    chain = posterior(log_odds + by_ranges, wheels.duration)
     for _ in range(TrackingConfig.laps):
         expected = motions.by_neighbours(chain, wheels.duration)
-        chain = posterior(found.log_odds(motions.log_marginal(expected)) + prior_odds, wheels.duration)
-    slips = chain.probability
-    found = placed_again(objects, pairs, found, prior, expected)
-    placed = found.chosen(slips)
-    # Where neighbours share few points, clouds some steps before say where they lie.
-    variance, poor = sigma**2 * ObjectPolicy.correlation, steps.enough & ~good
-    lost = Gaussian(mean, usual + lost_sigma(noise)[:, :, None] ** 2 * np.eye(3))
-    # A slip that lasts is known from the steps around.
-    odds = np.maximum(np.log(TrackingConfig.lost), logit(np.clip(slips, 1e-9, 1.0 - 1e-9)) - log_odds)
-    mode, tempting = _decided(objects, pairs, found, steps.pose, lost, np.where(poor, odds, -np.inf))
+        log_odds = found.log_odds(motions.log_marginal(expected))
+        chain = posterior(log_odds + by_ranges, wheels.duration)
+    found = with_neighbours(objects, pairs, found, expected)
+    # Where neighbours share few points, or a slip is possible, clouds some steps before say where they lie.
+    doubtful = steps.enough & (~good | (chain.probability > TrackingConfig.doubtful))
+    rest = np.clip(logit(np.clip(chain.probability, 1e-9, 1.0 - 1e-9)) - log_odds, -np.inf, 0.0)
+    found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
+    log_odds[doubtful] = choice.log_odds
+    slips = posterior(log_odds + by_ranges, wheels.duration).probability
+    variance, sound, mode = sigma**2 * ObjectPolicy.correlation, found.sound, choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
-    stays = np.where(poor, np.all(mode.pose == found.sound.pose, axis=1), log_odds < 0.0)
-    captured = np.flatnonzero(poor & stays & (tempting.share > found.sound.share))
-    matched = certain.followed_by(_as_edges(i, tempting, captured, variance))
-    rejected = _contradicted(matched, noise, graph) & stays
-    edges = certain.rows(np.flatnonzero(~rejected[np.searchsorted(i, certain.i)]))
-    edges = edges.followed_by(_as_edges(i, mode, np.flatnonzero(poor & _shown(mode) & ~rejected), variance))
+    tempting = found.candidates.rows(found.best(found.candidates.share))
+    captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
+    own = np.flatnonzero(~doubtful[np.searchsorted(i, certain.i)])
+    matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
+    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (log_odds < 0.0)
+    own = own[~rejected[np.searchsorted(i, certain.i[own])]]
+    edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
-    learnt = with_uncounted_ways(noise, edges, graph)
-    seen, steady = np.flatnonzero((slips > 0.5) & _shown(placed)), ~np.isin(edges.i, i[slips > 0.5])
-    slid = _as_edges(i, placed, seen, variance)
-    both = edges.rows(np.flatnonzero(steady)).followed_by(slid)
-    miss, moving = _miss(clouds, noise), _moving(objects, i, placed)
+    learnt, miss = with_uncounted_ways(noise, edges, graph), _miss(clouds, noise)
     return ScanOdometry(
-        edges, both.rows(np.argsort(both.i)), learnt, with_slips(learnt, slips),
-        float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, moving, rejected,
+        edges, learnt, with_slips(learnt, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
+        _moving(objects, i, mode, choice.covariance), rejected,
     )
 
 
@@ -212,81 +206,94 @@ def _as_edges(first: Ints, placed: Placed, rows: Ints, variance: float) -> Relat
 
 def _shown(placed: Placed) -> Bools:
     """Return which clouds (e,) are likelier to lie there than in space that nobody has seen."""
-    return np.asarray((placed.factors.matched >= TrackingConfig.fewest) & (placed.likelihood > 0.0))
+    return np.asarray(placed.shown & (placed.likelihood > 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Choice:
+    """The likeliest places of e steps."""
+
+    placed: Placed
+    """(e)."""
+    elsewhere: Bools
+    """(e,) whether the wheels slipped or a message was lost."""
+    covariance: Floats
+    """(e, 3, 3) of the poses by matches and prior."""
+    log_odds: Floats
+    """(r,) of slips over doubtful steps, by what their clouds show."""
 
 
 def _decided(
-    objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, near: Floats, lost: Gaussian, odds: Floats
-) -> tuple[Placed, Placed]:
-    """Return the likeliest place of each step (e,), and of doubtful ones the place other than the wheels' with the largest
-    evidence: they slipped, a message was lost, or the robot carried, in no time by the stamps.
+    objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, near: Floats, rows: Ints, slips: Floats
+) -> tuple[Placement, _Choice]:
+    """Return candidates, with those of doubtful steps (r,) completed, and the likeliest of all steps (e,).
 
-    One pair of clouds does not tell. The best of many places fits some surface by chance, and then in all pairs: so the prior's
-    part of the evidence counts whole, and the likelihood of each pair as far as one can be trusted.
+    One pair of clouds does not tell. The best of many places fits some surface by chance, and then in all pairs: so each pair
+    must outweigh the prior by itself, and counts as far as one can be trusted.
 
     Parameters
     ----------
-    near : (e, 3) where plain matching ended. lost : prior of steps over which a message was lost.
-    odds : (e,) log odds of another place beforehand; -inf where that is not asked.
+    near : (e, 3) where plain matching ended. slips : (e,) log odds of slips without the clouds of a step.
     """
-    rows, c = np.flatnonzero(np.isfinite(odds)), RegistrationConfig
-    some, wide, sound = pairs.rows(rows), lost.rows(rows), found.sound.rows(rows)
-    other, ended = found.slipped.rows(rows), descend(objects, some, near[rows], wide)
-    other = other.replaced(np.arange(len(rows)), ended, ended.evidence > other.evidence)
-    chain, moved = near.copy(), np.zeros(len(rows), dtype=bool)
-    chain[rows] = sound.pose
+    parts = found.prior.sound, found.prior.slipped, found.prior.lost
+    found = found.followed_by(rows, descend(objects, pairs.rows(rows), near[rows], parts[-1].rows(rows)))
+    chain, choice, log_odds = found.sound.pose.copy(), np.arange(len(near)), np.zeros(len(rows))
+    part, tied = np.zeros(len(near), dtype=np.intp), np.ones(len(near), dtype=bool)
+    odds = np.stack([slips, np.full(len(near), np.log(TrackingConfig.lost))])
     for number, row in enumerate(rows.tolist()):
-        one = np.array([number])
-        here = _seen(objects, pairs, chain, row, sound.pose[number])
-        few = max(other.share[number], sound.share[number]) < c.least_share
-        if few and of_fallible(here, c.useless).sum() <= 0.0:
-            anywhere = search(objects, some.rows(one), wide.rows(one))
-            other = other.replaced(one, anywhere, anywhere.evidence > other.evidence[one])
-        there = _seen(objects, pairs, chain, row, other.pose[number])
-        volume = other.evidence - other.likelihood - sound.evidence + sound.likelihood
-        # It must be likelier than that the clouds show nothing, too.
-        least = min(volume[number] + _support(here, there), other.evidence[number])
-        moved[number] = odds[row] + least > 0.0
-        chain[row] = (other if moved[number] else sound).pose[number]
-    return found.sound.replaced(rows, other, moved), found.sound.replaced(rows, other, np.ones(len(rows), dtype=bool))
+        own = np.flatnonzero(found.pair == row)
+        seen = _seen(objects, pairs, chain, tied, row, found.candidates.pose[own])
+        if found.candidates.share[own].max() < RegistrationConfig.least_share and np.median(seen[:, 0]) <= 0.0:
+            one = np.array([row])
+            found = found.followed_by(one, search(objects, pairs.rows(one), parts[-1].rows(one)))
+            own = np.append(own, len(found.pair) - 1)
+            seen = np.hstack([seen, _seen(objects, pairs, chain, tied, row, found.candidates.pose[own[-1:]])])
+        some, same = found.candidates.rows(own), np.full(len(own), row)
+        sound, *others = (seen + some.log_prior(each.rows(same)) for each in parts)
+        score = np.stack([odds_by_views(sound.max(axis=1, keepdims=True), each) for each in others])
+        log_odds[number] = score[0].max()
+        score += odds[:, row, None]
+        which, best = np.unravel_index(np.argmax(score), score.shape)
+        if score[which, best] > 0.0:
+            part[row], choice[row] = 1 + which, own[best]
+            chain[row] = some.pose[best]
+        tied[row] = _shown(found.candidates.rows(choice[row : row + 1]))[0]
+    placed = found.candidates.rows(choice)
+    covariances = np.stack([placed.covariance(each) for each in parts])
+    return found, _Choice(placed, part > 0, covariances[part, np.arange(len(part))], log_odds)
 
 
-def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, row: int, pose: Floats) -> Floats:
-    """Return the log likelihood (v,) of the cloud at the end of a step, which is a pose (3,), in those before it in a chain."""
-    at, placed = [], pose
+def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, tied: Bools, row: int, poses: Floats) -> Floats:
+    """Return the log likelihood (v, n) of the cloud at the end of a step, which is one of poses (n, 3), in those before it.
+
+    Parameters
+    ----------
+    chain, tied : (e, 3), (e,) the steps, and whether the place of each is known.
+    """
+    at, placed = [], poses
     for back in range(min(TrackingConfig.views, row + 1)):
-        if pairs.i[row - back] != pairs.i[row] - back:
+        if pairs.i[row - back] != pairs.i[row] - back or (back and not tied[row - back]):
             break
         placed = se2.compose(chain[row - back], placed) if back else placed
         at.append(placed)
-    compared = replace(pairs.rows(np.full(len(at), row)), i=pairs.i[row] - np.arange(len(at)))
-    return objects.log_likelihood(compared, np.array(at))
+    compared = pairs.rows(np.full(len(at) * len(poses), row))
+    compared = replace(compared, i=pairs.i[row] - np.repeat(np.arange(len(at)), len(poses)))
+    return objects.log_likelihood(compared, np.concatenate(at)).reshape(len(at), len(poses))
 
 
-def _support(here: Floats, there: Floats) -> float:
-    """Return the log odds for a place at which views have log likelihoods there (v,) against one at which they have others."""
-    # A pair may show one place and contradict the other, or show both and one of them better: what says more counts.
-    by_each, useless = there - here, RegistrationConfig.useless
-    apart, better = of_fallible(there, useless) - of_fallible(here, useless), of_fallible(by_each, useless)
-    odds = float(np.where(np.abs(apart) > np.abs(better), apart, better).sum())
-    # They see the same surfaces: together they say no more of these than the one that sees most.
-    most = float(np.abs(by_each).max(initial=0.0))
-    return float(np.clip(odds, -most, most))
-
-
-def _moving(objects: ObjectLikelihood, first: Ints, placed: Placed) -> Bools:
+def _moving(objects: ObjectLikelihood, first: Ints, placed: Placed, spread: Floats) -> Bools:
     """Return which points (p,) belong to objects that moved since the keyframe before, or one some steps before.
 
-    What moves slowly shows over several steps only; the uncertainty of a chain of steps grows with their number.
+    What moves slowly shows over several steps only; the uncertainty of a chain grows with their number, by (e, 3, 3) each.
     """
-    i, j, pose, covariance = first, first + 1, placed.pose, placed.covariance
+    i, j, pose, covariance = first, first + 1, placed.pose, spread
     moves = np.zeros(len(objects.clouds.points), dtype=bool)
     for _ in range(TrackingConfig.steps_back):
         moves |= objects.moving(pairs_of(objects.clouds, i, j), pose, covariance)
         after = np.flatnonzero(np.isin(j, first))
         follows = np.searchsorted(first, j[after])
         turn = se2.rotation(pose[after, 2])
-        covariance = covariance[after] + turn @ placed.covariance[follows] @ np.swapaxes(turn, 1, 2)
+        covariance = covariance[after] + turn @ spread[follows] @ np.swapaxes(turn, 1, 2)
         i, j, pose = i[after], j[after] + 1, se2.compose(pose[after], placed.pose[follows])
     return moves
 
