@@ -1,7 +1,9 @@
 """What all tests share: the slow marker, one BLAS thread, hypothesis without clocks, recordings kept elsewhere."""
 
+import gc
 import os
 import signal
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -10,6 +12,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+# Tests start Python some hundred times; compiling everything each time is a sixth of their work.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+# All that is collected lives to the end: looking for cycles in it over and over would be a tenth of the work.
+gc.disable()
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -47,6 +55,11 @@ def pytest_collection_modifyitems(config, items):
     kept = set(map(id, chosen))
     config.hook.pytest_deselected(items=[item for item in items if id(item) not in kept])
     items[:] = chosen
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_configure(config):
@@ -164,14 +177,38 @@ def minute_map(minute_log, once):
 
 
 @pytest.fixture(scope="session")
-def room_result(log, once):
-    """The map of the whole recording of the room, with the default settings."""
+def room_map(room_log, once):
+    """Folder with the map of the whole recording of the room, with the default settings, and what was said."""
+    import contextlib
+    import pickle
+    from unittest import mock
+
+    from uwblite import mapping
+    from uwblite.cli import main, making
+
+    def mapped(folder):
+        def build_map(*args, **options):
+            result = mapping.build_map(*args, **options)
+            (folder / "result").write_bytes(pickle.dumps(result))
+            return result
+
+        words = ["map", str(room_log), "--out", str(folder / "map"), "--corrected-log", str(folder / "corrected.log")]
+        with (
+            open(folder / "said.txt", "w") as said,
+            contextlib.redirect_stdout(said),
+            mock.patch.object(making, "build_map", build_map),
+        ):
+            (folder / "code").write_text(str(main(words)))
+
+    return once("room_map", mapped)
+
+
+@pytest.fixture(scope="session")
+def room_result(room_map):
+    """That map as it was before it was written."""
     import pickle
 
-    from uwblite.mapping import build_map
-
-    folder = once("room_result", lambda folder: (folder / "result").write_bytes(pickle.dumps(build_map(log))))
-    return pickle.loads((folder / "result").read_bytes())
+    return pickle.loads((room_map / "result").read_bytes())
 
 
 @pytest.fixture(scope="session")

@@ -70,13 +70,15 @@ def nodes_of(module: str) -> tuple[ast.AST, ...]:
     return tuple(ast.walk(tree_of(module)))
 
 
-def imports_of(module: str):
-    """Yield (imported module of this package, whether only for type checking)."""
-    here = module.split("/")
+@cache
+def imports_of(module: str) -> tuple[str, ...]:
+    """Return the modules of this package that are imported, but for those that only type checkers see."""
+    here, found = module.split("/"), list[str]()
     typing_only = {
         id(child)
         for node in nodes_of(module)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if isinstance(node, ast.If)
+        and "TYPE_CHECKING" in {getattr(n, "id", getattr(n, "attr", "")) for n in ast.walk(node.test)}
         for child in ast.walk(node)
     }
     for node in nodes_of(module):
@@ -85,7 +87,8 @@ def imports_of(module: str):
         base = here[: len(here) - node.level] + (node.module.split(".") if node.module else [])
         for alias in node.names:
             whole = "/".join([*base, alias.name])
-            yield whole if whole in KNOWN else "/".join(base)
+            found.append(whole if whole in KNOWN else "/".join(base))
+    return tuple(found)
 
 
 def algorithms_in_files_and_devices(module):
@@ -237,7 +240,7 @@ def test_no_module_has(rule):
 
 
 def run_python(*words, cwd=None, path=PACKAGE.parent):
-    environment = {"PATH": "/usr/bin:/bin", "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {"PATH": "/usr/bin:/bin"}
     if path:
         environment["PYTHONPATH"] = str(path)
     return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)

@@ -187,7 +187,7 @@ def bench_icp(repeats: int) -> None:
 
     def prepare(target, source, truth):
         """Return what align_pairs asks for; both views look from the middle of the hall."""
-        clouds = [make_cloud(target, np.zeros(2)), make_cloud(source, se2.inverse(truth)[:2])]
+        clouds = [make_cloud(target, np.zeros(2), 0.15), make_cloud(source, se2.inverse(truth)[:2], 0.15)]
         return joined(clouds), rasterize(joined(clouds[:1]), 0.1, 0.5), pair_points(joined(clouds), second, len(source))
 
     def align(prepared, guess):
@@ -195,10 +195,10 @@ def bench_icp(repeats: int) -> None:
         return align_pairs(clouds, raster, first, guess[None], points, 0.5, 0.15).pose[0]
 
     columns = ("uwblite", "small_gicp ICP", "Open3D point to line")
-    head("Registration, ms (error, mm), 8 pairs", "points", *columns, "ratio to small_gicp", "prepared")
+    head("Registration, ms (error, mm), 24 pairs", "points", *columns, "ratio to small_gicp", "prepared")
     for points in (1000, 2000, 3000):
         times, errors = [], []
-        for seed in range(8):
+        for seed in range(24):
             target, source, truth, guess = two_views(points, seed)
             prepared = prepare(target, source, truth)
             runs = (

@@ -85,8 +85,6 @@ def _run(name: str, command: list[str], *, quiet: bool = False) -> int:
     if not quiet:
         print(f"== {name}", flush=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1")}
-    # Tests start Python some hundred times; compiling everything each time is a sixth of their work.
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if quiet else {}
     done = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, env=environment, check=False, **output)
     shown = f"\n== {name}\n{done.stdout.decode(errors='replace')}" if quiet else ""

@@ -72,6 +72,8 @@ def concatenated(parts: Sequence[_Joined]) -> _Joined:
 
     A field may be such a dataclass itself.
     """
+    if len(parts) == 1:
+        return parts[0]
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}  # type: ignore[arg-type]
     whole = {n: np.concatenate(c) if isinstance(c[0], np.ndarray) else concatenated(c) for n, c in columns.items()}
     return replace(parts[0], **whole)  # type: ignore[type-var]

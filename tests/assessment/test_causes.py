@@ -118,7 +118,8 @@ def test_what_is_explained_is_folded_under_the_first_cause_of_all():
 
 @pytest.fixture(scope="module")
 def sound():
-    return recording(two_rounds())
+    """A round and a half."""
+    return recording(two_rounds()[:2400])
 
 
 def with_steps(log, change):

@@ -32,7 +32,7 @@ PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 LEVEL = SensorMounting(anchor_height=0.0)
 
 
-def run(seed=3, walls=None, scale=1.0, turn_scale=1.0, metres=80.0, radio_scale=1.0):
+def run(seed=3, walls=None, scale=1.0, turn_scale=1.0, metres=50.0, radio_scale=1.0):
     """Return stamps, truth and the recording of a path among four anchors."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, metres)
@@ -50,7 +50,7 @@ def stated(notices, words):
 @pytest.mark.parametrize("turn_scale", [-2.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (2.0, 0.5))])
 def test_gross_turns_leave_the_mirror_image_open(turn_scale):
     """By minus the factor that makes the turns agree, the mirror image fits as well: the ranges do not say which it is."""
-    _, truth, log = run(turn_scale=turn_scale)
+    _, truth, log = run(turn_scale=turn_scale, metres=80.0)
     result = build_map(log)
     doubt = stated(result.doubts, "may be mirrored")
     assert len(doubt) == 1
@@ -88,7 +88,7 @@ def test_without_a_laser_turns_that_no_slip_of_the_wheels_explains_leave_the_sig
 
 
 def test_given_anchors_decide_the_sign():
-    log = run(turn_scale=2.0)[2]
+    log = run(turn_scale=2.0, metres=80.0)[2]
     given = Constraints(
         anchors=tuple(GivenAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
     )
@@ -212,7 +212,7 @@ def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_la
 @pytest.mark.parametrize("radio_scale", [1.0, pytest.param(1.08, marks=pytest.mark.slow)])
 def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
     """Without a lidar nothing shows which of the two is wrong, but that they differ is plain: yards explain it."""
-    result = build_map(run(radio_scale=radio_scale)[2])
+    result = build_map(run(radio_scale=radio_scale, metres=80.0)[2])
     assert stated(result.warnings, "relative error of all ranges") == []
     reported = stated(result.doubts, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)

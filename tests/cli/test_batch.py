@@ -23,11 +23,11 @@ from uwblite.io.carmen import read_log, write_log
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory, room_log):
-    """Three recordings: half a minute, what is none, and one whose tag measured nothing."""
+    """Three recordings: twenty seconds, what is none, and one whose tag measured nothing."""
     folder, log = tmp_path_factory.mktemp("recordings"), read_log(room_log)
     silent = replace(log.ranges, ranges=np.zeros(len(log.ranges.ranges)))
-    write_log(folder / "monday.log", log.crop(0.0, 30.0))
-    write_log(folder / "tuesday.log.gz", replace(log, ranges=silent).crop(60.0, 72.0))
+    write_log(folder / "monday.log", log.crop(0.0, 20.0))
+    write_log(folder / "tuesday.log.gz", replace(log, ranges=silent).crop(60.0, 68.0))
     (folder / "notes.log").write_text("bread, milk\n")
     return [str(folder / name) for name in ("monday.log", "notes.log", "tuesday.log.gz")]
 

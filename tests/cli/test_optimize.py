@@ -176,7 +176,7 @@ def test_lines_of_kinds_that_are_not_used_are_said(tmp_path, capsys):
 @pytest.mark.parametrize("way", [[], ["--from-odometry", "--incremental"], ["--kernel", "huber"]])
 def test_closures_at_random_end_with_the_work_allowed_and_are_named(tmp_path, capsys, monkeypatch, way):
     """They are tried for as many multiplications as are allowed, whatever the way, and what is reached is written."""
-    graph = at_random(300, 600)
+    graph = at_random(200, 400)
     once = optimize(graph, SolverConfig(max_iterations=1))[1].work
     monkeypatch.setattr("uwblite.cli.optimize._WORK", 12.0 * once)
     done = []
@@ -187,8 +187,8 @@ def test_closures_at_random_end_with_the_work_allowed_and_are_named(tmp_path, ca
     printed = capsys.readouterr().out
     assert 12.0 * once <= sum(done) < 16.0 * once
     assert "DOUBT: not converged within the work that is allowed for a graph of its size; " in printed
-    assert len(read_g2o(out).graph.poses) == 300
-    assert " of 600 loop closures are more than 4 standard deviations off, that of poses " in printed
+    assert len(read_g2o(out).graph.poses) == 200
+    assert " of 400 loop closures are more than 4 standard deviations off, that of poses " in printed
     first = (tmp_path / "out.g2o").read_bytes()
     assert main(["optimize", path, "--out", out, "--force", *way]) == 3
     assert (tmp_path / "out.g2o").read_bytes() == first

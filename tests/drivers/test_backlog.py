@@ -4,6 +4,7 @@ import itertools
 import random
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from emulators.kobuki_device import Create2Device, KobukiDevice
 from emulators.uwb_boards import BOARDS, UwbBoard
@@ -102,9 +103,9 @@ def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
 
 def test_many_frames_do_not_wait_for_ever():
     backlog, count = Backlog(), 0
-    for k in range(200_000):
+    for k in range(80_000):
         count += len(backlog.take(Frame(0.0 if k == 0 else 5.0, k), 5.0, 0.02))
-    assert count > 130_000
+    assert count > 60_000
 
 
 @pytest.mark.parametrize("what", ["pause", "stop"])
@@ -120,10 +121,12 @@ def test_a_base_loses_nothing_in_a_pause_and_did_not_restart(kind, seconds, what
     assert not [action for _, action in actions if isinstance(action, Lost | Note | Corrupt)]
     poses = of_kind(actions, OdometryPose)
     assert len(poses) >= len(sent) - 10
-    for pose in poses:
-        true = min(sent, key=lambda row: abs(row[0] - pose.stamp))
-        assert abs(pose.stamp - true[0]) < 0.008
-        assert abs(pose.x - true[1]) + abs(pose.y - true[2]) < 0.03
+    measured, true = np.array([(pose.stamp, pose.x, pose.y) for pose in poses]), np.array(sent)[:, :3]
+    after = np.searchsorted(true[:, 0], measured[:, 0]).clip(1, len(true) - 1)
+    nearest = after - (measured[:, 0] - true[after - 1, 0] < true[after, 0] - measured[:, 0])
+    off = np.abs(measured - true[nearest])
+    assert off[:, 0].max() < 0.008
+    assert off[:, 1:].sum(axis=1).max() < 0.03
 
 
 @pytest.mark.parametrize("board", ["makerfabs", "bu01", "makerfabs-at", "bu03"])

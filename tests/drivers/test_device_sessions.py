@@ -318,7 +318,7 @@ def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
     """One byte in a hundred is changed and TLV has no sum: reading twice keeps wrong ranges out of the log."""
     device, sent = tag(seed=seed)
     line = FaultyLine([parse_fault("noise=0.01@3")], seed)
-    actions, _ = simulate(Dwm1001Driver(), device, 60.0, line=line)
+    actions, _ = simulate(Dwm1001Driver(), device, 40.0, line=line)
     epochs = of_kind(actions, RangeEpoch)
     true = {tuple((a, d) for a, d, _ in readings) for _, readings in sent}
     wrong = [e for e in epochs if tuple((int(r.anchor_id, 16), round(1000 * r.range)) for r in e.readings) not in true]
@@ -464,15 +464,15 @@ def test_lidar_on_a_slow_line_is_made_faster_or_asked_for_fewer_scans(rates, exp
     """RS-232 at 19200 bit/s carries 0.8 scans a second. What is left out is said; nothing that was sent is lost."""
     device, sent = lidar(ScipOptions(serial=True, rates=rates))
     driver = ScipDriver()
-    actions, reopens = simulate(driver, device, 60.0)
+    actions, reopens = simulate(driver, device, 40.0)
     scans = of_kind(actions, LaserScan)
     assert not reopens
-    assert len(scans) / 60 > 0.85 * expected[0]
+    assert len(scans) / 40 > 0.85 * expected[0]
     assert ("lidar-slow-line" in names(actions)) == (expected[1] < 1)
     settled = [scan for when, scan in actions if isinstance(scan, LaserScan) and when > START + 20]
     lost = sum(a.count for when, a in actions if isinstance(a, Lost) and when > START + 20)
     assert lost == 0
-    assert len(settled) == pytest.approx(400 * expected[1], rel=0.12)
+    assert len(settled) == pytest.approx(200 * expected[1], rel=0.12)
     truth = {}
     for true, values in sent:
         truth.setdefault(tuple(v if v < 4095 or rates[1:] else 5600 for v in values), []).append(true)
@@ -557,7 +557,7 @@ def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
     device, sent = tag(seed=seed)
     rng, calls = random.Random(seed), itertools.count()
     jitter = lambda: rng.uniform(0, 0.07) if (next(calls) // 150) % 2 else 0.001  # noqa: E731
-    actions, reopens = simulate(Dwm1001Driver(), device, 120.0, jitter=jitter)
+    actions, reopens = simulate(Dwm1001Driver(), device, 80.0, jitter=jitter)
     assert not reopens
     fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
     epochs = of_kind(actions, RangeEpoch)
@@ -585,7 +585,7 @@ def test_tag_whose_answers_take_longer_than_a_fix_lasts(least, most, share):
     assert "uwb-slow" in names(actions)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
     """Answers and scans take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""
     device, sent = lidar()

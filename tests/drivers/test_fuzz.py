@@ -86,7 +86,7 @@ def pieces(words):
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_protocols_take_anything(name, data):
     make, words = PROTOCOLS[name]
@@ -97,7 +97,7 @@ def test_protocols_take_anything(name, data):
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_splits_do_not_matter_for_any_input(name, data):
     """The good events of any bytes are the same whole and byte by byte."""
@@ -111,7 +111,7 @@ def test_splits_do_not_matter_for_any_input(name, data):
 
 
 @pytest.mark.parametrize("name", SESSIONS)
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_sessions_take_anything_at_any_time(name, data):
     words = PROTOCOLS[name][1]

@@ -216,7 +216,7 @@ def test_parts_of_any_length_are_skipped_by_their_length():
 
 @pytest.mark.parametrize("skew", [0.0, 1e-4])
 def test_odometer_follows_the_emulated_circle(skew):
-    """Four minutes of circling: encoders and gyro are rounded to 0.09 mm and 0.01 degrees, the path is 48 m."""
+    """Two minutes of circling: encoders and gyro are rounded to 0.09 mm and 0.01 degrees, the path is 24 m."""
     world, clock = RoomWorld(), WorldClock()
     truth = []
     device = KobukiDevice(
@@ -225,7 +225,7 @@ def test_odometer_follows_the_emulated_circle(skew):
     clock.start(100.0)
     driver, errors, stamps = KobukiDriver((0.0, -1.5, 0.0)), [], []
     now, rng = 100.0, random.Random(0)
-    while now < 340.0:
+    while now < 220.0:
         for event in driver.parse(device.advance(now), now + rng.expovariate(1000.0)):
             for pose in driver.take(event):
                 true = truth.pop(0)

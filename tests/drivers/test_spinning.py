@@ -67,7 +67,7 @@ def test_scans_are_right_in_range_and_time(name):
 @pytest.mark.parametrize("name", LIDARS)
 @pytest.mark.parametrize("fault", ["noise=0.0005", "drop=0.0005", "insert=0.0005", "garbage=300@2"])
 def test_damage_costs_frames_but_invents_nothing(name, fault):
-    actions, turns, _ = run(name, 3.5, line=FaultyLine([parse_fault(fault)], seed=5))
+    actions, turns, _ = run(name, 2.5, line=FaultyLine([parse_fault(fault)], seed=5))
     scans = of_kind(actions, LaserScan)
     assert len(scans) > 0.6 * len(turns)
     assert of_kind(actions, Corrupt)

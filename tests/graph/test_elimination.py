@@ -43,7 +43,7 @@ def test_tree_and_sizes_are_those_of_the_filled_pattern(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 50))
     pairs, width = rng.integers(0, n, (int(rng.integers(0, 3 * n)), 2)), rng.integers(1, 4, n)
-    order = rng.permutation(n) if seed % 2 else minimum_degree(pairs, n)
+    order = rng.permutation(n) if seed % 2 else minimum_degree(adjacency(pairs, n))
     parent, sizes = by_brute_force(pairs, order, width)
     np.testing.assert_array_equal(elimination_tree(pairs, order), parent)
     order, tree = contiguous(pairs, order)
@@ -70,7 +70,7 @@ def test_the_order_is_that_of_a_complete_factorisation(seed):
     n = 300
     pairs = np.vstack([np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), rng.integers(0, n, (100 * seed, 2))])
     factor = superlu(adjacency(pairs, n), "MMD_AT_PLUS_A")
-    np.testing.assert_array_equal(minimum_degree(pairs, n), np.argsort(factor.perm_c))
+    np.testing.assert_array_equal(minimum_degree(adjacency(pairs, n)), np.argsort(factor.perm_c))
 
 
 def test_a_ring_of_hundreds_ties_its_ends():
@@ -81,7 +81,7 @@ def test_a_ring_of_hundreds_ties_its_ends():
     assert lower[n - 1, n // 2] == 0.0
     sizes = column_sizes(pairs, np.arange(n), np.ones(n, dtype=int), contiguous(pairs, np.arange(n))[1])
     np.testing.assert_array_equal(sizes[:-2], np.full(n - 2, 3))
-    order = contiguous(pairs, minimum_degree(pairs, n))[0]
+    order = contiguous(pairs, minimum_degree(adjacency(pairs, n)))[0]
     assert sorted(order) == list(range(n))
 
 
@@ -89,7 +89,7 @@ def test_a_ring_of_hundreds_ties_its_ends():
 def test_rows_reach_to_the_first_of_their_pairs(seed):
     rng = np.random.default_rng(seed)
     pairs = rng.integers(0, 30, (20 * seed, 2))
-    order, reach = narrow_order(pairs, 30)
+    order, reach = narrow_order(adjacency(pairs, 30))
     place = np.argsort(order)[pairs]
     expected = [max([k - place[place.max(axis=1) == k].min(initial=k)]) for k in range(30)]
     np.testing.assert_array_equal(reach, expected)
@@ -102,9 +102,9 @@ def test_a_large_matrix_of_anything_tied_to_anything_is_full():
     ways = ((grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]))
     streets = np.vstack([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ways])
     links = np.random.default_rng(0).integers(0, n, (n, 2))
-    assert not is_full(narrow_order(streets, n)[1])
-    assert is_full(narrow_order(np.vstack([streets, links]), n)[1])
-    assert not is_full(narrow_order(links[(links < 2000).all(axis=1)], 2000)[1])
+    assert not is_full(narrow_order(adjacency(streets, n))[1])
+    assert is_full(narrow_order(adjacency(np.vstack([streets, links]), n))[1])
+    assert not is_full(narrow_order(adjacency(links[(links < 2000).all(axis=1)], 2000))[1])
     assert work_of(sparse.csc_matrix(adjacency(np.vstack([streets, links]), n))) == np.inf
 
 
@@ -152,5 +152,5 @@ def test_columns_of_one_pattern_are_eliminated_together(seed):
 def filled_by_columns(matrix):
     """Return the entries of a factor by minimum degree of single columns."""
     pairs, n = pairs_of(matrix), matrix.shape[0]
-    order, parent = contiguous(pairs, minimum_degree(pairs, n))
+    order, parent = contiguous(pairs, minimum_degree(adjacency(pairs, n)))
     return column_sizes(pairs, order, np.ones(n, dtype=int), parent).sum()

@@ -1,7 +1,6 @@
-"""Counted work: that of small recordings stays what it is, whoever does it."""
+"""Counted work: that of small recordings stays what it is."""
 
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -56,12 +55,6 @@ def test_scans_are_gone_through_at_most_thirteen_times_in_ten(mapped):
         # Of points made again where objects that move are left out, only the tables are new.
         assert sum(n for stage, n in made.items() if "clouds" in stage) <= 1.3 * made["clouds"]
     assert result.stages[-1].figures["passes"] <= 1.3
-
-
-def test_workers_count_as_one_process_does(log):
-    log = log.crop(0.0, 20.0)
-    with ThreadPoolExecutor(2) as executor:
-        assert total(build_map(log, executor=executor)) == total(build_map(log))
 
 
 def test_work_on_graphs_made_of_others_is_counted_together():

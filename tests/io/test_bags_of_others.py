@@ -89,15 +89,20 @@ def test_a_bag_without_sensors_says_what_it_holds(tmp_path):
         read_bag(path)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The bytes of a bag of 1000 poses, of ROS 2 and of ROS 1, by the ends of their names."""
+    rows, folder = [odometry(1.0 + 0.02 * k, 0.01 * k) for k in range(1000)], tmp_path_factory.mktemp("whole")
+    parts = next(bag(folder, rows).glob("*.mcap"))
+    return {"mcap": parts.read_bytes(), "bag": bag(folder, rows, ros=1).read_bytes()}
+
+
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 @pytest.mark.parametrize("name", ["run{}", "run{}.active", "recording"])
-def test_of_a_recording_that_was_not_closed_what_is_complete_is_read(tmp_path, kind, share, name):
+def test_of_a_recording_that_was_not_closed_what_is_complete_is_read(tmp_path, whole, kind, share, name):
     """Whatever the file is called: up to the cut the readings are those of the whole bag."""
-    rows = [odometry(1.0 + 0.02 * k, 0.01 * k) for k in range(1000)]
-    path = bag(tmp_path, rows, ros=1 if kind == "bag" else 2)
-    whole = path if path.is_file() else next(path.glob("*.mcap"))
-    data = whole.read_bytes()
+    data = whole[kind]
     cut = tmp_path / name.format(f".{kind}")
     cut.write_bytes(data[: int(share * len(data))])
     log = read_bag(cut)
@@ -128,19 +133,28 @@ def test_packed_blocks_that_are_complete_are_read(tmp_path, compression):
     assert len(log.odometry.stamps) > 300
 
 
+@pytest.fixture(scope="module")
+def store_and_poses():
+    """What ROS 1 knows, and 6000 poses that do not pack too well, as bytes, each with its time in ns."""
+    store, poses = store_with({}, 1), []
+    for k in range(6000):
+        _, _, _, fields = odometry(1.0 + 0.02 * k, 0.01 * k + 1e-4 * ((k * 7919) % 101))
+        poses.append((round((1.0 + 0.02 * k) * 1e9), store.serialize_ros1(made(store, ODOMETRY, fields), ODOMETRY)))
+    return store, poses
+
+
 @pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
-def test_of_packed_blocks_of_ros1_the_beginning_is_read(tmp_path, compression):
+def test_of_packed_blocks_of_ros1_the_beginning_is_read(tmp_path, store_and_poses, compression):
     """A block that is cut off keeps what its packer had finished."""
     from rosbags.rosbag1 import Writer
 
-    store, kind = store_with({}, 1), ODOMETRY
+    store, poses = store_and_poses
     writer = Writer(tmp_path / "run.bag")
     writer.set_compression(getattr(Writer.CompressionFormat, compression))
     with writer as out:
-        connection = out.add_connection("/odom", kind, typestore=store)
-        for k in range(6000):
-            _, _, _, fields = odometry(1.0 + 0.02 * k, 0.01 * k + 1e-4 * ((k * 7919) % 101))
-            out.write(connection, round((1.0 + 0.02 * k) * 1e9), store.serialize_ros1(made(store, kind, fields), kind))
+        connection = out.add_connection("/odom", ODOMETRY, typestore=store)
+        for time, data in poses:
+            out.write(connection, time, data)
     data = (tmp_path / "run.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: int(0.8 * len(data))])
     log = read_bag(tmp_path / "cut.bag")

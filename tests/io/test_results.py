@@ -338,8 +338,7 @@ except OSError as error:
 
 
 @pytest.mark.usefixtures("small_picture")
-@pytest.mark.parametrize("limit", [0, 100, 3000, 9000])
-@pytest.mark.parametrize("foreign", [True, False])
+@pytest.mark.parametrize(("limit", "foreign"), [(0, True), (100, False), (3000, True), (9000, False)])
 def test_running_out_of_space_leaves_the_previous_result(tmp_path, limit, foreign):
     folder = tmp_path / "map"
     write_result(folder, [small_log()], small_result(), RECORD)

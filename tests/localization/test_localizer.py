@@ -204,6 +204,18 @@ def test_rooms_that_the_map_does_not_hold_take_no_pose_away_while_ranges_agree()
     assert errors(states[found:], poses[found:]).max() < 0.15
 
 
+def test_a_start_at_the_map_s_edge_is_certain_though_most_rays_end_beyond_it():
+    """What lies beyond the map says nothing about whether the map is the right one."""
+    grid = grid_of(ODD)
+    right = grid.geometry.centre_of(*np.indices(grid.log_odds.shape))[..., 0] > 2.6
+    cut = dataclasses.replace(grid, log_odds=np.where(right, 0.0, grid.log_odds).astype(np.float32))
+    poses = path(((2.2, 2.0), (2.2, 5.0)))
+    states = robot(dataclasses.replace(known(), walls=walls_of(cut))).along(poses)
+    # As where all is mapped: a metre.
+    assert first_found(states) <= 13
+    assert errors(states[-1:], poses[-1:]).max() < 0.15
+
+
 def test_a_few_ends_near_walls_pull_at_no_pose_where_the_others_lie_in_unknown_space():
     """The map ends before the robot; what it sees beside itself is 0.1 m off the walls that the map has there."""
     grid = grid_of(ODD)

@@ -9,6 +9,8 @@ from uwblite import se2
 from uwblite.localization import hypotheses, range_likelihood
 from uwblite.localization.range_update import gross_share
 from uwblite.localization.window import Ranges
+from uwblite.radio.range_errors import RangeErrors
+from uwblite.radio.range_noise import RangeNoise
 
 
 def some_ranges(seed):
@@ -125,3 +127,35 @@ def test_poses_by_ranges_are_as_unsure_as_their_common_errors_and_correlated_wit
     np.testing.assert_allclose(found.pose_covariances[1], 0.04 * np.eye(3) + shared @ effect[0].T)
     np.testing.assert_allclose(found.covariance[1, :3, -3:], -shared)
     assert np.linalg.eigvalsh(found.covariance[1]).min() > 0
+
+
+def test_errors_that_the_map_s_own_ranges_had_at_a_place_are_expected_there():
+    pose, ranges = some_ranges(8)
+    exact = np.hypot(*(pose[:2] + se2.rotate(pose[2], ranges.tags) - ranges.places).T)
+    rng = np.random.default_rng(9)
+    noise = RangeNoise(0.05, 0.08, 2.0)
+    fields = tuple(RangeErrors(np.array([-3.0, -3.0]), 0.5, rng.normal(0.1, 0.2, (15, 15)), noise) for _ in range(3))
+    poses = pose + np.array([[0.0, 0.0, 0.0], [0.7, -0.2, 1.0]])
+    expected = range_likelihood.expected_errors(poses, ranges, fields)
+    tags = pose[:2] + se2.rotate(pose[2], ranges.tags)
+    one_by_one = [float(fields[a].at(tag)) for a, tag in zip(ranges.anchor, tags, strict=True)]
+    np.testing.assert_allclose(expected[0], one_by_one, atol=1e-12)
+    late = replace(ranges, values=exact + one_by_one)
+    best = range_likelihood.range_likelihood(pose[None], late, expected=expected[:1])
+    none = range_likelihood.range_likelihood(pose[None], replace(ranges, values=exact), expected=np.zeros((1, 12)))
+    np.testing.assert_allclose(best, none, rtol=1e-4)
+    assert best[0] > range_likelihood.range_likelihood(pose[None], late)[0] + 1.0
+
+
+def test_a_long_detour_is_less_likely_where_the_map_s_own_robot_has_measured():
+    pose, ranges = some_ranges(8)
+    exact = np.hypot(*(pose[:2] + se2.rotate(pose[2], ranges.tags) - ranges.places).T)
+    costs = []
+    for expected in (None, np.zeros((1, 12))):
+        one, late = (
+            range_likelihood.range_likelihood(pose[None], replace(ranges, values=exact + off), expected=expected)[0]
+            for off in (np.zeros(12), 1.4 * (np.arange(12) == 0))
+        )
+        costs.append(one - late)
+    # Shares of the tails at 1.4 m, relative to the cores: 0.3 exp(-2.8) / 0.7 and 0.12 exp(-3.5) / 0.83.
+    assert 1.0 < costs[1] - costs[0] < 2.5

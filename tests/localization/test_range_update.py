@@ -2,6 +2,7 @@
 
 import numpy as np
 from helpers.hypotheses import a_bank, numeric
+from scipy.ndimage import map_coordinates
 
 from uwblite import se2
 from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN
@@ -11,7 +12,8 @@ from uwblite.radio.range_noise import RangeNoise
 
 
 def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
-    field = RangeErrors(np.array([[0.5, 0.5]]), np.array([20.0]), RangeNoise(0.05, 0.08, 2.0))
+    table = np.random.default_rng(7).normal(0.0, 0.2, (9, 8))
+    field = RangeErrors(np.array([-3.0, -2.5]), 1.0, table, RangeNoise(0.05, 0.08, 2.0))
     fact = RangeFacts(1, np.array([4.0, -2.0]), 0.0, 0.5, 0.1, 0.01, field)
     tag = np.array([0.3, -0.1])
     for seed in range(3):
@@ -20,7 +22,7 @@ def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
         tagged = se2.transform(bank.mean[0, :3], tag)
         towards = np.arctan2(*(fact.place - tagged)[::-1]) - bank.mean[0, 2]
         waves = np.array([np.cos(towards * np.array([1, 2, 3])), np.sin(towards * np.array([1, 2, 3]))]).ravel()
-        known = 20.0 * (0.08**2 * np.exp(-np.hypot(*(tagged - field.places[0])) / 2.0) + 0.1**2)
+        known = map_coordinates(table, (tagged - field.origin)[:, None], order=1, mode="nearest")[0]
 
         def expected(x, waves=waves, known=known):
             place = x[:2] + se2.rotate(x[2], tag)
@@ -52,7 +54,7 @@ def test_repeated_ranges_count_as_the_mean_of_their_correlated_errors_varies():
     """White noise and multipath over 200 lengths: the variance of the mean is that of so many independent ranges."""
     noise, every, count = RangeNoise(0.06, 0.1, 0.8), 0.05, 3200
     sigma = float(np.hypot(noise.white, noise.slow))
-    fact = RangeFacts(0, np.zeros(2), 1.0, 0.0, sigma, 0.0, RangeErrors(np.zeros((0, 2)), np.zeros(0), noise))
+    fact = RangeFacts(0, np.zeros(2), 1.0, 0.0, sigma, 0.0, RangeErrors(np.zeros(2), 1.0, np.zeros((1, 1)), noise))
     away = every * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     variance = noise.white**2 / count + noise.slow**2 * np.exp(-away / noise.length).mean()
     white = (fact.white / sigma) ** 2

@@ -6,6 +6,8 @@ import numpy as np
 from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.localization.walls import Rays, walls_of
 
 POSE = np.array([3.0, 2.5, 0.6])
@@ -82,3 +84,21 @@ def test_the_nearest_points_are_those_of_a_search_of_all():
     # The table tells the nearest point of a cell's centre.
     np.testing.assert_allclose(found[near], true[near], atol=0.05 * np.sqrt(2.0))
     assert np.isinf(found[true > 0.6]).all()
+
+
+def test_a_few_cells_of_a_wall_know_its_direction_as_well_as_their_rounding_allows():
+    """Three to nine cells of straight walls of any small angle: their lines' angles err as the stated variance says."""
+    rng, geometry = np.random.default_rng(4), GridGeometry(0.05, np.zeros(2), 60, 60)
+    squared = []
+    for _ in range(300):
+        count, angle, offset = int(rng.integers(3, 10)), rng.uniform(-0.12, 0.12), rng.uniform(1.95, 2.05)
+        col = np.arange(30 - count // 2, 30 - count // 2 + count)
+        row = ((offset + np.tan(angle) * 0.05 * (col - 30)) / 0.05).astype(int)
+        odds = np.where(np.arange(60)[:, None] < row.mean(), -4.0, 0.0) * np.ones(60)
+        odds[row, col] = 4.0
+        walls = walls_of(OccupancyGrid(geometry, odds.astype(np.float32)))
+        lined = np.flatnonzero(np.hypot(*walls.normals.T) > 0.5)
+        middle = lined[np.argmin(np.abs(walls.points[lined, 0] - 1.525))]
+        normal = walls.normals[middle]
+        squared.append((np.arctan2(normal[0], -normal[1]) - angle) ** 2 / walls.normal_variance[middle])
+    assert 0.3 < np.mean(squared) < 2.0

@@ -120,7 +120,7 @@ def test_anchors_that_stay_keep_their_names_and_nothing_is_told(held):
 
 @pytest.mark.parametrize("held", [True, False])
 def test_an_anchor_that_is_moved_has_two_places(held):
-    estimate, task = planted(moves=[(0, 1, (-2.0, 1.5), 70.0, 70.0)], held=held)
+    estimate, task = planted(moves=[(0, 1, (-2.0, 1.5), 70.0, 70.0)], held=held, height=None if held else 0.0)
     found = decide_places(estimate, task)
     assert found.anchor_ids == (*NAMES, "B@2")
     assert told(task) == [("moved-anchor", "B", "B@2")]

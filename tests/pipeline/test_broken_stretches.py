@@ -37,8 +37,7 @@ SLIP = 40.0
 def walked(shift=(0.0, 0.0), moved=(0, 1, 2, 3)):
     """Return an estimate at the true poses, all clouds matched, its task and the true poses.
 
-    The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift;
-    heights are then given.
+    The wheels do not count a second of the way. From then on, the ranges to some anchors are those of anchors moved by a shift.
     """
     estimate, task, true = walked_once(shift, moved)
     task = replace(task, stages=Stages(None, None))
@@ -60,7 +59,7 @@ def walked_once(shift, moved):
     log = SensorLog(
         odometry(stamps, chain(truth[0], motion)), replace(radio, ranges=measured),
         scans(stamps, truth, HALL, rate=4.0, sweep=0.0, range_max=6.0, noise=0.01, rng=rng),
-        SensorMounting() if shift == (0.0, 0.0) else SensorMounting(anchor_height=0.0),
+        SensorMounting(anchor_height=0.0),
     )  # fmt: skip
     task = Task(gather([log], KeyframeConfig()), MappingConfig(), Constraints(), Stages(None, None))
     estimate, true = (
@@ -98,7 +97,7 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     task.stages.note("clock-offset", offset=0.1)
     mended = replace_broken_stretches(estimate, task)
     assert aligned_error(mended.graph.poses[:, :2], true[:, :2]) < 0.05
-    # Their heights and constant errors are unknown.
+    # Their constant errors are unknown.
     np.testing.assert_allclose(mended.graph.anchors, ANCHORS, atol=0.4)
     finding = told(task.stages.facts)[-1]
     assert (finding.kind, finding.severity, finding.sensor, finding.recording) == ("worse-than-parts", "doubt", "lidar", 1)

@@ -24,7 +24,7 @@ from uwblite.problem.solution import at_given_poses
 @pytest.fixture(scope="module")
 def room():
     log = recording(two_rounds())
-    return log.crop(end=float(log.odometry.stamps[0]) + 15.0)
+    return log.crop(end=float(log.odometry.stamps[0]) + 6.0)
 
 
 @pytest.mark.parametrize(("most", "kind"), [(10_000, "warnings"), (150, "doubts")])

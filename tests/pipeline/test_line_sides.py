@@ -1,6 +1,7 @@
 """Trajectories caught on the wrong side of a line of anchors, and when another side is a doubt."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
 from uwblite.pipeline import line_sides, radio_stages
-from uwblite.pipeline.estimate import Task
+from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.recordings import gather
 from uwblite.sensor_log import SensorLog
 
 
+@cache
 def there_and_back(across: float) -> tuple[Task, np.ndarray]:
     """Return a drive along a corridor and back, beside four anchors on a line or with every other one so far across, m."""
     rng = np.random.default_rng(3)
@@ -33,6 +35,12 @@ def there_and_back(across: float) -> tuple[Task, np.ndarray]:
     return task, np.column_stack([np.interp(at, log.odometry.stamps, column) for column in truth[:, :2].T])
 
 
+@cache
+def estimated(across: float) -> Estimate:
+    """Return the first estimate of that drive."""
+    return radio_stages.first_optimisation(there_and_back(across)[0])
+
+
 def error(found: np.ndarray, true: np.ndarray) -> float:
     """Return the rms distance of places from where they are, up to reflection, m."""
     both = (found[:, :2] * [1.0, side] for side in (1.0, -1.0))
@@ -40,8 +48,7 @@ def error(found: np.ndarray, true: np.ndarray) -> float:
 
 
 def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
-    task, true = there_and_back(0.0)
-    estimate = radio_stages.first_optimisation(task)
+    (task, true), estimate = there_and_back(0.0), estimated(0.0)
     graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     assert error(graph.poses, true) < 0.15
     # One way is caught where it is put to the other side of the anchors.
@@ -63,8 +70,7 @@ def test_anchors_stand_on_a_line_but_for_one(beside, line):
 
 
 def test_anchors_on_both_sides_leave_no_other_side():
-    task, true = there_and_back(2.4)
-    estimate = radio_stages.first_optimisation(task)
+    (task, true), estimate = there_and_back(2.4), estimated(2.4)
     graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     assert error(graph.poses, true) < 0.15
     assert not line_sides.mirrored_tails(graph, estimate.placed)
@@ -75,8 +81,7 @@ def test_anchors_on_both_sides_leave_no_other_side():
 @pytest.mark.parametrize("caught", [False, True])
 def test_a_map_is_doubted_where_another_side_fits_about_as_well(caught):
     """So is one that is caught on the wrong side, and not the one on the side for which there is very strong evidence."""
-    task, _ = there_and_back(0.0)
-    estimate = radio_stages.first_optimisation(task)
+    (task, _), estimate = there_and_back(0.0), estimated(0.0)
     estimate = replace(estimate, graph=estimate.graph.with_edges(*estimate.odometry_and_ranges))
     if caught:
         start = estimate.graph.with_estimates_of(estimate.other_side)

@@ -18,7 +18,7 @@ from uwblite.sensor_log import Odometry, SensorMounting
 def test_keyframes_and_clouds_follow_the_lidar_s_clock(late):
     """Scans of a room whose stamps are late by a constant; the correction of a clock that is late is negative."""
     rng = np.random.default_rng(3)
-    stamps, truth = wander(rng, 90.0)
+    stamps, truth = wander(rng, 60.0)
     seen = scans(stamps, truth, box(9, 7), rate=10.0, beams=120, sweep=0.0)
     seen = seen.rows(np.arange(5, len(seen.stamps) - 5))
     log = recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()).with_later_scans(late)

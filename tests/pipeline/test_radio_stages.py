@@ -83,9 +83,9 @@ PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
 
 
 def surveyed(bias=(0.0,) * 4, scale=1.0, seed=3):
-    """Return the task of a walk of 80 m among four anchors, with a radio of such biases, m, and scale."""
+    """Return the task of a walk of 60 m among four anchors, with a radio of such biases, m, and scale."""
     rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, 80.0)
+    stamps, truth = planted.wander(rng, 60.0)
     radio = planted.ranges(rng, stamps, truth, PLACES, sigma=0.08, bias=bias)
     radio = replace(radio, ranges=radio.ranges * scale)
     wheels = planted.odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)

@@ -47,7 +47,7 @@ def test_what_is_kept_stays_and_holds_all_that_is_looked_at(seed):
 
 
 def test_a_map_of_the_thinned_recording_is_the_same_map():
-    log = planted(3)
+    log = planted(3, 8.0)
     config = MappingConfig()
     whole, part = build_map(log, config), build_map(thinned(log, config.keyframes, config.grid), config)
     np.testing.assert_array_equal(whole.trajectory, part.trajectory)

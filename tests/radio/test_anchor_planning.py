@@ -76,10 +76,10 @@ def test_the_first_place_is_the_best_of_all_and_more_never_harm():
 
 def test_anchors_go_where_none_are_in_line_of_sight():
     """Two rooms joined by a door; all anchors stand in the left one."""
-    grid = hall(wall_at=50, door=range(28, 32))
-    plan = plan_anchors(grid, np.array([[-2.0, 3.0], [-2.0, 13.0], [5.0, 8.0]]), 2)
-    assert (plan.places[:, 0] > -3.0 + 0.2 * 50).all()
-    right = plan.points[:, 0] > -3.0 + 0.2 * 51
+    grid = hall(44, 70, wall_at=35, door=range(20, 24))
+    plan = plan_anchors(grid, np.array([[-2.0, 3.0], [-2.0, 10.0], [3.0, 7.0]]), 2)
+    assert (plan.places[:, 0] > -3.0 + 0.2 * 35).all()
+    right = plan.points[:, 0] > -3.0 + 0.2 * 36
     assert plan.errors[-1][right].mean() < 0.6 * plan.errors[0][right].mean()
 
 
@@ -107,7 +107,7 @@ def test_places_half_a_metre_from_walls_are_those_of_a_loop():
 
 
 def test_places_keep_half_a_metre_from_walls_where_there_is_room():
-    grid = hall(wall_at=50, door=range(28, 32))
+    grid = hall(44, 70, wall_at=35, door=range(20, 24))
     plan = plan_anchors(grid, np.zeros((0, 2)), 4)
     walls = grid.occupied_points()
     for place in plan.places:

@@ -13,8 +13,8 @@ from uwblite.sensor_log import Odometry, SensorLog
 CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 
 
-def late_by(seconds, seed=1, metres=100.0, still=()):
-    """Return a drive of 200 s among four anchors; ranges are stamped late, and wheels count nothing at times, s."""
+def late_by(seconds, seed=1, metres=60.0, still=()):
+    """Return a drive of 120 s among four anchors; ranges are stamped late, and wheels count nothing at times, s."""
     rng = np.random.default_rng(seed)
     stamps, truth = planted.wander(rng, metres)
     wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.01, turn_noise=0.01)
@@ -37,8 +37,7 @@ def kinds_of(log):
     return [(fact.kind, fact.figures.get("what", "")) for fact in explained_by_ranges(log)[1]]
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("late", [-18.0, 5.0])
+@pytest.mark.parametrize(("seed", "late"), [(0, -18.0), (1, 5.0)])
 def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
     log = late_by(late, seed)
     moved, (fact,) = explained_by_ranges(log)
@@ -47,7 +46,7 @@ def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
     np.testing.assert_allclose(moved.ranges.stamps, log.ranges.stamps - fact.figures["late"])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_sound_recording_has_nothing_to_explain(seed):
     log = late_by(0.0, seed)
     assert explained_by_ranges(log) == (log, [])
@@ -57,8 +56,8 @@ def test_a_sound_recording_has_nothing_to_explain(seed):
     assert explained_by_ranges(few) == (few, [])
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("still", [((80.0, 100.0),), ((100.0, 200.0),)])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("still", [((45.0, 60.0),), ((60.0, 120.0),)])
 def test_wheels_that_stand_still_make_no_clock(seed, still):
     moved, facts = explained_by_ranges(late_by(0.0, seed, still=still))
     assert moved.ranges.stamps[0] == late_by(0.0, seed).ranges.stamps[0]
@@ -69,28 +68,43 @@ def test_wheels_that_stand_still_make_no_clock(seed, still):
 def test_wheels_that_turn_at_random_make_no_clock(seed):
     """Each stretch fits at some other offset; all are no clock."""
     rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, 200.0)
+    stamps, truth = planted.wander(rng, 80.0)
     wheels = planted.odometry(stamps, truth, rng, noise=0.05, turn_noise=0.6)
     log = SensorLog(wheels, planted.ranges(rng, stamps, truth, CORNERS, rate=1.0, sigma=0.15, outliers=0.1), None)
     assert "late-ranges" not in dict(kinds_of(log))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_names_exchanged_half_way_are_named(seed):
     log = late_by(0.0, seed)
     radio = log.ranges
-    other = np.where((radio.stamps > 100.0) & (radio.anchor < 2), 1 - radio.anchor, radio.anchor)
+    other = np.where((radio.stamps > 60.0) & (radio.anchor < 2), 1 - radio.anchor, radio.anchor)
     (fact,) = explained_by_ranges(replace(log, ranges=replace(radio, anchor=other)))[1]
     assert fact.kind == "exchanged-names"
     assert set(fact.figures["anchors"]) == set(radio.anchor_ids[:2])
-    assert fact.figures["at"] == pytest.approx(100.0, abs=10.0)
+    assert fact.figures["at"] == pytest.approx(60.0, abs=10.0)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
+def test_names_exchanged_on_a_path_that_drifts_are_no_fault_of_the_wheels(seed):
+    """Moments before and after the exchange see it on one side, where no path explains it; it is one cause."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 120.0)
+    wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.02, turn_noise=0.08)
+    anchors = np.concatenate([CORNERS[:, :2], [[3.0, -6.0], [-5.0, 2.0]]])
+    radio = planted.ranges(rng, stamps, truth, anchors, rate=2.0, sigma=0.05, outliers=0.1)
+    other = np.where(radio.stamps > 60.0, (radio.anchor + 1) % len(anchors), radio.anchor)
+    facts = explained_by_ranges(SensorLog(wheels, replace(radio, anchor=other), None))[1]
+    exchanged = [fact for fact in facts if fact.kind == "exchanged-names"]
+    assert [set(fact.figures["anchors"]) for fact in exchanged] == [set(radio.anchor_ids)]
+    assert [fact for fact in facts if abs(fact.figures["at"] - 60.0) < 15.0] == exchanged
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_ranges_that_are_any_numbers_from_half_time_are_no_fault_of_the_wheels(seed):
     log, rng = late_by(0.0, seed), np.random.default_rng(seed)
     radio = log.ranges
-    values = np.where(radio.stamps > 100.0, rng.uniform(0.5, 15.0, len(radio.stamps)), radio.ranges)
+    values = np.where(radio.stamps > 60.0, rng.uniform(0.5, 15.0, len(radio.stamps)), radio.ranges)
     assert ("exchanged-names", "no distances") in kinds_of(replace(log, ranges=replace(radio, ranges=values)))
     assert "wheels-against-ranges" not in dict(kinds_of(replace(log, ranges=replace(radio, ranges=values))))
 
@@ -99,10 +113,10 @@ def test_ranges_that_are_any_numbers_from_half_time_are_no_fault_of_the_wheels(s
 @pytest.mark.parametrize(
     ("what", "begin", "end", "change"),
     [
-        ("mirrored", 100.0, 200.0, lambda steps: steps * np.array([1.0, -1.0, -1.0])),
-        ("turned", 100.0, 100.1, lambda steps: steps - np.array([0.0, 0.0, 1.5])),
-        ("turns", 100.0, 200.0, lambda steps: steps * np.array([1.0, 1.0, 0.0])),
-        ("ways", 80.0, 130.0, lambda steps: steps * np.array([2.0, 2.0, 1.0])),
+        ("mirrored", 60.0, 120.0, lambda steps: steps * np.array([1.0, -1.0, -1.0])),
+        ("turned", 60.0, 60.1, lambda steps: steps - np.array([0.0, 0.0, 1.5])),
+        ("turns", 60.0, 120.0, lambda steps: steps * np.array([1.0, 1.0, 0.0])),
+        ("ways", 45.0, 90.0, lambda steps: steps * np.array([2.0, 2.0, 1.0])),
     ],
 )
 def test_what_is_wrong_with_the_wheels_is_named(seed, what, begin, end, change):
@@ -111,19 +125,19 @@ def test_what_is_wrong_with_the_wheels_is_named(seed, what, begin, end, change):
     named = {what, "elsewhere"} if what == "turned" else {what}
     assert named & {fact.figures["what"] for fact in facts}
     if what == "turned":
-        assert facts[0].figures["at"] == pytest.approx(100.0, abs=10.0)
+        assert facts[0].figures["at"] == pytest.approx(60.0, abs=10.0)
     if what == "ways":
         assert facts[0].figures["value"] == pytest.approx(2.0, rel=0.25)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_anchor_that_is_moved_is_no_fault_of_the_wheels(seed):
     rng = np.random.default_rng(seed)
-    stamps, truth = planted.wander(rng, 100.0)
+    stamps, truth = planted.wander(rng, 60.0)
     wheels = planted.odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
     moved = CORNERS + np.array([[0.0], [0.0], [3.0], [0.0]])
     one, other = (planted.ranges(np.random.default_rng(seed), stamps, truth, at, rate=1.0) for at in (CORNERS, moved))
-    radio = replace(one, ranges=np.where(one.stamps > 100.0, other.ranges, one.ranges))
+    radio = replace(one, ranges=np.where(one.stamps > 60.0, other.ranges, one.ranges))
     assert kinds_of(SensorLog(wheels, radio, None)) == []
 
 
@@ -132,7 +146,7 @@ def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
     rng, policy = np.random.default_rng(0), RangePolicy(noise=(0.2,))
     paths = rng.normal(size=(2, 30, 2)) * 3.0
     values = np.hypot(*(paths[0] - [7.0, -4.0]).T) + 0.05 * rng.standard_normal(30)
-    (likely,) = _best_place(paths, values, policy)
+    (likely,) = _best_place(paths, values, np.ones(30), policy)
     around = np.stack(np.meshgrid(np.linspace(6.0, 8.0, 81), np.linspace(-5.0, -3.0, 81)), axis=-1).reshape(-1, 1, 2)
     errors = np.hypot(*np.moveaxis(paths[0] - around, -1, 0)) - values
     best = -np.log(np.pi * 0.2 * (1.0 + (errors / 0.2) ** 2)).sum(axis=1)

@@ -18,7 +18,8 @@ from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRan
 
 @pytest.fixture(scope="module")
 def sound():
-    return recording(two_rounds())
+    """A round and a half."""
+    return recording(two_rounds()[:2400])
 
 
 def with_poses(log, poses):

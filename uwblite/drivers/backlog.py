@@ -9,6 +9,7 @@ have the usual distance, and each frame its usual place in the round.
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 PAUSE, LEAST_PAUSE = 3.0, 0.1
@@ -73,10 +74,11 @@ class Backlog:
 
     def deadline(self) -> float | None:
         """Return the time at which events that wait need not do so any longer, s."""
-        frames = [(held.event.stamp, held.spacing) for held in self._waiting[-MEMORY:] if held.spacing is not None]
+        latest_first = reversed(self._waiting[-MEMORY:])
+        frames = list(islice(((held.event.stamp, held.spacing) for held in latest_first if held.spacing is not None), FAST))
         if not frames:
             return None
-        return float(frames[-FAST:][0][0] + min(LOOK * frames[-1][1], MOST_LOOK))
+        return float(frames[-1][0] + min(LOOK * frames[0][1], MOST_LOOK))
 
     def due(self, now: float) -> list[Any]:
         """Return the events that need not wait any longer at time `now`, s."""

@@ -13,6 +13,7 @@ to compute row and column counts for sparse Cholesky factorization, SIAM J. Matr
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree, reverse_cuthill_mckee
 from scipy.sparse.linalg import spilu
@@ -32,20 +33,37 @@ are connected, in the rooms of a site or the streets of a town only those nearby
 MOST_WORK = 4e9
 """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
 any poses and any others, however few, fill the whole matrix."""
-_LITTLE_WORK = 1e8
-"""Multiplications in the envelope of a band up to which those of a sparser order are not counted."""
+_LITTLE_WORK = 4e8
+"""Multiplications in the envelope of a band up to which those of a sparser order are not counted: that takes half as long as a
+factorisation."""
 PER_COMPLEX = 4
 """Multiplications in one of complex numbers."""
 
 
 def adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
     """Return a positive definite matrix with the pattern of a graph, by pairs (b, 2) of nodes that share an edge."""
-    a, b = pairs[pairs[:, 0] != pairs[:, 1]].T
+    a, b = _apart(pairs)
     each = np.arange(nodes)
-    rows, columns = np.concatenate([each, a, b]), np.concatenate([each, b, a])
-    values = np.ones(len(rows))
-    values[:nodes] += len(rows)
-    return sparse.csc_matrix((values, (rows, columns)), shape=(nodes, nodes))
+    rows, indptr = _compressed(np.concatenate([each, a, b]), np.concatenate([each, b, a]), nodes)
+    values = np.where(rows == np.repeat(each, np.diff(indptr)), 1.0 + len(rows), 1.0)
+    return sparse.csc_matrix((values, rows, indptr), shape=(nodes, nodes))
+
+
+def _apart(pairs: Ints) -> tuple[Ints, Ints]:
+    """Return the two nodes (p,), (p,) of each pair (b, 2) of different ones."""
+    one, other = pairs[:, 0], pairs[:, 1]
+    different = np.flatnonzero(one != other)
+    return one.take(different), other.take(different)
+
+
+def _compressed(minor: Ints, major: Ints, nodes: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the different entries of a matrix (nodes, nodes) in compressed form: the ascending minor indices of every major
+    one, and where each of these begins (nodes + 1,). One sort of numbers takes a third of the time of sparse.coo_matrix."""
+    keys = np.sort(major.astype(WIDE, copy=False) * nodes + minor)
+    keys = keys[np.flatnonzero(np.diff(keys, prepend=-1))]
+    major = keys // max(nodes, 1)
+    ends = np.cumsum(np.bincount(major, minlength=nodes), dtype=np.int32)
+    return (keys - major * nodes).astype(np.int32), np.append(np.zeros(1, dtype=np.int32), ends)
 
 
 def pairs_of(matrix: sparse.csc_matrix) -> Ints:
@@ -69,13 +87,17 @@ def alike_columns(matrix: sparse.csc_matrix) -> tuple[Ints, Ints]:
     return group, np.stack([group[column[kept]], group[row[kept]]], axis=1)
 
 
-def narrow_order(pairs: Ints, nodes: int) -> tuple[Ints, Ints]:
-    """Return the order (nodes,) of a narrow band, by reverse Cuthill-McKee, and how far (nodes,) each row reaches in it."""
-    order = reverse_cuthill_mckee(adjacency(pairs, nodes).tocsr(), symmetric_mode=True).astype(np.intp)
-    lower = _lower_triangle(pairs, order)
-    first, some = np.arange(nodes), np.diff(lower.indptr) > 0
-    first[some] = lower.indices[lower.indptr[:-1][some]]
-    return order, np.arange(nodes) - first
+def narrow_order(pattern: sparse.csc_matrix) -> tuple[Ints, Ints]:
+    """Return the order (n,) of a narrow band, by reverse Cuthill-McKee, and how far (n,) each row reaches in it.
+
+    Parameters
+    ----------
+    pattern : see adjacency.
+    """
+    order = reverse_cuthill_mckee(pattern.T, symmetric_mode=True).astype(np.intp)
+    place = np.argsort(order)
+    first = np.minimum.reduceat(place[pattern.indices], pattern.indptr[:-1]) if len(order) else order
+    return order, (place - first)[order]
 
 
 def is_full(reach: Ints) -> bool:
@@ -91,14 +113,17 @@ _SMALL, _WIDE = 3000, 0.1
 """Number of rows, and their share in the band of such a matrix. For the streets of a town it is a fiftieth."""
 
 
-def minimum_degree(pairs: Ints, nodes: int) -> Ints:
-    """Return the order (nodes,) of elimination by multiple minimum degree.
+def minimum_degree(pattern: sparse.csc_matrix) -> Ints:
+    """Return the order (n,) of elimination by multiple minimum degree.
 
     SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, then takes almost no time; a
     complete one would compute the fill that is only to be counted.
+
+    Parameters
+    ----------
+    pattern : see adjacency.
     """
     options = {"SymmetricMode": True, "Equil": False}
-    pattern = adjacency(pairs, nodes)
     factor = spilu(pattern, 1.0, 1.0, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
     return np.asarray(np.argsort(factor.perm_c))
 
@@ -147,7 +172,7 @@ def order_of_columns(matrix: sparse.csc_matrix) -> Ints:
     """Return the order (n,) of elimination of the columns of a symmetric matrix, whose rows ascend in each of them: by minimum
     degree of groups that are alike, with every subtree contiguous."""
     group, pairs = alike_columns(matrix)
-    place = np.argsort(contiguous(pairs, minimum_degree(pairs, int(group.max(initial=-1)) + 1))[0])
+    place = np.argsort(contiguous(pairs, minimum_degree(adjacency(pairs, int(group.max(initial=-1)) + 1)))[0])
     return np.argsort(place[group], kind="stable")
 
 
@@ -196,20 +221,19 @@ _ALONE = 6.0
 def work_of(matrix: sparse.csc_matrix) -> float:
     """Return the multiplications of a factorisation of a symmetric matrix by minimum degree; infinite where it fills up."""
     pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
-    if is_full(narrow_order(pairs, len(width))[1]):
+    pattern = adjacency(pairs, len(width))
+    if is_full(narrow_order(pattern)[1]):
         return np.inf
-    order, parent = contiguous(pairs, minimum_degree(pairs, len(width)))
+    order, parent = contiguous(pairs, minimum_degree(pattern))
     return work(pairs, order, width, parent)
 
 
 def _lower_triangle(pairs: Ints, order: Ints) -> sparse.csr_matrix:
     """Return the pattern below the diagonal of the matrix with its nodes in this order; columns ascend in every row."""
     place = np.argsort(order)
-    both = place[pairs[pairs[:, 0] != pairs[:, 1]]]
-    entries = np.ones(len(both)), (both.max(axis=1, initial=0), both.min(axis=1, initial=len(order)))
-    lower = sparse.csr_matrix(entries, shape=(len(order), len(order)))
-    lower.sort_indices()
-    return lower
+    one, other = map(place.take, _apart(pairs))
+    columns, indptr = _compressed(np.minimum(one, other), np.maximum(one, other), len(order))
+    return sparse.csr_matrix((np.ones(len(columns)), columns, indptr), shape=(len(order), len(order)))
 
 
 def _first_below(parent: Ints) -> Ints:
@@ -263,22 +287,24 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     """
     if poses < 2:
         return Ordering(np.arange(poses), False, False)
-    among = pairs[(pairs < poses).all(axis=1)]
+    among = pairs.take(np.flatnonzero(np.maximum(pairs[:, 0], pairs[:, 1]) < poses), axis=0)
     if last is not None:
         return Ordering(_before(among, poses, last), False, False)
+    pattern = adjacency(among, poses)
     if subtrees:
-        return Ordering(contiguous(among, minimum_degree(among, poses))[0], False, False)
+        return Ordering(contiguous(among, minimum_degree(pattern))[0], False, False)
     bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
     tied = poses >= _MANY and len(among) - poses > _TIED * poses
     if bordered or tied:
-        order, reach = narrow_order(among, poses)
+        order, reach = narrow_order(pattern)
         if bordered and reach.max() <= _WIDEST_BAND:
             return Ordering(order, True, True)
         if tied and is_full(reach):
             return Ordering(np.arange(poses), False, False, iterative=True)
-    order, parent = contiguous(among, minimum_degree(among, poses))
+    order = minimum_degree(pattern)
     if bordered and not tied and (most := 27.0 * float(np.sum((reach + 1.0) ** 2))) <= _LITTLE_WORK:
         return Ordering(order, True, False, work=most)
+    order, parent = contiguous(among, order)
     if bordered:
         multiplications = work(among, order, width, parent)
     else:
@@ -300,7 +326,7 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
     late[last[last >= 0]] = True
     reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
     if reach > _LONGEST_LINK:
-        order = minimum_degree(pairs, poses)
+        order = minimum_degree(adjacency(pairs, poses))
     else:
         block = np.arange(poses) // reach + 1
         order = np.lexsort((np.arange(poses), block & -block))

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import WIDE, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
 from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
@@ -139,7 +139,13 @@ class Blocks:
 
     def inside(self, size: int) -> "Blocks":
         """Return the blocks within the first rows and columns; no block crosses this limit."""
-        keep = self.row < size
+        return self._some(self.row < size, size)
+
+    def below(self, size: int) -> "Blocks":
+        """Return the blocks whose rows come after the first."""
+        return self._some(self.row >= size, self.size)
+
+    def _some(self, keep: Bools, size: int) -> "Blocks":
         row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
         return Blocks(row, column, height, width, start, size)
 
@@ -235,10 +241,9 @@ class BorderedLayout:
 
     def __init__(self, inside: Layout, blocks: Blocks, size: int) -> None:
         """Find where in the border each value goes; the first `size` rows are inside."""
-        rows, columns, places = blocks.entries()
-        below = rows >= size
+        rows, columns, self._from = blocks.below(size).entries()
         self._inside, self._shape = inside, (blocks.size - size, blocks.size)
-        self._from, self._to = places[below], columns[below] + (rows[below] - size) * blocks.size
+        self._to = columns + (rows - size) * blocks.size
 
     def factor(self, values: Floats) -> BorderedFactor:
         """Factorise the matrix with these values."""

@@ -253,7 +253,7 @@ class Graph:
 def edge_cost(edges: Edges, residuals: Floats) -> float:
     """Return the robust, weighted cost of whitened residuals (e, d) of these edges."""
     rho = edges.kernel.rho(np.einsum("ed,ed->e", residuals, residuals))
-    return float(np.sum(rho * edges.own_weights))
+    return float(np.sum(rho if edges.weights is None else rho * edges.weights))
 
 
 def linearized_cost(graph: Graph, linearized: Sequence[Linearization]) -> float:

@@ -53,9 +53,10 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -
     linked : (n - 1,) pose k + 1 is defined relative to pose k.
     """
     shift, start = unknowns.spread("poses", step), moved(graph, unknowns, step).poses
-    link = se2.between(graph.poses[:-1], graph.poses[1:])
-    by_first, by_second = se2.between_jacobians(graph.poses[:-1], graph.poses[1:])
-    link = link + np.einsum("eij,ej->ei", by_first, shift[:-1]) + np.einsum("eij,ej->ei", by_second, shift[1:])
+    link, change = se2.between(graph.poses[:-1], graph.poses[1:]), np.diff(shift, axis=0)
+    turned = np.stack([link[:, 1], -link[:, 0]], axis=1) * shift[:-1, 2:]
+    link[:, :2] += se2.rotate(-graph.poses[:-1, 2], change[:, :2]) + turned
+    link[:, 2] += change[:, 2]
     free = np.zeros(len(start), dtype=bool)
     free[1:] = linked & np.all(unknowns.number["poses"][1:] >= 0, axis=1)
     first = np.maximum.accumulate(np.where(free, 0, np.arange(len(free))))

@@ -1,12 +1,12 @@
 """Point-to-line ICP of many pairs of clouds at once, each pair on its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import PairFactors, PairPoints, match, nondegenerate_step
@@ -60,16 +60,31 @@ def align_pairs(
     points : of the source clouds, see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
     """
     pose, gate, moving = guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
+    finished: list[tuple[Ints, PairFactors]] = []
     for _ in range(iterations):
         some = PairPoints(points.row[moving])
-        step = nondegenerate_step(match(clouds, raster, i[moving], pose[moving], some, gate, gate / 2.0))[0]
+        factors = match(clouds, raster, i[moving], pose[moving], some, gate, gate / 2.0)
+        step = nondegenerate_step(factors)[0]
         length = np.abs(step).max(axis=1)
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / DescentPolicy.farthest, np.abs(step[:, 2]) / DescentPolicy.widest)
         pose[moving] += step / np.maximum(reach, 1.0)[:, None]
         left = (length >= DescentPolicy.converged) | (gate > last_gate)
-        if not left.any():
-            break
+        if not left.all():
+            finished.append((moving[~left], _after(factors.rows(~left), step[~left])))
         gate = np.maximum(np.minimum(0.8 * gate, DescentPolicy.gate_per_step * length), last_gate)[left]
         moving = moving[left]
+        if not len(moving):
+            break
+    if len(moving) or not finished:
+        some = PairPoints(points.row[moving])
+        finished.append((moving, match(clouds, raster, i[moving], pose[moving], some, last_gate, last_gate / 2.0)))
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
-    return Aligned(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))
+    order = np.argsort(np.concatenate([which for which, _ in finished]))
+    return Aligned(pose, concatenated([factors for _, factors in finished]).rows(order))
+
+
+def _after(factors: PairFactors, step: Floats) -> PairFactors:
+    """Return the factors after steps (e, 3) so short that every point keeps its match."""
+    change = np.einsum("eij,ej->ei", factors.hessian, step)
+    squared = factors.squared + np.einsum("ei,ei->e", 2.0 * factors.gradient + change, step)
+    return replace(factors, gradient=factors.gradient + change, squared=squared)

@@ -98,6 +98,8 @@ class Lines:
     """(n,) points in the neighbourhood, the point itself included."""
     normal_variance: Floats
     """(n,) rad^2, variance of the normal's angle by the scatter about the line; 0 where there is no line."""
+    along: Floats
+    """(n,) m^2, variance of the neighbourhood along the line."""
 
 
 _ROUNDING = 1e-12
@@ -146,4 +148,5 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
         linearity=1.0 - ratio,
         neighbours=both + 1,
         normal_variance=np.where(valid, ratio / np.maximum(count - 2.0, 1.0), 0.0),
+        along=large,
     )

@@ -39,7 +39,7 @@ class Comparison:
     weight: Floats
     """(h,) log-likelihood."""
     fit: Floats
-    """(h,) mean log-likelihood of the rays."""
+    """(h,) mean log-likelihood of the rays that do not end in unknown space."""
     known: Floats
     """(h,) rays' ends in known space."""
     rays: Rays
@@ -68,7 +68,7 @@ class PlaceSearch:
     """
 
     def __init__(self, known: KnownMap) -> None:
-        self.walls, self._biases = known.walls, known.anchors.bias_sigma
+        self.walls, self._biases, self._errors = known.walls, known.anchors.bias_sigma, known.anchors.errors
         self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
         self._odom = np.zeros(3)
@@ -136,17 +136,21 @@ class PlaceSearch:
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        fit, known = np.zeros((2, len(poses)))
+        fit, judged, known = np.zeros((3, len(poses)))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for part in search.units(len(poses), PER_RAY * len(rays.hit)):
                 agreement = self.walls.agreement(poses[part], rays)
-                fit[part], known[part] = agreement.log_likelihood, agreement.known
+                fit[part], judged[part], known[part] = agreement.log_likelihood, agreement.fit, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
-        weight = range_likelihood.range_likelihood(poses, ranges) + independent * fit
+        weight = independent * fit
+        for part in search.units(len(poses), (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(ranges)):
+            expected = range_likelihood.expected_errors(poses[part], ranges, self._errors) if self._errors else None
+            weight[part] += range_likelihood.range_likelihood(poses[part], ranges, expected=expected)
+            yield (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(poses[part]) * len(ranges)
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])
-        parts_of = (weight[new], fit[new], known[new], rays, looks, ranges, independent)
+        parts_of = (weight[new], judged[new], known[new], rays, looks, ranges, independent)
         return Comparison(places, found.complete, *parts_of)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:

@@ -197,7 +197,7 @@ class PoseEstimator:
         if not self._certain and len(self._window.ranges) > 2 * self._searched_ranges:
             # The new ones leave far fewer places to compare: sooner done than what is under way.
             self._places.drop()
-            self._search_stamp = -np.inf
+            self._search_stamp, self._parts = -np.inf, 1
         if free and not self._places.idle:
             compared, done = self._places.advance(self._bank, odom)
             self.work += done

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..radio.range_errors import RangeErrors
 from .range_update import WILD, gross_share, repeated
 from .window import DRIFT, Ranges
 
-PER_RANGE = 35
-"""Operations on elements of arrays for the likelihood of a range at a pose."""
+PER_RANGE, PER_EXPECTED = 35, 50
+"""Operations on elements of arrays for the likelihood of a range at a pose, and for the error of the map's own ranges there."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
 _AT_ONCE = 512
@@ -68,18 +69,51 @@ def series(ranges: Ranges) -> Series:
     return Series(before, stay, change, np.where(again, 1.0 / many, 1.0))
 
 
-def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
+@dataclass(frozen=True, slots=True)
+class Detours:
+    """How ranges are late, beside a normal error: shares of the density that a normal error has at 0."""
+
+    core: float
+    """Of the normal error."""
+    late: float
+    """Of an exponentially distributed detour."""
+    length: float
+    """Its mean, m."""
+
+
+ANYWHERE = Detours(0.7, 0.3, 0.5)
+"""Where nothing is known of the place: a third of the ranges is late."""
+VISITED = Detours(0.83, 0.12, 0.4)
+"""Of ranges from which the map's own errors at the place are taken off: in twelve drives in maps of other drives, three
+buildings each of four worlds, 6 to 18 % were late by 0.2 to 0.7 m (means), where without that 10 to 46 % were."""
+
+
+def expected_errors(poses: Floats, ranges: Ranges, errors: tuple[RangeErrors, ...]) -> Floats:
+    """Return by how much the map's own ranges were off where the tag was (h, m), at poses (h, 3), m.
+
+    Parameters
+    ----------
+    errors : (a,) of the anchors.
+    """
+    late = np.zeros((len(poses), len(ranges)))
+    for anchor in np.unique(ranges.anchor):
+        own = np.flatnonzero(ranges.anchor == anchor)
+        late[:, own] = errors[anchor].at(poses[:, None, :2] + se2.rotate(poses[:, None, 2], ranges.tags[own][None]))
+    return late
+
+
+def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
 
     The error of ranges to one anchor stays what it was, with a probability that fades with the way, or is drawn anew.
 
     Parameters
     ----------
-    wider : added to every sigma, m: the poses are those of a grid.
+    wider : added to every sigma, m: the poses are those of a grid. expected : (h, m) errors of the map's own ranges there, m.
     """
     if not len(ranges):
         return np.zeros(len(poses))
-    error, fresh = _drawn(poses, ranges, wider)
+    error, fresh = _drawn(poses, ranges, wider, expected)
     chain = series(ranges)
     again = np.flatnonzero(chain.stay)
     change = (chain.change + wider)[again]
@@ -95,14 +129,19 @@ def shared_likelihood(poses: Floats, ranges: Ranges) -> Floats:
     return np.asarray(np.log(_drawn(poses, ranges)[1]) @ series(ranges).share)
 
 
-def _drawn(poses: Floats, ranges: Ranges, wider: float = 0.0) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _drawn(
+    poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the errors (h, m) of ranges, m, and their likelihoods (h, m), each drawn anew."""
     # Single precision, and the normal distribution by a tanh (Page, Applied Statistics 1977; off by 2e-4): a third of the time.
-    error, sigma = _misfits(poses, ranges).astype(np.float32), ranges.sigma + wider
+    misfit, sigma, detours = _misfits(poses, ranges), ranges.sigma + wider, ANYWHERE
+    if expected is not None:
+        misfit, detours = misfit - expected, VISITED
+    error = misfit.astype(np.float32)
     gross, z = gross_share(sigma).astype(np.float32), error / sigma.astype(np.float32)
     square = z * z
-    late = 0.15 * np.exp(-2.0 * np.maximum(error, 0.0)) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
-    return error, np.asarray(0.7 * np.exp(-0.5 * square) + late + gross, dtype=np.float32)
+    late = np.exp(np.maximum(error, 0.0) / -detours.length) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
+    return error, np.asarray(detours.core * np.exp(-0.5 * square) + 0.5 * detours.late * late + gross, dtype=np.float32)
 
 
 def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:

@@ -80,7 +80,7 @@ class Walls:
     one_sided: Bools
     """(n,) the wall was seen from the side of its normal alone."""
     normal_variance: Floats
-    """(n,) rad^2, of the normal's angle, by the scatter of the cells about the line."""
+    """(n,) rad^2, of the normal's angle, by the scatter of the cells about the line and by their rounding."""
     cell: float
     """m; of the table of nearest walls."""
     origin: Floats
@@ -215,7 +215,7 @@ def walls_of(grid: OccupancyGrid) -> Walls:
         return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), 1.0, none)
     resolution = grid.geometry.resolution
     sides = _free_side(grid.geometry, states, occupied)
-    lines = _lines(occupied, sides, max(_NORMAL_RADIUS, 3.0 * resolution))
+    lines = _lines(occupied, sides, resolution)
     normals = lines.normals * np.where((lines.normals * sides).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     one_sided = np.hypot(*sides.T) > 0.5
     points = lines.centers - _BEHIND * normals * one_sided[:, None]
@@ -233,13 +233,17 @@ def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats)
     return slope / np.maximum(np.hypot(*slope.T), _ONE_SIDE)[:, None]
 
 
-def _lines(points: Floats, sides: Floats, radius: float) -> Lines:
-    """Fit a line to each point's neighbours within a radius, m, on its own side of the wall: a thin wall has two surfaces."""
+def _lines(points: Floats, sides: Floats, resolution: float) -> Lines:
+    """Fit a line to each cell's neighbours on its own side of the wall, a thin one having two surfaces; resolution in m."""
+    radius = max(_NORMAL_RADIUS, 3.0 * resolution)
     lines = estimate_normals(points, make_tree(np.column_stack([points, radius * sides])), radius)
     straight = lines.linearity >= _STRAIGHT
     normals = np.where(straight[:, None], lines.normals, 0.0)
     centers = np.where(straight[:, None], lines.centers, points)
-    return replace(lines, centers=centers, normals=normals, normal_variance=np.where(straight, lines.normal_variance, 0.0))
+    # A few cells in a row seem to have no scatter at all: that of their rounding is certain.
+    rounded = resolution**2 / 12.0 / np.maximum(lines.neighbours * lines.along, resolution**2 / 12.0)
+    variance = np.where(straight, np.maximum(lines.normal_variance, rounded), 0.0)
+    return replace(lines, centers=centers, normals=normals, normal_variance=variance)
 
 
 _STRAIGHT = 0.6

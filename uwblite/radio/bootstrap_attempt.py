@@ -8,6 +8,7 @@ again and anchors not yet placed are searched from the poses so far.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -187,6 +188,21 @@ class Attempt:
         found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
         return BootstrapResult(final, self.placed, found, self.doubtful, self.slips)
 
+    def of_likely_slips(self) -> Self:
+        """Return the attempt, complete, without the slips that its measurements do not pay for once all is known."""
+        if not self.slips.any():
+            return self
+        likeliest, evidence = self, self.evidence()
+        for first, last in runs_of(self.slips > 0.0):
+            other = copy(likeliest)
+            other.poses, other.sigma, other.slips = likeliest.poses.copy(), likeliest.sigma.copy(), likeliest.slips.copy()
+            other.slips[first:last] = 0.0
+            other.wheels = with_slips(self.odometry, other.slips)
+            other._solve(_SCALES[1:])
+            if (without := other.evidence()) > evidence:
+                likeliest, evidence = other, without
+        return likeliest
+
     def evidence(self) -> float:
         """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant.
 
@@ -206,6 +222,11 @@ class Attempt:
             else:
                 likely -= 0.5 * float(edge_cost(edges, edges.residuals(part)))
         return likely + number * log_prior(0.0, independent / (number + 1))
+
+    @property
+    def suspects_slips(self) -> bool:
+        """Whether wheels slipped somewhere, or may have slipped in the clearest stretch, in which no slip is sought."""
+        return bool(self.slips.any()) or any(self._deviates(*self.first, forward=forward) for forward in (False, True))
 
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
@@ -322,9 +343,9 @@ class Attempt:
             return
         own = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
         rows, duration = self.ranges.rows(np.flatnonzero(own)), self.odometry.duration[low : high - 1]
-        prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
-        if bent - _USUAL * len(rows) + prior < EvidencePolicy.positive:
+        if not self._deviates(low, high, forward=forward):
             return
+        prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
         arm = rows.lever_arm + se2.rotate(rows.turn, np.broadcast_to(rows.tag, (len(rows), 2)))
         pose, steps, start = rows.pose - low, motion[low : high - 1], self.poses[low]
         if not forward:
@@ -345,9 +366,30 @@ class Attempt:
 
     def _cost(self, low: int, high: int) -> float:
         """Return half the robust chi2 of wheels and ranges over the poses [low, high), that of ranges as annealing ends."""
-        part, kernel = self._part(low, high), Kernel("geman-mcclure", _SCALES[-1])
-        robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in part.edges)
+        part = self._part(low, high)
+        robust = (replace(e, kernel=_LAST) if isinstance(e, RangeEdges) else e for e in part.edges)
         return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
+
+    def _deviates(self, low: int, high: int, *, forward: bool) -> bool:
+        """Return whether wheels and ranges deviate so much, from some pose of [low, high) on, that a slip may be likelier.
+
+        However long the part is, the few ranges beyond a slip near its end tell.
+
+        Parameters
+        ----------
+        forward : whether the pose at the lower end is known, not the other one.
+        """
+        part, excess, count = self._part(low, high), 0.0, 0
+        for edges in part.edges:
+            squared = np.einsum("ed,ed->e", residuals := edges.residuals(part), residuals)
+            if isinstance(edges, RangeEdges):
+                beyond = np.argsort(-edges.pose if forward else edges.pose, kind="stable")
+                off = np.cumsum((0.5 * _LAST.rho(squared) - _USUAL)[beyond])
+                excess, count = excess + float(off.max(initial=0.0)), len(edges)
+            else:
+                excess += 0.5 * float(squared.sum())
+        duration = float(self.odometry.duration[low : high - 1].sum())
+        return excess + log_prior(duration, count) >= EvidencePolicy.positive
 
     def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
@@ -356,7 +398,8 @@ class Attempt:
         """
         part = self._part(low, high)
         errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
-        if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
+        typical = float(np.median(np.abs(errors[0]))) if errors else 0.0
+        if typical < 2.0 and not (self.seeks and self._deviates(low, high, forward=fixed_pose == low)):
             return True
         self._anneal_poses(low, high, fixed_pose, _SCALES)
         return False
@@ -394,6 +437,7 @@ class Attempt:
 
 _SCALES = (20.0, 6.0, 3.0)
 """Scales of the ranges' kernel, one after the other, standard deviations."""
+_LAST = Kernel("geman-mcclure", _SCALES[-1])
 _USUAL = 0.5
 """Half the chi2 of a sound range."""
 

@@ -67,23 +67,34 @@ _MOST_CELLS = 400
 _GATE = 2.0
 """White standard deviations at which a range's weight falls to a half (Cauchy)."""
 _ITERATIONS = 4
+_PER_LENGTH, _MOST_ENTRIES, _FADED = 0.2, 10_000, 3.0
+"""Step of the table of errors, in lengths over which they are alike; most entries of an anchor, in larger buildings with a
+larger step; and lengths after which a place says nothing about another one: 5 %."""
 _APART = 1e6
 """m; between the anchors' ranges when their noise is learnt together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeErrors:
-    """The error of ranges to one anchor by the place of the tag."""
+    """The error of ranges to one anchor by the place of the tag, as a table: thousands of poses are compared by it."""
 
-    places: Floats
-    """(k, 2) m, map frame."""
-    coefficients: Floats
-    """(k,) 1/m."""
+    origin: Floats
+    """(2,) m, map frame, of the first entry."""
+    cell: float
+    """m between entries."""
+    table: Floats
+    """(x, y) m."""
     noise: RangeNoise
 
     def at(self, places: Floats) -> Floats:
-        """Return the errors (h,) to expect at places (h, 2) of the tag, m."""
-        return np.asarray(_covariance(places, self.places, self.noise) @ self.coefficients)
+        """Return the errors (...) to expect at places (..., 2) of the tag, m; outside of the table that of its edge."""
+        last = np.array(self.table.shape) - 1
+        at = np.clip((places - self.origin) / self.cell, 0.0, last)
+        low = np.minimum(at.astype(np.intp), np.maximum(last - 1, 0))
+        (x, y), (i, j) = np.moveaxis(at - low, -1, 0), np.moveaxis(low, -1, 0)
+        i1, j1 = np.minimum(i + 1, last[0]), np.minimum(j + 1, last[1])
+        lower, upper = (self.table[i, k] + x * (self.table[i1, k] - self.table[i, k]) for k in (j, j1))
+        return np.asarray(lower + y * (upper - lower))
 
 
 def range_errors(anchor: Ints, tags: Floats, bearings: Floats, errors: Floats, count: int) -> tuple[RangeErrors, ...]:
@@ -130,7 +141,20 @@ def _of_one(tags: Floats, errors: Floats, noise: RangeNoise) -> RangeErrors:
         coefficients = np.asarray(np.linalg.solve(covariance + np.diag(noise.white**2 / total), mean), dtype=np.float64)
         left = errors - (covariance @ coefficients)[member]
         weight = 1.0 / (1.0 + np.square(left / (_GATE * noise.white)))
-    return RangeErrors(places, coefficients, noise)
+    return _table(places, coefficients, noise)
+
+
+def _table(places: Floats, coefficients: Floats, noise: RangeNoise) -> RangeErrors:
+    """Return the errors about places (k, 2), m, to where they have faded, interpolated with coefficients (k,), 1/m."""
+    if not len(places):
+        return RangeErrors(np.zeros(2), 1.0, np.zeros((1, 1)), noise)
+    origin = places.min(axis=0) - _FADED * noise.length
+    size = places.max(axis=0) + _FADED * noise.length - origin
+    cell = max(_PER_LENGTH * noise.length, float(np.sqrt(np.prod(size) / _MOST_ENTRIES)))
+    x, y = (origin[k] + cell * np.arange(int(np.ceil(size[k] / cell)) + 1) for k in (0, 1))
+    # A line after the other, to bound the memory.
+    lines = [_covariance(np.column_stack([np.full(len(y), value), y]), places, noise) @ coefficients for value in x]
+    return RangeErrors(origin, cell, np.array(lines), noise)
 
 
 def _squares(tags: Floats) -> Ints:

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaln
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SensorLog, plausible
@@ -99,6 +99,8 @@ class Explanation:
     begin: float = 0.0
     end: float = np.inf
     """Way, m, on which it changes something."""
+    names: dict[str, str] = field(default_factory=dict)
+    """What anchors are called before the moment by what they are called after it."""
 
 
 def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> tuple[SensorLog, list[Fact]]:
@@ -112,8 +114,34 @@ def explained_by_ranges(log: SensorLog, policy: RangePolicy = RangePolicy()) -> 
         left = _at_moments(in_time, _traces(in_time, policy), policy)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
-            return in_time, [Fact.of(late.kind, **late.figures), *_facts(left, in_time)]
-    return log, _facts([ways, *moments], log)
+            return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left, policy), in_time)]
+    return log, _facts([ways, *_with_names_undone(log, moments, policy)], log)
+
+
+def _with_names_undone(log: SensorLog, rows: list[Explanation], policy: RangePolicy) -> list[Explanation]:
+    """Return the rows without those that the exchange of names explains: with the names exchanged back they are no more.
+
+    An exchange contradicts the path, too, at moments somewhat before it and after it, where it is on one side: what holds there
+    of two explanations of the same readings shows in what either leaves.
+    """
+    exchanges = [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong]
+    for row in sorted(exchanges, key=lambda row: -row.log_odds):
+        near = [other for other in rows if other.begin < row.end and row.begin < other.end]
+        undone = _with_names(log, 0.5 * (row.begin + row.end), row.names)
+        left = _at_moments(undone, _traces(undone, policy), policy, row)
+        if row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+            rows = [row, *left, *(other for other in rows if other not in near)]
+            log = undone
+    return rows
+
+
+def _with_names(log: SensorLog, way: float, names: dict[str, str]) -> SensorLog:
+    """Return the recording with anchors of other names from a moment on, given by the way, m."""
+    ranges = log.ranges
+    assert ranges is not None
+    at = np.interp(way, log.odometry.travelled, log.odometry.stamps)
+    others = np.array([ranges.anchor_ids.index(names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
+    return replace(log, ranges=replace(ranges, anchor=np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)))
 
 
 def _most(rows: Sequence[Explanation]) -> float:
@@ -164,7 +192,7 @@ def _over_stretches(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy
                 continue
             shifted = log.odometry.at((trace.stamps + offsets[:, None]).ravel())[:, :2].reshape(len(offsets), -1, 2)
             paths = np.concatenate([policy.factors[:, None, None] * trace.places, shifted])
-            one = _best_place(paths, trace.ranges, policy)
+            one = _best_place(paths, trace.ranges, np.ones(len(trace.ranges)), policy)
             sound[:, :, number] += one
             each = np.concatenate([each, one[:, None, count:]], axis=1)
     scaled, late = sound[:, :count], sound[:, count:].sum(axis=2)
@@ -188,14 +216,22 @@ def _over_stretches(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy
     return clock, Explanation(odds - null + float(costs), "wheels-against-ranges", other_ways, float(edges[a]), end)
 
 
-def _at_moments(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy) -> list[Explanation]:
+def _at_moments(
+    log: SensorLog, traces: Sequence[Trace], policy: RangePolicy, near: Explanation | None = None
+) -> list[Explanation]:
     """Return names that are exchanged, and paths that go on elsewhere, from a moment on.
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment.
+
+    Parameters
+    ----------
+    near : only moments whose stretches overlap with those of this one.
     """
     odometry, half, every = log.odometry, policy.stretch, 0.25 * policy.stretch
     longest, found = max(float(trace.ranges.max(initial=0.0)) for trace in traces), list[Explanation]()
-    for at in np.arange(half, float(odometry.travelled[-1]) - half, every):
+    for at in np.arange(half, float(odometry.travelled[-1]) - half, every).tolist():
+        if near is not None and (at + half <= near.begin or near.end <= at - half):
+            continue
         origin = se2.inverse(odometry.at(np.array([np.interp(at, odometry.travelled, odometry.stamps)]))[0])
         sides = [(trace.between(at - half, at, origin), trace.between(at, at + half, origin)) for trace in traces]
         sides = [side for side in sides if min(len(trace.ranges) for trace in side) >= policy.fewest]
@@ -206,11 +242,35 @@ def _at_moments(log: SensorLog, traces: Sequence[Trace], policy: RangePolicy) ->
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """Readings of several anchors on one stretch, filled up to the most that one of them has."""
+
+    places: Floats
+    """(a, n, 2) of the base, m."""
+    ranges: Floats
+    """(a, n) m."""
+    counted: Floats
+    """(a, n) 1 for a reading, 0 for what fills up."""
+
+    @staticmethod
+    def of(traces: Sequence[Trace]) -> "Side":
+        """Fill up the readings of each anchor."""
+        shape = len(traces), max(len(trace.ranges) for trace in traces)
+        places, ranges, counted = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape)
+        for k, trace in enumerate(traces):
+            many = len(trace.ranges)
+            places[k, :many], ranges[k, :many], counted[k, :many] = trace.places, trace.ranges, 1.0
+        return Side(places, ranges, counted)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Moment:
     """Readings of anchors before and after a moment."""
 
-    before: list[Trace]
-    after: list[Trace]
+    before: Side
+    after: Side
+    names: list[str]
+    """(a,) of the anchors."""
     sides: Floats
     """(2, a, g) log likelihoods of the readings to one place before, and to one after."""
     driven: Floats
@@ -224,73 +284,89 @@ class Moment:
         """Fit the places on both sides; None without anchors."""
         if not sides:
             return None
-        before, after = (list(side) for side in zip(*sides, strict=True))
-        likely = [[_best_place(trace.places[None], trace.ranges, policy)[:, 0] for trace in side] for side in (before, after)]
-        driven = np.array([[_by_way(trace, longest, policy) for trace in side] for side in (before, after)])
-        nothing = np.array([[_no_distances(trace, longest) for trace in side] for side in (before, after)])
-        return Moment(before, after, np.array(likely), driven, nothing, policy)
+        before, after = (Side.of([pair[k] for pair in sides]) for k in (0, 1))
+        likely = [_best_place(side.places, side.ranges, side.counted, policy).T for side in (before, after)]
+        driven = np.array([[_by_way(pair[k], longest, policy) for pair in sides] for k in (0, 1)])
+        nothing = np.array([[_no_distances(pair[k], longest) for pair in sides] for k in (0, 1)])
+        return Moment(before, after, [one.anchor for one, _ in sides], np.array(likely), driven, nothing, policy)
 
     @property
     def alone(self) -> Floats:
         """(a, g) log likelihoods of the readings to two places each."""
         return np.asarray(self.sides.sum(axis=0))
 
-    def likely(self, motions: Floats, sign: float = 1.0) -> Floats:
-        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not."""
-        each = np.stack([self.same(k, k, motions, sign) for k in range(len(self.before))])
-        return np.asarray(each.sum(axis=0).max(axis=0))
+    def likely(self, motions: Floats, sign: float = 1.0, names: Ints | None = None) -> Floats:
+        """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not, and of anchors that are others
+        (a,) after the moment."""
+        each = np.arange(len(self.names))
+        return np.asarray(self.same(each, each if names is None else names, motions, sign).sum(axis=1).max(axis=0))
 
-    def same(self, k: int, other: int, motions: Floats, sign: float = 1.0) -> Floats:
-        """Return log likelihoods (g, m) of anchor k before the moment being another one after it, moved or not."""
-        one, two = self.before[k], self.after[other]
-        moved = se2.transform(motions[:, None], two.places * np.array([1.0, sign]))
-        paths = np.concatenate([np.broadcast_to(one.places, (len(motions), *one.places.shape)), moved], axis=1)
-        likely = _best_place(paths, np.concatenate([one.ranges, two.ranges]), self.policy)
-        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + self.alone[k][:, None]))
+    def same(self, k: Ints, other: Ints, motions: Floats, sign: float = 1.0) -> Floats:
+        """Return log likelihoods (g, p, m) of anchors k (p,) before the moment being others (p,) after it, moved or not."""
+        one, two = self.before, self.after
+        moved = se2.transform(motions[:, None], two.places[other][:, None] * np.array([1.0, sign]))
+        still = np.broadcast_to(one.places[k][:, None], (len(k), len(motions), *one.places.shape[1:]))
+        ranges = np.concatenate([one.ranges[k], two.ranges[other]], axis=1)[:, None]
+        counted = np.concatenate([one.counted[k], two.counted[other]], axis=1)[:, None]
+        likely = _best_place(np.concatenate([still, moved], axis=2), ranges, counted, self.policy)
+        apart = self.sides[0, k] + self.sides[1, other]
+        return np.asarray(np.logaddexp(likely, np.log(self.policy.moved) + apart.T[:, :, None]))
 
-    def refined(self, motions: Floats, size: float, sign: float = 1.0) -> tuple[Floats, float]:
+    def refined(self, motions: Floats, size: float, sign: float = 1.0, names: Ints | None = None) -> tuple[Floats, float]:
         """Return the best motion (3,) about the best of some (m, 3), within a size, m, coarse to fine; its log likelihood."""
-        best = motions[np.argmax(self.likely(motions, sign))]
+        best = motions[np.argmax(self.likely(motions, sign, names))]
         around = np.stack(np.meshgrid(*3 * [np.array([-0.5, 0.0, 0.5])]), axis=-1).reshape(-1, 3)
         for reach in size * 0.5 ** np.arange(np.log2(size / self.policy.usual_motion) + 3.0):
             tried = best + around * reach
-            likely = self.likely(tried, sign)
+            likely = self.likely(tried, sign, names)
             best = tried[np.argmax(likely)]
         return best, float(likely.max())
 
+    def exchanged(self, motions: Floats) -> tuple[Ints, float]:
+        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3); its log likelihood."""
+        each = np.arange(len(self.names))
+        k, other = np.indices((len(each), len(each))).reshape(2, -1)
+        pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
+        orders = [linear_sum_assignment(-pairs[:, :, m])[1] for m in range(len(motions))]
+        best = int(np.argmax([pairs[each, order, m].sum() for m, order in enumerate(orders)]))
+        return orders[best], self.refined(motions[best : best + 1], self.policy.usual_motion, names=orders[best])[1]
+
     def rows(self) -> Iterator[Explanation]:
         """Yield what explains a change; nothing where nothing could: with all anchors at any place the path is no likelier."""
-        policy, count, turn = self.policy, len(self.before), np.array([0.0, 0.0, 1.0])
+        policy, count, turn = self.policy, len(self.names), np.array([0.0, 0.0, 1.0])
         turns = np.arange(-np.pi, np.pi, policy.turn)
         usual = np.abs(turns) < policy.usual_motion
         small, any_turn = turns[usual, None] * turn, turns[:: len(turns) // 12, None] * turn
-        still, null = self.refined(small, policy.usual_motion)
-        if float(self.alone.sum(axis=0).max()) - null < EvidencePolicy.very_strong:
+        sound = float(self.alone.sum(axis=0).max()) - EvidencePolicy.very_strong
+        if float(self.likely(small).max()) > sound:
+            return
+        null = self.refined(small, policy.usual_motion)[1]
+        if null > sound:
             return
         large = self.likely(turns[~usual, None] * turn)
         turned = float(np.logaddexp.reduce(large)) - np.log(len(large))
         rows = [("turned", turned, float(np.degrees(turns[~usual][np.argmax(large)])))]
         unknown = (self.driven[:1] + self.sides[1:], self.sides[:1] + self.driven[1:], self.driven.sum(axis=0)[None])
         rows += [("turns", float(np.concatenate(unknown).sum(axis=1).max()), 0.0)]
-        rows += [("mirrored", float(self.likely(small, -1.0).max()), 0.0)]
-        free = 1.5 * np.log(sum(len(trace.ranges) for trace in self.before + self.after))
+        rows += [("mirrored", self.refined(small, policy.usual_motion, -1.0)[1], 0.0)]
+        free = 1.5 * np.log(self.before.counted.sum() + self.after.counted.sum())
         rows += [("elsewhere", self.refined(any_turn, policy.stretch)[1] - free, 0.0)]
         rows += [("mirrored", self.refined(any_turn, policy.stretch, -1.0)[1] - free, 0.0)]
         for what, gain, value in rows:
             prior = policy.exchanged if what == "mirrored" else policy.wheels
             figures = {"what": what, "value": value}
             yield Explanation(gain - null + float(np.log(prior)), "wheels-against-ranges", figures)
-        pairs = np.array([[self.same(k, other, still[None])[:, 0] for other in range(count)] for k in range(count)])
-        to = linear_sum_assignment(-pairs.max(axis=2))[1]
-        changed = [trace.anchor for k, trace in zip(to, self.before, strict=True) if self.after[k].anchor != trace.anchor]
+        to, gain = self.exchanged(small)
+        changed = [name for k, name in zip(to, self.names, strict=True) if self.names[k] != name]
         # The number of cycles of so many of the anchors.
-        cycles = gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
-        gain = float(pairs[np.arange(count), to].sum(axis=0).max() - cycles)
+        gain -= gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
         unordered = (self.nothing[:1, :, None] + self.sides[1:], self.sides[:1] + self.nothing[1:, :, None])
         nowhere = float(np.concatenate(unordered).sum(axis=1).max())
-        for what, odds in (("exchanged", gain if changed else -np.inf), ("no distances", nowhere)):
-            named = {"what": what, "anchors": changed}
-            yield Explanation(odds - null + float(np.log(policy.exchanged)), "exchanged-names", named)
+        prior, kind = float(np.log(policy.exchanged)) - null, "exchanged-names"
+        if changed:
+            names = {self.names[k]: name for k, name in zip(to, self.names, strict=True)}
+            yield Explanation(gain + prior, kind, {"what": "exchanged", "anchors": changed}, names=names)
+        yield Explanation(nowhere + prior, kind, {"what": "no distances", "anchors": changed})
 
 
 def _best_stretch(gains: Floats) -> tuple[float, int, int]:
@@ -302,22 +378,28 @@ def _best_stretch(gains: Floats) -> tuple[float, int, int]:
     return float(sums[end] - sums[begin]), begin, end
 
 
-def _best_place(paths: Floats, ranges: Floats, policy: RangePolicy) -> Floats:
-    """Return log likelihoods (g, d) of ranges (n,) along paths (d, n, 2) to one place each, for g scales of errors.
+def _best_place(paths: Floats, ranges: Floats, counted: Floats, policy: RangePolicy) -> Floats:
+    """Return log likelihoods (g, ...) of ranges (..., n) along paths (..., n, 2) to one place each, for g scales of errors.
+
+    Counted (..., n) are 1 for a reading, and 0 where there is none.
 
     Squares of ranges are linear in the place and the square of its distance from the middle of the path.
     """
-    middle = paths.mean(axis=1, keepdims=True)
-    columns = np.concatenate([-2.0 * (paths - middle), np.ones((*paths.shape[:2], 1))], axis=2)
-    squares = ranges**2 - np.sum((paths - middle) ** 2, axis=2)
-    weights, scales = np.ones(squares.shape), np.array(policy.noise)[:, None, None]
+    many = counted.sum(axis=-1)
+    middle = np.sum(paths * counted[..., None], axis=-2) / many[..., None]
+    x, y = (-2.0 * (paths[..., k] - middle[..., k, None]) for k in (0, 1))
+    squares, twice = ranges**2 - 0.25 * (x**2 + y**2), 2.0 * ranges
+    rows = np.stack([x, y, np.broadcast_to(1.0, x.shape), squares], axis=-2)
+    sure = counted / twice**2
+    weights = np.broadcast_to(sure, squares.shape)
     for _ in range(policy.rounds):
-        scaled = columns * (weights / (2.0 * ranges) ** 2)[..., None]
-        normal = np.swapaxes(scaled, 1, 2) @ columns + policy.ridge * np.eye(3)
-        found = np.linalg.solve(normal, np.sum(scaled * squares[..., None], axis=1)[..., None])
-        errors = ((columns @ found)[..., 0] - squares) / (2.0 * ranges)
-        weights = 1.0 / (1.0 + (errors / policy.usual_error) ** 2)
-    return np.asarray(-np.sum(np.log(np.pi * scales * (1.0 + (errors / scales) ** 2)), axis=2) - 1.5 * np.log(len(ranges)))
+        normal = (rows[..., :3, :] * weights[..., None, :]) @ np.swapaxes(rows, -1, -2)
+        found = np.linalg.solve(normal[..., :3] + policy.ridge * np.eye(3), normal[..., 3:])
+        errors = (found[..., 0, :] * x + found[..., 1, :] * y + found[..., 2, :] - squares) / twice
+        weights = sure / (1.0 + (errors / policy.usual_error) ** 2)
+    scales = np.array(policy.noise).reshape(-1, *(1,) * (errors.ndim - 1))
+    off = np.sum(counted * np.log(1.0 + (errors / scales[..., None]) ** 2), axis=-1)
+    return np.asarray(-off - many * np.log(np.pi * scales) - 1.5 * np.log(many))
 
 
 def _by_way(trace: Trace, longest: float, policy: RangePolicy) -> Floats:
