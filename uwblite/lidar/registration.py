@@ -223,7 +223,7 @@ class Placement:
         return motions
 
     def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
-        """Return of each pair the likelier place (e), of sound wheels or after a slip, covariance (e, 3, 3), probability (e,).
+        """Return the likelier place (e) of each pair, sound or slipped, with its covariance (e, 3, 3) and probability (e,).
 
         Parameters
         ----------

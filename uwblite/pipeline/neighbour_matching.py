@@ -65,8 +65,9 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
     track, by_ranges = _followed(estimate, steps), estimate.odometry.slips
-    estimate = _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
-    if not np.any(track.slips > NeighbourPolicy.likely):
+    wheels = track.wheels if by_ranges is None else track.slipped
+    estimate = _match_neighbours(replace(estimate, odometry=wheels), track, task)
+    if estimate.ranges is None or not np.any(track.slips > NeighbourPolicy.likely):
         return estimate
     return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), task.following(estimate))
 
@@ -117,6 +118,7 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
+    Without ranges, steps that the clouds contradict were cut before, and loops that they tie judge the wheels.
 
     Parameters
     ----------
