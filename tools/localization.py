@@ -33,7 +33,10 @@ from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import FREE, OccupancyGrid
 from uwblite.localization import Localizer, LocalizerState, Scanner
+from uwblite.localization.comparison import INDEPENDENT_RAYS, LOOK_BACK
+from uwblite.localization.hypotheses import apart
 from uwblite.localization.known_map import KnownMap
+from uwblite.localization.range_likelihood import expected_errors, range_likelihood
 from uwblite.localization.walls import walls_of
 
 WORLDS = ("hall", "lab", "corridor", "warehouse")
@@ -47,6 +50,10 @@ BEFORE = 40.0
 """s of driving before a robot is carried away, in which it is found and has tracked its pose: eight metres."""
 WRONG_SECONDS = 40.0
 """s of each drive in a map that is not the building's."""
+WANTED = 2.0
+"""m of driving within which a start should be certain."""
+STEPS, FAINT = (0.1, 0.05), 14.0
+"""m and rad between poses of the exhaustive comparison; log-likelihood by which ranges of a pose may be worse than the best."""
 ELSEWHERE = {"hall": "lab", "lab": "hall", "warehouse": "lab", "corridor": "lab"}
 """The other building."""
 OTHER_TAG = 0.12
@@ -304,17 +311,69 @@ def wrong_rows(on: Bench, grid: OccupancyGrid, other: KnownMap, starts: int) -> 
 KINDS = {"all sensors": (True, True), "without lidar": (True, False), "without UWB": (False, True)}
 
 
-def start_row(on: Bench, name: str, count: int) -> list[object]:
-    """Return the row of many starts."""
+def start_moments(on: Bench, count: int) -> list[float]:
+    """Return so many times at which the robot is within the map, s."""
     begin, end = on.trial.log.odometry.stamps[[0, -1]].tolist()
     moments = np.linspace(begin + 3.0, end - 75.0, 20 * count)
-    moments = moments[on.mapped(moments)]
-    moments = moments[np.linspace(0, len(moments) - 1, count).astype(int)]
-    found = [start(on, float(t), *KINDS[name]) for t in moments]
+    return _spread(moments[on.mapped(moments)], count).tolist()
+
+
+def start_row(on: Bench, name: str, count: int) -> list[object]:
+    """Return the row of many starts."""
+    found = [start(on, moment, *KINDS[name]) for moment in start_moments(on, count)]
     ways = np.array([s.way for s in found])
     within = np.isfinite(ways)
     typical, slow = (float(np.quantile(ways[within], q)) if within.any() else np.nan for q in (0.5, 0.95))
     return [on.building, name, count, f"{within.mean():.0%}", _short(typical), _short(slow), sum(s.wrong for s in found)]
+
+
+def late_rows(on: Bench, count: int) -> list[list[object]]:
+    """Return a row for each of many starts with all sensors that is not certain after WANTED m: what could be known there."""
+    rows = []
+    for moment in start_moments(on, count):
+        way = start(on, moment).way
+        if way > WANTED:
+            inside, spread, ranges = posterior(on, moment)
+            rows.append([on.building, f"{moment:.0f}", _short(way), ranges, f"{inside:.3f}", f"{spread:.2f}"])
+    return rows
+
+
+def posterior(on: Bench, begin: float) -> tuple[float, float, int]:
+    """Compare every place and heading of the map by the measurements of WANTED m of driving.
+
+    Returns
+    -------
+    The share of the probability within half a metre and 0.3 rad of the likeliest pose, the standard deviation of the place
+    there along its longer axis, m, and the number of ranges. A grid of STEPS over all free space, no candidate left out.
+    """
+    localizer, true = on.localizer(), on.trial.poses[:, :2]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true, axis=0).T))])
+    last = float(np.interp(np.interp(begin, on.trial.stamps, way) + WANTED, way, on.trial.stamps))
+    for _, kind, k in on.played(begin, last):
+        on.feed(localizer, kind, k)
+    estimator, walls = localizer._estimator, on.known.walls
+    assert walls is not None
+    odom, odometer = estimator._odometer.pose, estimator._way
+    ranges, (rays, ago) = estimator._window.ranges_since(odom, odometer), estimator._window.seen(odom, odometer, LOOK_BACK)
+    axes = [np.arange(low, high, STEPS[0]) for low, high in zip(walls.geometry.origin, walls.geometry.corner, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    places = places[walls.state_at(*places.T) == FREE]
+    poses, weights = np.zeros((0, 3)), np.zeros(0)
+    for heading in np.arange(0.0, 2.0 * np.pi, STEPS[1]):
+        turned = np.column_stack([places, np.full(len(places), heading)])
+        weight = range_likelihood(turned, ranges, expected=expected_errors(turned, ranges, on.known.anchors.errors))
+        some = weight > max(weight.max(), weights.max(initial=-np.inf)) - FAINT
+        poses, weights = np.concatenate([poses, turned[some]]), np.concatenate([weights, weight[some]])
+    some = weights > weights.max() - FAINT
+    poses, weights = poses[some], weights[some]
+    independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
+    for part in np.array_split(np.arange(len(poses)), 1 + len(poses) // 1000):
+        weights[part] += independent * walls.agreement(poses[part], rays).log_likelihood
+    share = np.exp(weights - weights.max())
+    share /= share.sum()
+    near = ~apart(poses[np.argmax(share)], poses)
+    spread = np.cov(poses[near, :2].T, aweights=share[near])
+    return float(share[near].sum()), float(np.sqrt(np.linalg.eigvalsh(spread)[-1])), len(ranges)
 
 
 def track_rows(on: Bench, seconds: float) -> list[list[object]]:
@@ -374,6 +433,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--building", default=BUILDINGS, help=text)
     parser.add_argument("--whole", action="store_true", help="the lidar loses no returns")
     parser.add_argument("--easy", action="store_true", help="rooms without the errors of real ones")
+    parser.add_argument("--late", action="store_true", help="what could be known where a start is late, and nothing else")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep maps and recordings, and use those that are there")
     parser.add_argument("--print", action="store_true", help="write nothing")
     args = parser.parse_args(argv)
@@ -381,13 +441,22 @@ def main(argv: list[str] | None = None) -> int:
         tables: dict[tuple[str, ...], list[list[object]]] = {}
         for building in args.building.split(","):
             place, other = (Place(w, int(building), args.seed, args.easy, not args.whole) for w in (world, ELSEWHERE[world]))
-            for head, rows in measured(place, other, args).items():
+            found = late(place, args) if args.late else measured(place, other, args)
+            for head, rows in found.items():
                 tables.setdefault(head, []).extend(rows)
         text = "\n".join(table(head, rows) for head, rows in tables.items())
         print(text, flush=True)
         if not args.print:
-            write_section(ROOT / "docs" / "lab" / "localization.md", f"localization {world}", text)
+            section = f"{'late starts' if args.late else 'localization'} {world}"
+            write_section(ROOT / "docs" / "lab" / "localization.md", section, text)
     return 0
+
+
+def late(place: Place, args: argparse.Namespace) -> dict[tuple[str, ...], list[list[object]]]:
+    """Return the rows of one building's late starts by the head of their table."""
+    head = (f"{place.world}, building", "start at, s", "certain after, m", f"ranges in {WANTED:.0f} m",
+            "probability of the likeliest place", "its sigma, m")  # fmt: skip
+    return {head: late_rows(bench(place, args.keep), args.starts)}
 
 
 def measured(place: Place, other: Place, args: argparse.Namespace) -> dict[tuple[str, ...], list[list[object]]]:

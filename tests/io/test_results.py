@@ -4,11 +4,11 @@ import csv
 import io
 import json
 import os
+import resource
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -321,20 +321,15 @@ def test_every_file_is_on_the_disk_before_it_counts(tmp_path, monkeypatch):
     assert events == [set()]
 
 
-FILE_LIMIT = """
-import resource, signal, sys
-import numpy as np
-sys.path.insert(0, {tests!r})
-from helpers.results import small_log, small_result
-from uwblite.io import results
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
-results.picture = lambda *_: np.zeros((2, 3, 3), dtype=np.uint8)
-try:
-    results.write_result(sys.argv[1], [small_log()], small_result(evil="x"), results.RunRecord("c", "k"))
-except OSError as error:
-    sys.exit(7 if error.filename.startswith(sys.argv[1] + "/") else error.filename)
-"""
+def write_within(folder, limit):
+    """Write a result in a process whose files may have so many bytes; end with 7 where the error names the folder's file."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        write_result(folder, [small_log()], small_result(evil="x"), RunRecord("c", "k"))
+    except OSError as error:
+        os._exit(7 if str(error.filename).startswith(f"{folder}/") else 1)
+    os._exit(0)
 
 
 @pytest.mark.usefixtures("small_picture")
@@ -345,9 +340,10 @@ def test_running_out_of_space_leaves_the_previous_result(tmp_path, limit, foreig
     if foreign:
         (folder / "notes.txt").write_text("mine")
     before = contents(folder)
-    code = FILE_LIMIT.format(tests=str(Path(__file__).parent.parent))
-    done = subprocess.run([sys.executable, "-c", code, str(folder), str(limit)], check=False, env=dict(os.environ))
-    assert done.returncode == 7
+    writing = get_context("fork").Process(target=write_within, args=(folder, limit))
+    writing.start()
+    writing.join()
+    assert writing.exitcode == 7
     assert contents(folder) == before
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 

@@ -113,7 +113,7 @@ def from_counts(counter: RayCounter, config: GridConfig, *, spent: bool = False)
     """Return the map that counted hits and misses make: additive log-odds, clamped; spent: in the memory of the misses."""
     log_odds = counter.misses.view(np.float32) if spent else np.zeros(counter.hits.shape, dtype=np.float32)
     for rows in counter.geometry.strips():
-        log_odds[rows] = _log_odds(counter, rows, config)
+        np.copyto(log_odds[rows], _log_odds(counter, rows, config), where=counter.seen(rows), casting="same_kind")
     return OccupancyGrid(counter.geometry, log_odds)
 
 
@@ -125,9 +125,16 @@ def _log_odds(counter: RayCounter, rows: slice, config: GridConfig) -> NDArray[n
 
 
 def walls_of(counter: RayCounter, config: GridConfig) -> Bools:
-    """Return which cells (rows, cols) are occupied or next to an occupied one: walls without holes of two cells."""
-    occupied, least = np.zeros(np.add(counter.hits.shape, 2), dtype=bool), math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE))
+    """Return which cells (rows, cols) are occupied or next to an occupied one: walls without holes of two cells.
+
+    Here as in from_counts, memory of cells that no ray met is not touched.
+    """
+    occupied, walls = np.zeros(np.add(counter.hits.shape, 2), dtype=bool), np.zeros(counter.hits.shape, dtype=bool)
+    least = math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE))
     for rows in counter.geometry.strips():
-        occupied[1:-1, 1:-1][rows] = _log_odds(counter, rows, config).astype(np.float32) > least
-    beside = occupied[:-2] | occupied[1:-1] | occupied[2:]
-    return beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]
+        np.copyto(occupied[1:-1, 1:-1][rows], True, where=_log_odds(counter, rows, config).astype(np.float32) > least)
+    for rows in counter.geometry.strips():
+        around = occupied[rows.start : rows.stop + 2]
+        beside = around[:-2] | around[1:-1] | around[2:]
+        np.copyto(walls[rows], True, where=beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:])
+    return walls

@@ -153,10 +153,18 @@ class RayCounter:
             window[top : top + part.shape[0], left : left + part.shape[1]] = part
         return windows.reshape(-1)
 
+    def seen(self, rows: slice) -> Bools:
+        """Return which cells of some rows a ray met."""
+        return (self.hits[rows] > 0) | (self.misses[rows] > 0)
+
     def cropped(self, margin: int = 2) -> "RayCounter":
         """Return the same counts in the smallest grid that holds all of them and a margin of cells."""
-        seen = (self.hits > 0) | (self.misses > 0)
-        rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        in_rows, in_cols = (np.zeros(size, dtype=np.bool_) for size in self.hits.shape)
+        for some in self.geometry.strips():
+            seen = self.seen(some)
+            in_rows[some] = seen.any(axis=1)
+            in_cols |= seen.any(axis=0)
+        rows, cols = np.flatnonzero(in_rows), np.flatnonzero(in_cols)
         if len(rows) == 0:
             return self
         top, left = max(int(rows[0]) - margin, 0), max(int(cols[0]) - margin, 0)

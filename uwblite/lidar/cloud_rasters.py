@@ -106,15 +106,6 @@ def _offsets(reach: float) -> list[tuple[int, int]]:
     return [*zip(*(axis[order][square[order] <= reach * reach].tolist() for axis in (dx, dy)), strict=True)]
 
 
-def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:
-    """Return the rasters of some clouds (w,), those of the other numbered on behind those of the one."""
-    run = np.concatenate([one.run, other.run + np.int32(len(one.nearest))])
-    nearest = np.concatenate([one.nearest, other.nearest])
-    origin, shape = np.concatenate([one.origin, other.origin]), np.concatenate([one.shape, other.shape])
-    start = np.concatenate([one.start, other.start + np.int32(len(one.run))])
-    return CloudRasters(one.cell, origin[which], shape[which], start[which], run, nearest, one.work)
-
-
 def _blocks(clouds: Clouds) -> Iterator[slice]:
     """Yield the clouds a bounded number at a time."""
     for first in range(0, len(clouds), _CLOUDS_AT_ONCE):

@@ -92,7 +92,10 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
         elif settled:
             late = shown.graph.calibration.get("laser_delay") - estimate.lidar.delay
         corrected, delay = abs(late), estimate.lidar.delay + late
-        estimate = _at_delay(estimate.with_estimates_of(shown.graph), late, delay, task)
+        # No reference keeps the clouds in memory while others take their place.
+        estimate = replace(estimate.with_estimates_of(shown.graph), scans=None)
+        del shown
+        estimate = _at_delay(estimate, late, delay, task)
         task = task.following(estimate)
         estimate, steps = _descended(_with_clock_at(estimate, delay) if settled else estimate, task)
         if settled:
@@ -126,7 +129,13 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
-    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
+    estimate = replace(_without_moving(estimate, track, task), odometry=track.slipped)
+    return _match_neighbours(estimate, track, task)
+
+
+def _without_moving(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
+    """Return the estimate without the points of objects that move."""
+    return replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, task.config))
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -193,11 +202,11 @@ def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Es
 
 
 def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
-    """Match each cloud with those just before and after it, so that sub-maps are stiff; objects that move are left out."""
+    """Match each cloud with those just before and after it, so that sub-maps are stiff."""
     config, rules, graph = task.config, task.config.refinement, estimate.graph
     rejected = np.zeros(len(graph.poses), dtype=bool)
     rejected[estimate.odometry.i[track.rejected]] = True
-    estimate = replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, config), rejected=rejected)
+    estimate = replace(estimate, rejected=rejected)
     weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
     graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])

@@ -20,7 +20,8 @@ _BLOCK = 32
 def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
     """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
     parts = [part for r in recordings.each for part in _blocks(r, np.arange(len(r.frames)), config, delay)]
-    return _with_raster(replace(clouds.joined(parts), work=work), config, delay)
+    built = clouds.joined(parts)
+    return _with_raster(replace(built, work=work), config, delay, len(built.points))
 
 
 def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
@@ -29,19 +30,19 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     former = np.concatenate([_former(a, b, config, old.delay) for a, b in pairs])
     changed = [np.flatnonzero(former[b.rows] < 0) for b in after.each]
     parts = [p for r, which in zip(after.each, changed, strict=True) for p in _blocks(r, which, config, old.delay)]
-    new = _with_raster(replace(clouds.joined(parts), work=old.clouds.work), config, old.delay)
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
-    both = replace(clouds.joined([old.clouds, new.clouds]), work=old.clouds.work).chosen(place)
-    return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay)
+    both = clouds.joined([old.clouds, *parts]).chosen(place)
+    return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(p.points) for p in parts))
 
 
 def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
     """Return the clouds with some of their points (p,) alone."""
-    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay)
+    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay, int(kept.sum()))
 
 
-def _with_raster(built: Clouds, config: MappingConfig, delay: float) -> ScanClouds:
-    built.work[POINTS] += len(built.points)
+def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
+    """Return clouds with rasters, and count so many points of them as made."""
+    built.work[POINTS] += new
     raster = cloud_rasters.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
     return ScanClouds(built, raster, delay)
 

@@ -22,7 +22,7 @@ def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, s
     graph : poses (k, 3) by dead reckoning, anchors (a, 2) of any value, calibration block; its edges (priors) stay.
     """
     slipping = [_with_slips(graph, measured, config, search, ())]
-    if not slipping[0].suspects_slips and slipping[0].misfit() < config.agreement:
+    if not slipping[0].slips.any() and slipping[0].misfit() < config.agreement:
         return slipping[0].estimate()
     tried = _without_slips(graph, measured, config, search)
     while slipping[-1].suspects_slips and len(slipping) <= _STARTS:

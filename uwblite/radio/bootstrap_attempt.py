@@ -23,7 +23,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
-from ..odometry.slips import with_slips
+from ..odometry.slips import LASTS, with_slips
 from ..problem.alternatives import EvidencePolicy
 from . import nlos_mixture
 from .range_noise import RangeNoiseConfig, independent_shares
@@ -189,19 +189,29 @@ class Attempt:
         return BootstrapResult(final, self.placed, found, self.doubtful, self.slips)
 
     def of_likely_slips(self) -> Self:
-        """Return the attempt, complete, without the slips that its measurements do not pay for once all is known."""
+        """Return the attempt, complete, each of whose slips stays, moves by half its length, or goes: what is likeliest once
+        all is known."""
         if not self.slips.any():
             return self
         likeliest, evidence = self, self.evidence()
-        for first, last in runs_of(self.slips > 0.0):
-            other = copy(likeliest)
-            other.poses, other.sigma, other.slips = likeliest.poses.copy(), likeliest.sigma.copy(), likeliest.slips.copy()
-            other.slips[first:last] = 0.0
-            other.wheels = with_slips(self.odometry, other.slips)
-            other._solve(_SCALES[1:])
-            if (without := other.evidence()) > evidence:
-                likeliest, evidence = other, without
+        for at in runs_of(self.slips > 0.0):
+            half = max((at[1] - at[0]) // 2, 1)
+            for begin, end in (at[0], at[0]), (at[0] - half, at[1] - half), (at[0] + half, at[1] + half):
+                to = max(begin, 0), min(end, len(self.slips))
+                other = likeliest._with_slip_moved(at, to)
+                if (posterior := other.evidence()) > evidence:
+                    likeliest, evidence, at = other, posterior, to
         return likeliest
+
+    def _with_slip_moved(self, at: tuple[int, int], to: tuple[int, int]) -> Self:
+        """Return the attempt with the slip over some steps at others, first <= k < last, solved again."""
+        other = copy(self)
+        other.poses, other.sigma, other.slips = self.poses.copy(), self.sigma.copy(), self.slips.copy()
+        other.slips[slice(*at)] = 0.0
+        other.slips[slice(*to)] = 1.0
+        other.wheels = with_slips(self.odometry, other.slips)
+        other._solve(_SCALES[1:])
+        return other
 
     def evidence(self) -> float:
         """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant.
@@ -221,7 +231,8 @@ class Attempt:
                     likely += float(shares[own] @ mixture.log_density(errors[own]))
             else:
                 likely -= 0.5 * float(edge_cost(edges, edges.residuals(part)))
-        return likely + number * log_prior(0.0, independent / (number + 1))
+        lasting = float(self.slips @ self.odometry.duration) / LASTS
+        return likely + number * log_prior(0.0, independent / (number + 1)) - lasting
 
     @property
     def suspects_slips(self) -> bool:

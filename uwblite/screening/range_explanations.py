@@ -228,11 +228,12 @@ def _at_moments(
     near : only moments whose stretches overlap with those of this one.
     """
     odometry, half, every = log.odometry, policy.stretch, 0.25 * policy.stretch
+    way = odometry.travelled
     longest, found = max(float(trace.ranges.max(initial=0.0)) for trace in traces), list[Explanation]()
-    for at in np.arange(half, float(odometry.travelled[-1]) - half, every).tolist():
+    for at in np.arange(half, float(way[-1]) - half, every).tolist():
         if near is not None and (at + half <= near.begin or near.end <= at - half):
             continue
-        origin = se2.inverse(odometry.at(np.array([np.interp(at, odometry.travelled, odometry.stamps)]))[0])
+        origin = se2.inverse(odometry.at(np.array([np.interp(at, way, odometry.stamps)]))[0])
         sides = [(trace.between(at - half, at, origin), trace.between(at, at + half, origin)) for trace in traces]
         sides = [side for side in sides if min(len(trace.ranges) for trace in side) >= policy.fewest]
         moment = Moment.of(sides, longest, policy)
