@@ -171,7 +171,7 @@ def follow(
     captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
     own = np.flatnonzero(~doubtful[np.searchsorted(i, certain.i)])
     matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
-    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (log_odds < 0.0)
+    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (~good | (log_odds < 0.0))
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
