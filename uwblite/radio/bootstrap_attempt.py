@@ -117,6 +117,7 @@ class Attempt:
         self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
         self.low = self.high = self.solved = 0
         self.piece = self.smallest = 0.0
+        self.usual = _USUAL
         self.begun = np.zeros((0, 2))
 
     @property
@@ -390,12 +391,13 @@ class Attempt:
         ----------
         forward : whether the pose at the lower end is known, not the other one.
         """
-        part, excess, count = self._part(low, high), 0.0, 0
+        part, excess, count, (mean, variance) = self._part(low, high), 0.0, 0, self.usual
         for edges in part.edges:
             squared = np.einsum("ed,ed->e", residuals := edges.residuals(part), residuals)
             if isinstance(edges, RangeEdges):
                 beyond = np.argsort(-edges.pose if forward else edges.pose, kind="stable")
-                off = np.cumsum((0.5 * _LAST.rho(squared) - _USUAL)[beyond])
+                off = np.cumsum((0.5 * _LAST.rho(squared) - mean)[beyond])
+                off -= _BY_CHANCE * np.sqrt(variance * np.arange(1.0, len(off) + 1.0))
                 excess, count = excess + float(off.max(initial=0.0)), len(edges)
             else:
                 excess += 0.5 * float(squared.sum())
@@ -430,10 +432,12 @@ class Attempt:
         self.poses[self.low : self.high] = solved.poses
         self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
         for edges in solved.edges:
-            if isinstance(edges, RangeEdges):
+            if isinstance(edges, RangeEdges) and len(edges):
                 error = edges.residuals(solved)[:, 0] * edges.sigma
                 for anchor in np.unique(edges.anchor):
                     self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.config.range_sigma)
+                cost = 0.5 * _LAST.rho((error / self.sigma[edges.anchor]) ** 2)
+                self.usual = max(float(cost.mean()), _USUAL[0]), max(float(cost.var()), _USUAL[1])
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
@@ -449,8 +453,10 @@ class Attempt:
 _SCALES = (20.0, 6.0, 3.0)
 """Scales of the ranges' kernel, one after the other, standard deviations."""
 _LAST = Kernel("geman-mcclure", _SCALES[-1])
-_USUAL = 0.5
-"""Half the chi2 of a sound range."""
+_USUAL = (0.5, 0.5)
+"""Mean and variance of half the chi2 of a sound range."""
+_BY_CHANCE = 2.0
+"""Standard deviations by which sums deviate by chance, with a probability of 2 %."""
 
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:
