@@ -45,13 +45,15 @@ def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
         since = _age(recording, rec)
         (grown,), (sigma_grown,) = added_unknown(graph, ranges, (since[ranges.pose] / ranges.sigma)[None, :, None])
         (scaled,), (sigma_scaled,) = added_unknown(graph, wheels, _growth(graph, wheels, since)[None])
-        for value, sigma, limit, text in (
+        patterns = (
             (grown, sigma_grown, _LONGER, f"all ranges seem to grow by {grown:.1f} m over the recording (radio warming up?)"),
             (scaled, sigma_scaled, _SCALE, _scale_text(scaled)),
-        ):
-            if abs(value) > max(limit, _SIGMAS * sigma):
-                why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
-                yield doubt("drift", why, value=float(value), sigma=float(sigma))
+        )
+        # Either changes the size of the path beside the ranges: they are rival explanations of one remainder.
+        value, sigma, limit, text = max(patterns, key=lambda pattern: abs(pattern[0]) / pattern[1])
+        if abs(value) > max(limit, _SIGMAS * sigma):
+            why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
+            yield doubt("drift", why, value=float(value), sigma=float(sigma))
     yield from _check_turns(graph, wheels, rec)
 
 
