@@ -61,9 +61,9 @@ def _compressed(minor: Ints, major: Ints, nodes: int) -> tuple[NDArray[np.int32]
     one, and where each of these begins (nodes + 1,). One sort of numbers takes a third of the time of sparse.coo_matrix."""
     keys = np.sort(major.astype(WIDE, copy=False) * nodes + minor)
     keys = keys[np.flatnonzero(np.diff(keys, prepend=-1))]
-    major = keys // max(nodes, 1)
+    major = (keys // max(nodes, 1)).astype(np.intp)
     ends = np.cumsum(np.bincount(major, minlength=nodes), dtype=np.int32)
-    return (keys - major * nodes).astype(np.int32), np.append(np.zeros(1, dtype=np.int32), ends)
+    return (keys % max(nodes, 1)).astype(np.int32), np.append(np.zeros(1, dtype=np.int32), ends)
 
 
 def pairs_of(matrix: sparse.csc_matrix) -> Ints:
