@@ -12,7 +12,6 @@ from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unk
 from uwblite.graph.graph import Graph
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.odometry.slips import LASTS
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import bootstrap
 from uwblite.radio.bootstrap import bootstrap_graph
@@ -79,7 +78,7 @@ WHEELS = {
 @pytest.mark.parametrize("seed", [2, pytest.param(1, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_a_bent_trajectory_and_unknown_anchors_are_recovered(fault, seed):
     rng = np.random.default_rng(seed)
-    stamps, truth = wander(rng, 90.0)
+    stamps, truth = wander(rng, 150.0)
     places = places_around(rng, 4)
     wheels = odometry(stamps, truth, rng, **WHEELS[fault])
     bent = aligned_error(wheels.poses[:, :2], truth[:, :2])
@@ -97,7 +96,7 @@ def test_a_bent_trajectory_and_unknown_anchors_are_recovered(fault, seed):
 def test_any_number_of_anchors_serves(count):
     """One or two anchors leave the odometry to hold the rest: the result may not be worse than the odometry alone."""
     rng = np.random.default_rng(10 + count)
-    stamps, truth = wander(rng, 90.0)
+    stamps, truth = wander(rng, 150.0)
     places = places_around(rng, count)
     wheels = odometry(stamps, truth, rng, scale=0.99, turn_scale=1.02, drift=0.004, noise=0.01, turn_noise=0.01)
     radio = ranges(rng, stamps, truth, places, rate=max(0.5, 2.0 / count), sigma=SIGMA, outliers=0.1)
@@ -111,7 +110,7 @@ def test_any_number_of_anchors_serves(count):
 
 def test_anchors_that_are_in_reach_part_of_the_time_are_placed_when_they_come():
     rng = np.random.default_rng(21)
-    stamps, truth = wander(rng, 130.0)
+    stamps, truth = wander(rng, 200.0)
     end = stamps[-1]
     in_reach = np.array([[0, 0.45], [0, 0.45], [0.05, 0.5], [0.35, 1.0], [0.4, 1.0], [0.55, 1.0]]) * end
     places = places_around(rng, 6)
@@ -136,7 +135,7 @@ def reversed_in_time(wheels: Odometry, radio: UwbRanges) -> tuple[Odometry, UwbR
 def test_the_result_does_not_depend_on_where_the_recording_starts(seed):
     """Forwards, backwards and without its first third, the same recording gives the same places."""
     rng = np.random.default_rng(seed)
-    stamps, truth = wander(rng, 90.0)
+    stamps, truth = wander(rng, 150.0)
     places = places_around(rng, 4)
     wheels = odometry(stamps, truth, rng, drift=0.012, noise=0.01, turn_noise=0.02)
     radio = ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1)
@@ -228,23 +227,6 @@ def test_equal_inputs_give_equal_bytes():
     assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()
 
 
-@pytest.mark.parametrize("part", [slice(80, 110), slice(-110, -80)])
-def test_a_slip_near_an_end_shows_in_the_few_ranges_beyond_it(part):
-    """Wheels that spin for 3 s count 1.2 m and 0.7 rad too much; the ranges of the other 97 % of the way agree all the same."""
-    rng = np.random.default_rng(34)
-    stamps, truth = wander(rng, 90.0)
-    places = places_around(rng, 4)
-    motion = se2.between(truth[:-1], truth[1:])
-    motion[part] += np.array([0.04, 0.0, 0.023])
-    wheels = odometry(stamps, se2.chain(truth[0], motion), rng, noise=0.01, turn_noise=0.01)
-    bootstrapped, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA))
-    error, _ = judged(bootstrapped, at, stamps, truth, places)
-    times = at[np.flatnonzero(bootstrapped.slips)]
-    assert error < WELL / 3
-    assert len(times)
-    assert np.abs(times - stamps[part].mean()).max() < 3.0 * LASTS
-
-
 class Tried(Attempt):
     """An attempt over 400 m whose misfit is given for 50, 100, 200 m and the end, by its heading error."""
 
@@ -252,14 +234,9 @@ class Tried(Attempt):
     known: ClassVar[dict[float, float]] = {}
 
     def __init__(self, graph, measured, config, search, without=None):
-        self.first = 0, 50
+        self.first, self.known = (0, 50), type(self).known if without is None else {}
         self.slipping, self.path, self.config, self.low, self.high = without is not None, np.arange(401.0), config, 0, 0
         self.heading, self.slips = float(graph.calibration.values[0]), np.zeros(400)
-
-    suspects_slips = False
-
-    def of_likely_slips(self):
-        return self
 
     def began_like(self, other):
         return {self.heading, other.heading} == {0.4, -0.15}

@@ -9,7 +9,7 @@ from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.odometry.slips import EVERY, LASTS, with_slips
+from uwblite.odometry.slips import EVERY, LASTS
 from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, Measured
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 
@@ -243,48 +243,3 @@ def test_an_attempt_from_the_middle_goes_on_until_it_has_the_way_that_is_asked_f
     one = FromTheMiddle(100, [True] * 20, [False] * 20)
     one.run(30.0)
     assert one.path[one.high - 1] - one.path[one.low] >= 30.0 > one.path[one.high - 5] - one.path[one.low]
-
-
-@pytest.mark.parametrize("marked", [[(22, 26)], [(22, 26), (5, 9)], [(5, 9), (22, 26), (32, 36)]])
-def test_slips_that_nothing_pays_for_go_and_others_stay(marked):
-    """Wheels that count half a metre and 0.2 rad too much over each of four steps, and slips that are not there."""
-    truth = se2.chain(np.zeros(3), np.tile([0.5, 0.0, 0.15], (39, 1)))
-    motion = se2.between(truth[:-1], truth[1:])
-    motion[22:26] += [0.5, 0.0, 0.2]
-    anchors = np.array([[4.0, 3.0], [6.0, -3.0], [-4.0, 1.0]])
-    pose, anchor = np.repeat(np.arange(40), 3), np.tile([0, 1, 2], 40)
-    rng = np.random.default_rng(8)
-    distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T) + 0.05 * rng.standard_normal(120)
-    wheels = chained(se2.chain(np.zeros(3), motion), (0.02, 0.02, 0.02))
-    measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0))
-    graph = Graph(truth.copy(), anchors)
-    attempt = Attempt(graph, measured, BootstrapConfig(range_sigma=0.05), TrilaterationConfig(), ())
-    attempt.placed[:], attempt.low, attempt.high, attempt.poses = True, 0, 40, truth.copy()
-    for first, last in marked:
-        attempt.slips[first:last] = 1.0
-    attempt.wheels = with_slips(wheels, attempt.slips)
-    attempt._solve((3.0,))
-    before = attempt.evidence(), attempt.slips.copy(), attempt.poses.copy()
-    likely = attempt.of_likely_slips()
-    assert np.flatnonzero(likely.slips).tolist() == [22, 23, 24, 25]
-    assert likely.evidence() >= before[0]
-    # The attempt itself is as it was.
-    np.testing.assert_array_equal(attempt.slips, before[1])
-    np.testing.assert_array_equal(attempt.poses, before[2])
-
-
-def test_a_slip_moves_to_where_the_wheels_slipped():
-    attempt, truth = along_a_line(poses=40)
-    attempt.low, attempt.high = 0, 40
-    moved = attempt._with_slip_moved((5, 9), (7, 11))
-    assert np.flatnonzero(moved.slips).tolist() == [7, 8, 9, 10]
-    np.testing.assert_allclose(moved.poses, truth, atol=1e-6)
-
-
-def test_ranges_beyond_a_slip_near_the_end_deviate_however_long_the_piece():
-    for poses in (12, 40):
-        attempt, _ = along_a_line(poses=poses)
-        assert not attempt._deviates(0, poses, forward=True)
-        attempt.poses[-5:, 1] += 1.0
-        assert attempt._deviates(0, poses, forward=True)
-        assert not attempt._deviates(0, poses - 5, forward=True)

@@ -13,48 +13,16 @@ from .trilateration import TrilaterationConfig
 def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, search: TrilaterationConfig) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
-    Wheels may slip where the ranges ask for it. Where they do not slip anywhere and the ranges agree, that is all. Otherwise
-    wheels that do not slip, but are bent or have a gross error of the heading, are the other explanation, and slips are sought
-    from several first stretches; of all attempts the one of greatest evidence is taken.
+    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path. A
+    hypothesis that begins like an earlier attempt would continue like it, and is dropped. Where the first began well, one that
+    begins as well is continued at once, as long as the ranges agree, then the others in the order of their misfit; the first
+    that reaches the end is taken. Where none does, the best of them is continued if it began clearly better than the
+    uncorrected heading, and is taken if it also ends better. Wheels that slip are the other explanation: they are sought from
+    several first stretches, and of the attempts that agree the one of greatest evidence is taken.
 
     Parameters
     ----------
     graph : poses (k, 3) by dead reckoning, anchors (a, 2) of any value, calibration block; its edges (priors) stay.
-    """
-    slipping = [_with_slips(graph, measured, config, search, ())]
-    if not slipping[0].slips.any() and slipping[0].misfit() < config.agreement:
-        return slipping[0].estimate()
-    tried = _without_slips(graph, measured, config, search)
-    while slipping[-1].suspects_slips and len(slipping) <= _STARTS:
-        if tried.misfit() < config.agreement and slipping[-1].evidence() < tried.evidence():
-            break
-        # The wheels may have slipped in the first stretch as well.
-        slipping.append(_with_slips(graph, measured, config, search, [each.first for each in slipping]))
-    agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
-    return max([tried, *agreeing], key=Attempt.evidence).estimate()
-
-
-_STARTS = 3
-"""Further stretches that are tried as the first one where the wheels slip."""
-
-
-def _with_slips(
-    graph: Graph, measured: Measured, config: BootstrapConfig, search: TrilaterationConfig, without: Sequence[tuple[int, int]]
-) -> Attempt:
-    """Return an attempt whose wheels slip where the ranges ask for it, begun in none of some stretches, complete."""
-    attempt = Attempt(graph, measured, config, search, without)
-    attempt.run()
-    return attempt.of_likely_slips()
-
-
-def _without_slips(graph: Graph, measured: Measured, config: BootstrapConfig, search: TrilaterationConfig) -> Attempt:
-    """Return an attempt whose wheels do not slip, complete; where its ranges do not agree, the likeliest error of the heading.
-
-    Other hypotheses of a gross heading error are tried over a part of the path. A hypothesis that begins like an earlier
-    attempt would continue like it, and is dropped. Where the first began well, one that begins as well is continued at once, as
-    long as the ranges agree, then the others in the order of their misfit; the first that reaches the end is taken. Where none
-    does, the best of them is continued if it began clearly better than the uncorrected heading, and is taken if it also ends
-    better.
     """
     first, *others = (
         Attempt(replace(graph, calibration=calibration), measured, config, search)
@@ -65,8 +33,19 @@ def _without_slips(graph: Graph, measured: Measured, config: BootstrapConfig, se
     begun = first.misfit()
     # Where it has a jump, it is completed only if nothing else agrees.
     first.run(torn=not others)
-    agrees = first.misfit() < config.agreement or not others
-    return first if agrees else _likeliest_heading(first, begun, others, config)
+    if first.misfit() < config.agreement:
+        return first.estimate()
+    tried, slipping = [_likeliest_heading(first, begun, others, config)] if others else [first], list[Attempt]()
+    while len(slipping) <= _STARTS and (not slipping or slipping[-1].slips.any()):
+        # The wheels may have slipped in the first stretch as well.
+        slipping.append(Attempt(graph, measured, config, search, [each.first for each in slipping]))
+        slipping[-1].run()
+    agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
+    return max([*tried, *agreeing], key=Attempt.evidence).estimate()
+
+
+_STARTS = 3
+"""Further stretches that are tried as the first one where the wheels slip."""
 
 
 def _likeliest_heading(first: Attempt, begun: float, others: Sequence[Attempt], config: BootstrapConfig) -> Attempt:

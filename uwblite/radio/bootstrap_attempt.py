@@ -8,7 +8,6 @@ again and anchors not yet placed are searched from the poses so far.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -23,7 +22,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
-from ..odometry.slips import LASTS, with_slips
+from ..odometry.slips import with_slips
 from ..problem.alternatives import EvidencePolicy
 from . import nlos_mixture
 from .range_noise import RangeNoiseConfig, independent_shares
@@ -117,7 +116,6 @@ class Attempt:
         self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
         self.low = self.high = self.solved = 0
         self.piece = self.smallest = 0.0
-        self.usual = _USUAL
         self.begun = np.zeros((0, 2))
 
     @property
@@ -189,31 +187,6 @@ class Attempt:
         found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
         return BootstrapResult(final, self.placed, found, self.doubtful, self.slips)
 
-    def of_likely_slips(self) -> Self:
-        """Return the attempt, complete, each of whose slips stays, moves by half its length, or goes: what is likeliest once
-        all is known."""
-        if not self.slips.any():
-            return self
-        likeliest, evidence = self, self.evidence()
-        for at in runs_of(self.slips > 0.0):
-            half = max((at[1] - at[0]) // 2, 1)
-            for begin, end in (at[0], at[0]), (at[0] - half, at[1] - half), (at[0] + half, at[1] + half):
-                to = max(begin, 0), min(end, len(self.slips))
-                other = likeliest._with_slip_moved(at, to)
-                if (posterior := other.evidence()) > evidence:
-                    likeliest, evidence, at = other, posterior, to
-        return likeliest
-
-    def _with_slip_moved(self, at: tuple[int, int], to: tuple[int, int]) -> Self:
-        """Return the attempt with the slip over some steps at others, first <= k < last, solved again."""
-        other = copy(self)
-        other.poses, other.sigma, other.slips = self.poses.copy(), self.sigma.copy(), self.slips.copy()
-        other.slips[slice(*at)] = 0.0
-        other.slips[slice(*to)] = 1.0
-        other.wheels = with_slips(self.odometry, other.slips)
-        other._solve(_SCALES[1:])
-        return other
-
     def evidence(self) -> float:
         """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant.
 
@@ -232,13 +205,7 @@ class Attempt:
                     likely += float(shares[own] @ mixture.log_density(errors[own]))
             else:
                 likely -= 0.5 * float(edge_cost(edges, edges.residuals(part)))
-        lasting = float(self.slips @ self.odometry.duration) / LASTS
-        return likely + number * log_prior(0.0, independent / (number + 1)) - lasting
-
-    @property
-    def suspects_slips(self) -> bool:
-        """Whether wheels slipped somewhere, or may have slipped in the clearest stretch, in which no slip is sought."""
-        return bool(self.slips.any()) or any(self._deviates(*self.first, forward=forward) for forward in (False, True))
+        return likely + number * log_prior(0.0, independent / (number + 1))
 
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
@@ -355,9 +322,9 @@ class Attempt:
             return
         own = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
         rows, duration = self.ranges.rows(np.flatnonzero(own)), self.odometry.duration[low : high - 1]
-        if not self._deviates(low, high, forward=forward):
-            return
         prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
+        if bent - _USUAL * len(rows) + prior < EvidencePolicy.positive:
+            return
         arm = rows.lever_arm + se2.rotate(rows.turn, np.broadcast_to(rows.tag, (len(rows), 2)))
         pose, steps, start = rows.pose - low, motion[low : high - 1], self.poses[low]
         if not forward:
@@ -378,31 +345,9 @@ class Attempt:
 
     def _cost(self, low: int, high: int) -> float:
         """Return half the robust chi2 of wheels and ranges over the poses [low, high), that of ranges as annealing ends."""
-        part = self._part(low, high)
-        robust = (replace(e, kernel=_LAST) if isinstance(e, RangeEdges) else e for e in part.edges)
+        part, kernel = self._part(low, high), Kernel("geman-mcclure", _SCALES[-1])
+        robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in part.edges)
         return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
-
-    def _deviates(self, low: int, high: int, *, forward: bool) -> bool:
-        """Return whether wheels and ranges deviate so much, from some pose of [low, high) on, that a slip may be likelier.
-
-        However long the part is, the few ranges beyond a slip near its end tell.
-
-        Parameters
-        ----------
-        forward : whether the pose at the lower end is known, not the other one.
-        """
-        part, excess, count, (mean, variance) = self._part(low, high), 0.0, 0, self.usual
-        for edges in part.edges:
-            squared = np.einsum("ed,ed->e", residuals := edges.residuals(part), residuals)
-            if isinstance(edges, RangeEdges):
-                beyond = np.argsort(-edges.pose if forward else edges.pose, kind="stable")
-                off = np.cumsum((0.5 * _LAST.rho(squared) - mean)[beyond])
-                off -= _BY_CHANCE * np.sqrt(variance * np.arange(1.0, len(off) + 1.0))
-                excess, count = excess + float(off.max(initial=0.0)), len(edges)
-            else:
-                excess += 0.5 * float(squared.sum())
-        duration = float(self.odometry.duration[low : high - 1].sum())
-        return excess + log_prior(duration, count) >= EvidencePolicy.positive
 
     def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
@@ -411,8 +356,7 @@ class Attempt:
         """
         part = self._part(low, high)
         errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
-        typical = float(np.median(np.abs(errors[0]))) if errors else 0.0
-        if typical < 2.0 and not (self.seeks and self._deviates(low, high, forward=fixed_pose == low)):
+        if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
             return True
         self._anneal_poses(low, high, fixed_pose, _SCALES)
         return False
@@ -432,12 +376,10 @@ class Attempt:
         self.poses[self.low : self.high] = solved.poses
         self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
         for edges in solved.edges:
-            if isinstance(edges, RangeEdges) and len(edges):
+            if isinstance(edges, RangeEdges):
                 error = edges.residuals(solved)[:, 0] * edges.sigma
                 for anchor in np.unique(edges.anchor):
                     self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.config.range_sigma)
-                cost = 0.5 * _LAST.rho((error / self.sigma[edges.anchor]) ** 2)
-                self.usual = max(float(cost.mean()), _USUAL[0]), max(float(cost.var()), _USUAL[1])
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
@@ -452,11 +394,8 @@ class Attempt:
 
 _SCALES = (20.0, 6.0, 3.0)
 """Scales of the ranges' kernel, one after the other, standard deviations."""
-_LAST = Kernel("geman-mcclure", _SCALES[-1])
-_USUAL = (0.5, 0.5)
-"""Mean and variance of half the chi2 of a sound range."""
-_BY_CHANCE = 2.0
-"""Standard deviations by which sums deviate by chance, with a probability of 2 %."""
+_USUAL = 0.5
+"""Half the chi2 of a sound range."""
 
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:

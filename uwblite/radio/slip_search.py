@@ -20,7 +20,7 @@ class SlipSearchPolicy:
 
     headings: ClassVar[int] = 72
     """Turns over a slip, evenly from none to a whole one."""
-    shares: ClassVar[tuple[float, ...]] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    shares: ClassVar[tuple[float, ...]] = (0.0, 0.5, 1.0)
     """Shares of the distance counted over it that were driven."""
     longest: ClassVar[float] = 2.0
     """Time over which the motion is sought, in mean durations of a slip: six in seven are shorter."""
@@ -87,7 +87,8 @@ def likeliest_slip(poses: Floats, duration: Floats, ranges: TagRanges) -> Slip |
         tag = se2.transform(se2.between(poses[last], poses[after.pose]), after.tag)
         place = se2.transform(se2.inverse(poses[first]), after.place)
         cost = after.cost(se2.transform(motions[:, None], tag), place).sum(axis=1) + usual[ranges.pose <= first].sum()
-        cost += _along(motions, (within.pose - first) / (last - first), within, se2.inverse(poses[first])).sum(axis=1)
+        # The tag stays about where it was before the slip.
+        cost += within.cost(np.broadcast_to(poses[first, :2], (len(during), 2)), within.place).sum()
         k = int(np.argmin(cost))
         if cost[k] < best:
             best, slip = float(cost[k]), Slip(first, last, _displaced(poses, first, last, motions[k]))
@@ -104,12 +105,6 @@ def _motions(counted: Floats) -> Floats:
     turns = np.linspace(-np.pi, np.pi, SlipSearchPolicy.headings, endpoint=False) + counted[2]
     share, turn = (each.ravel() for each in np.meshgrid(SlipSearchPolicy.shares, turns, indexing="ij"))
     return np.column_stack([share[:, None] * counted[:2], turn])
-
-
-def _along(motions: Floats, share: Floats, ranges: TagRanges, home: Floats) -> Floats:
-    """Return the robust cost (h, m) of ranges at shares (m,) of motions (h, 3) from a pose whose inverse is given."""
-    poses = se2.exp(share[:, None] * se2.log(motions)[:, None])
-    return ranges.cost(se2.transform(poses, ranges.tag), se2.transform(home, ranges.place))
 
 
 def _displaced(poses: Floats, first: int, last: int, motion: Floats) -> Floats:
