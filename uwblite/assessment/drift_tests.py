@@ -50,8 +50,9 @@ def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             (scaled, sigma_scaled, _SCALE, _scale_text(scaled)),
         )
         # Either changes the size of the path beside the ranges: they are rival explanations of one remainder.
-        value, sigma, limit, text = max(patterns, key=lambda pattern: abs(pattern[0]) / pattern[1])
-        if abs(value) > max(limit, _SIGMAS * sigma):
+        drifting = [each for each in patterns if abs(each[0]) > max(each[2], _SIGMAS * each[1])]
+        if drifting:
+            value, sigma, _, text = max(drifting, key=lambda each: abs(each[0]) / each[1])
             why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
             yield doubt("drift", why, value=float(value), sigma=float(sigma))
     yield from _check_turns(graph, wheels, rec)
