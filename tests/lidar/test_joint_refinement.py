@@ -182,15 +182,15 @@ def test_neighbours_are_of_one_recording():
 def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
-    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
-    monkeypatch.setattr(overlap.OverlapPolicy, "points_at_once", 37)
+    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
+    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
     monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
     parts = overlap.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
     assert parts.shape == whole.shape
     assert (parts != whole).nnz == 0
     assert parts.nnz == whole.nnz == whole.sum()
-    np.testing.assert_array_equal(scan_matching.pair_points(clouds, j, 7).row, listed)
+    np.testing.assert_array_equal(scan_matching.pairs_of(clouds, j, j, 7).points, listed)
 
 
 def test_surface_cells_distinguish_the_sides_of_a_wall():
@@ -277,9 +277,9 @@ def test_the_gate_shrinks_at_its_own_pace_where_a_step_failed(monkeypatch, bette
     truth, path, clouds = room(7, 0.0, 4.0)
     asked = []
 
-    def recorded(clouds, raster, i, T_i_j, points, gate, *more):
+    def recorded(raster, pairs, T_i_j, gate, *more):
         asked.append(gate)
-        return match(clouds, raster, i, T_i_j, points, gate, *more)
+        return match(raster, pairs, T_i_j, gate, *more)
 
     summary = SimpleNamespace(chi2_initial=1.0, chi2_history=[] if better is None else [0.5 if better else 1.0])
     monkeypatch.setattr(joint_refinement, "match", recorded)

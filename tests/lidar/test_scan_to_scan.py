@@ -32,8 +32,8 @@ def tracked(truth, clouds, stated, by_ranges=None, duration=None):
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    steps = match_plainly(clouds, raster, wheels.i, stated, GATE)
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps)
+    steps = match_plainly(raster, wheels.i, stated, GATE)
+    return follow(raster, wheels, Graph(np.array(poses)), steps)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,7 @@ def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
     poses[astray] = se2.compose(poses[astray], np.array([0.2, -0.1, 0.8]))
     tied[astray] = False
     raster = rasterize(clouds, 0.1, GATE)
-    found, laid = reattached(clouds, raster, poses, np.arange(len(truth)) * 1.0, tied, GATE)
+    found, laid = reattached(raster, poses, np.arange(len(truth)) * 1.0, tied, GATE)
     assert laid.tolist() == [astray]
     error = se2.between(se2.between(truth[astray - 1], truth[astray]), se2.between(found[astray - 1], found[astray]))
     assert np.hypot(*error[:2]) < 0.02
@@ -218,7 +218,7 @@ def test_as_many_as_three_keyframes_in_a_row_are_laid_where_their_stamps_say(wal
     poses = truth.copy()
     poses[run] += [30.0, 0.0, 1.0]
     stamps = 1e6 + np.arange(len(truth))
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE)
+    found, laid = reattached(rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE)
     assert laid.tolist() == run.tolist()
     error = se2.between(truth[run], found[run])
     assert np.abs(error[:, :2]).max() < 0.03
@@ -230,6 +230,6 @@ def test_keyframes_without_neighbours_on_both_sides_stay(walk):
     tied = np.ones(len(truth), dtype=bool)
     tied[[0, -1]] = False
     tied[4:9] = False
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE)
+    found, laid = reattached(rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE)
     assert len(laid) == 0
     np.testing.assert_array_equal(found, truth)

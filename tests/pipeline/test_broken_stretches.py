@@ -15,7 +15,7 @@ from uwblite.assessment.causes import explained
 from uwblite.constraints import Constraints
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.lidar.object_likelihood import pairs_of
+from uwblite.lidar.scan_matching import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.broken_steps import broken_steps

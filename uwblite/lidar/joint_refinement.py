@@ -23,7 +23,7 @@ from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from .cloud_rasters import ScanClouds
 from .clouds import Clouds
 from .overlap import surface_cells
-from .scan_matching import PairFactors, match, measured, pair_points
+from .scan_matching import PairFactors, match, measured, pairs_of
 
 _NEIGHBOURS = 4
 """Clouds no farther apart in the chain than this are neighbours."""
@@ -167,15 +167,14 @@ def refine(
     graph : wheels, radio, priors and other edges; scan edges come from here.
     scans : their raster's reach bounds the gate. pairs : see unmeasured.
     """
-    i, j, clouds, raster = pairs.i, pairs.j, scans.clouds, scans.raster
-    points = pair_points(clouds, j, config.points)
+    i, j, looked_up = pairs.i, pairs.j, pairs_of(scans.clouds, pairs.i, pairs.j, config.points)
     gate, sigma, rounds, fit = config.first_gate, config.sigma, 0, np.inf
     optimizer = Optimizer()
     # The next round looks all matches up again: one successful step is enough.
     brief = replace(solver, max_iterations=12, relative_decrease=0.5)
     T_i_j = pairs.relative(graph)
     while True:
-        factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
+        factors = match(scans.raster, looked_up, T_i_j, gate, max(gate / 3.0, 2.5 * sigma))
         used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
         if used.any() and gate < 0.25:
             sigma = float(np.sqrt(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)))
@@ -213,10 +212,10 @@ def measured_again(
     pairs: ScanEdges, graph: Graph, scans: ScanClouds, config: RefinementConfig, weight: Floats
 ) -> ScanEdges:
     """Return refined pairs as the poses of a graph have them, measured with weights (p,) of the clouds' points."""
-    T_i_j, points = pairs.relative(graph), pair_points(scans.clouds, pairs.j, config.points)
+    T_i_j, looked_up = pairs.relative(graph), pairs_of(scans.clouds, pairs.i, pairs.j, config.points)
     gate = config.last_gate
     kernel = max(gate / 3.0, 2.5 * config.sigma)
-    factors = match(scans.clouds, scans.raster, pairs.i, T_i_j, points, gate, kernel, weight)
+    factors = match(scans.raster, looked_up, T_i_j, gate, kernel, weight)
     variance = factors.squared.sum() / max(factors.weight.sum(), 1.0)
     shared = _shared(pairs.i, pairs.j, np.ones(len(pairs), dtype=bool), config)
     z, sqrt_information = measured(factors, T_i_j, max(variance, (0.25 * config.sigma) ** 2) * shared)

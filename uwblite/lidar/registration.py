@@ -14,16 +14,14 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import expit, logit
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..odometry.slips import FalseMotions
 from . import correlative_matching
-from .cloud_rasters import rasterize
-from .degeneracy import measured_part
-from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy
-from .raster_search import Window, best_poses
-from .scan_matching import PairFactors, nondegenerate_step, pair_points
+from .object_likelihood import ObjectLikelihood, ObjectPolicy
+from .scan_matching import CloudPairs, MatchingPolicy, PairFactors, limited, measured_part, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +34,8 @@ class RegistrationConfig:
     """Matches from which on a pose is measured: twice its unknowns."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
-    same: ClassVar[float] = 16.27
-    """Squared Mahalanobis distance up to which two modes are one; one in a thousand exceeds it by chance."""
+    contradicts: ClassVar[float] = 16.266
+    """Squared Mahalanobis distance beyond which two poses are not the same; one in a thousand exceeds it by chance."""
     worth: ClassVar[float] = 0.02
     """Posterior odds of a slip below which it is not searched for."""
     good_share: ClassVar[float] = 0.75
@@ -46,23 +44,13 @@ class RegistrationConfig:
     """The same of an exhaustive search."""
     places: ClassVar[int] = 4
     """Best places of an exhaustive search from which matching descends."""
-    scored: ClassVar[int] = 120
-    """Points that such a search looks up."""
-    cell: ClassVar[float] = 0.1
-    """Step of such a search in x and y, m."""
-    wide: ClassVar[float] = 3.0
-    """Half-width of a search from which on one correlation of all shifts takes less time, m."""
     linear: ClassVar[float] = 0.1
     """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
     iterations: ClassVar[int] = 20
-    shrink: ClassVar[float] = 0.8
-    """Gate of an iteration as a share of the one before."""
     cooling: ClassVar[float] = 0.6
     """Covariance of the prior that residuals may still have in an iteration, as a share of the one before."""
     cold: ClassVar[float] = 0.05
     """Share of the prior's covariance from which on descent may end."""
-    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
-    """Longest step of one iteration, m and rad."""
     converged: ClassVar[float] = 1e-3
     """Steps below this end the descent, m or rad."""
 
@@ -117,7 +105,7 @@ class Placed(Table):
     @property
     def share(self) -> Floats:
         """(e,) share of the points looked up that match, 0..1."""
-        return self.factors.matched / np.maximum(self.factors.asked, 1)
+        return self.factors.share
 
     @property
     def shown(self) -> Bools:
@@ -236,7 +224,7 @@ class Placement:
         narrow, broad = sound.covariance(self.prior.sound), slipped.covariance(self.prior.slipped)
         off, slid = _difference(slipped.pose, sound.pose), of_slip > of_sound
         spread = np.linalg.solve(narrow, broad + off[:, :, None] * off[:, None, :])
-        same = np.einsum("eii->e", spread) < RegistrationConfig.same
+        same = np.einsum("eii->e", spread) < RegistrationConfig.contradicts
         likely = np.where(same, np.logaddexp(of_sound, of_slip), np.maximum(of_sound, of_slip)) - every
         place = sound.replaced(np.arange(len(same)), slipped, slid)
         # Any of them may be favoured falsely, however much.
@@ -305,25 +293,17 @@ def _shares(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> li
 
 
 def _searched(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
-    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view.
-
-    Where the wheels counted metres, the window is as large as the clouds: all its shifts are one correlation there.
-    """
-    c, clouds, within = RegistrationConfig, objects.clouds, 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
-    starts = np.tile(prior.mean, (c.places, 1, 1))
-    for row, (target, source) in enumerate(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)):
-        own, other = (clouds.chosen(np.array([k])) for k in (target, source))
-        view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (own, other))
-        low, high = (np.clip(prior.mean[row, :2] + side * within[row, :2], -view, view) for side in (-1.0, 1.0))
-        middle, half = np.append(0.5 * (low + high), prior.mean[row, 2]), 0.5 * (high - low)
-        turn = min(float(within[row, 2]), np.pi)
-        if half[:2].max() > c.wide:
-            found = correlative_matching.search(own, other, middle, (float(half[0]), float(half[1]), turn)).poses
-        else:
-            pair, raster = clouds.chosen(np.array([target, source])), rasterize(own, c.cell, c.first_gate)
-            points = pair_points(pair, np.array([1]), c.scored).of(0)
-            found = best_poses(pair, raster, points, middle, Window(float(half.max()), turn), c.places)
-        starts[: len(found), row] = found[: c.places]
+    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view."""
+    within = 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
+    starts = np.tile(prior.mean, (RegistrationConfig.places, 1, 1))
+    for row, (mean, reach) in enumerate(zip(prior.mean, within, strict=True)):
+        target, source = (objects.clouds.chosen(which[row : row + 1]) for which in (pairs.i, pairs.j))
+        view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (target, source))
+        low, high = (np.clip(mean[:2] + side * reach[:2], -view, view) for side in (-1.0, 1.0))
+        middle, (wide, tall) = np.append(0.5 * (low + high), mean[2]), 0.5 * (high - low)
+        window = float(wide), float(tall), min(float(reach[2]), np.pi)
+        found = correlative_matching.search(target, source, middle, window).poses[: len(starts)]
+        starts[: len(found), row] = found
     return list(starts)
 
 
@@ -341,19 +321,16 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     pose, gate, temper, left = start.copy(), c.first_gate, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
-        factors, _ = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)
+        factors = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)[0]
         matches, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
         pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
-        step = -np.linalg.solve(matches / scale + information[left], (gradient / scale + pull)[..., None])[..., 0]
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / c.farthest[0], np.abs(step[:, 2]) / c.farthest[1])
-        step /= np.maximum(reach, 1.0)[:, None]
+        step = -limited(_solved(matches / scale + information[left], gradient / scale + pull))
         pose[left] += step
         if gate <= ObjectPolicy.gate and temper < c.cold:
             left = left[np.abs(step).max(axis=1) >= c.converged]
-        gate, temper = max(gate * c.shrink, ObjectPolicy.gate), temper * c.cooling
+        gate, temper = max(gate * MatchingPolicy.shrink, ObjectPolicy.gate), temper * c.cooling
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
-    factors, judged = objects.match(pairs, pose, ObjectPolicy.gate)
-    likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
+    factors, likelihood, most = objects.match(pairs, pose, ObjectPolicy.gate)
     matches = measured_part(factors.hessian, factors.spurious, factors.gradient)[0] / scale
     return Placed(pose, factors, matches, likelihood, most)
 
@@ -364,9 +341,8 @@ def of_fallible(log_odds: Floats, wrong: float) -> Floats:
     Where people crowd about the robot, one pair of clouds can favour a false place by any factor: the model of the surfaces is
     wrong there, and only several pairs in a row tell.
     """
-    favoured = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -ObjectPolicy.largest, ObjectPolicy.largest)))
-    right = (1.0 - wrong) * favoured + wrong * (1.0 - favoured)
-    return np.asarray(np.log(right) - np.log1p(-right))
+    favoured = expit(log_odds)
+    return np.asarray(logit((1.0 - wrong) * favoured + wrong * (1.0 - favoured)))
 
 
 def odds_by_views(here: Floats, there: Floats) -> Floats:

@@ -20,8 +20,7 @@ from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, w
 from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy, pairs_of
-from .pair_alignment import align_pairs
+from .object_likelihood import ObjectLikelihood, ObjectPolicy
 from .registration import (
     Placed,
     Placement,
@@ -34,7 +33,7 @@ from .registration import (
     search,
     with_neighbours,
 )
-from .scan_matching import match, measured, pair_points
+from .scan_matching import CloudPairs, align_pairs, match, measured, pairs_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +50,6 @@ class TrackingConfig:
     """Standard deviation of a match that clouds cannot fall below, m: walls are no straighter."""
     median: ClassVar[float] = 2.366
     """Of chi2 with three degrees of freedom."""
-    contradicts: ClassVar[float] = 16.266
-    """What one step in a thousand exceeds by chance, of such a chi2."""
     elsewhere: ClassVar[float] = 0.12
     """m or rad; an error that a step of faultless odometry never has."""
     laps: ClassVar[int] = 3
@@ -113,40 +110,36 @@ class Steps:
         return self.enough & ((self.share < RegistrationConfig.good_share) | elsewhere)
 
 
-def match_plainly(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> Steps:
+def match_plainly(raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> Steps:
     """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3).
 
     Parameters
     ----------
-    clouds, raster : see clouds.build and cloud_rasters.rasterize. gate : reach of the raster, m.
+    gate : reach of the raster, m.
     """
-    points = pair_points(clouds, i + 1, ObjectPolicy.points)
-    aligned = align_pairs(clouds, raster, i, guess, points, gate, min(ObjectPolicy.gate, gate))
+    aligned = align_pairs(raster, pairs_of(raster.clouds, i, i + 1), guess, gate, min(ObjectPolicy.gate, gate))
     return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= TrackingConfig.min_points)
 
 
-def descended_edges(clouds: Clouds, raster: CloudRasters, steps: Steps) -> RelativePoseEdges:
+def descended_edges(raster: CloudRasters, steps: Steps) -> RelativePoseEdges:
     """Return the steps that descent measured, without a search, as edges."""
     shown = steps.enough & (steps.share >= RegistrationConfig.least_share)
-    return _edges(clouds, raster, steps.i[shown], steps.pose[shown], ObjectPolicy.gate)[0]
+    return _edges(raster, steps.i[shown], steps.pose[shown])[0]
 
 
-def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps
-) -> ScanOdometry:
+def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges: near what the wheels count, unless these slipped.
 
     Parameters
     ----------
-    clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes; what is no scan and shows slips weighs as much as one pair of clouds.
-    graph : holds their calibration. steps : the same steps after descent, see descend.
+    graph : holds their calibration. steps : the same steps after descent, see match_plainly.
     """
     i, good = wheels.i, steps.enough & (steps.share >= RegistrationConfig.good_share)
-    certain, sigma = _edges(clouds, raster, i[good], steps.pose[good], ObjectPolicy.gate)
+    certain, sigma = _edges(raster, i[good], steps.pose[good])
     noise = replace(reestimate_wheel_noise(wheels, certain, graph), slips=None)
-    pairs, mean = pairs_of(clouds, i, i + 1), noise.corrected(graph)
-    objects = ObjectLikelihood.of(clouds, raster, sigma, pairs, mean)
+    pairs, mean = pairs_of(raster.clouds, i, i + 1), noise.corrected(graph)
+    objects = ObjectLikelihood.of(raster, sigma, pairs, mean)
     objects = objects.learnt(pairs.rows(steps.enough), steps.pose[steps.enough])
     prior = Prior.about(mean, covariance_of(noise, graph), slip_sigma(noise), lost_sigma(noise))
     found = register(objects, pairs, prior, steps.pose)
@@ -175,7 +168,7 @@ def follow(
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
-    learnt, miss = with_uncounted_ways(noise, edges, graph), _miss(clouds, noise)
+    learnt, miss = with_uncounted_ways(noise, edges, graph), _miss(raster.clouds, noise)
     return ScanOdometry(
         edges, learnt, with_slips(learnt, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
         _moving(objects, i, mode, choice.covariance), rejected,
@@ -195,7 +188,7 @@ def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph)
     # Single steps also hold the errors that telescope, which the wheels' noise leaves out.
     usual = max(float(np.median(squared)) / TrackingConfig.median, 1.0) if len(squared) else 1.0
     contradicted = np.zeros(len(wheels), dtype=bool)
-    contradicted[own[squared > usual * TrackingConfig.contradicts]] = True
+    contradicted[own[squared > usual * RegistrationConfig.contradicts]] = True
     return contradicted
 
 
@@ -299,7 +292,7 @@ def _moving(objects: ObjectLikelihood, first: Ints, placed: Placed, spread: Floa
 
 
 def reattached(
-    clouds: Clouds, raster: CloudRasters, poses: Floats, stamps: Floats, tied: Bools, gate: float
+    raster: CloudRasters, poses: Floats, stamps: Floats, tied: Bools, gate: float
 ) -> tuple[Floats, Ints]:
     """Place keyframes that match none of their neighbours between these, where their clouds fit there.
 
@@ -314,7 +307,7 @@ def reattached(
     -------
     Poses (k, 3), and the keyframes (r,) that were placed again.
     """
-    lone = np.flatnonzero(~tied & (_lines_of(clouds) >= TrackingConfig.min_points))
+    lone = np.flatnonzero(~tied & (_lines_of(raster.clouds) >= TrackingConfig.min_points))
     sound = np.flatnonzero(tied)
     place = np.searchsorted(sound, lone)
     inner = (place > 0) & (place < len(sound))
@@ -323,8 +316,7 @@ def reattached(
     lone, before, after = lone[near], before[near], after[near]
     share = (stamps[lone] - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1e-9)
     guess = se2.between(poses[before], se2.interpolate(poses[before], poses[after], share))
-    points, tight = pair_points(clouds, lone, ObjectPolicy.points), min(ObjectPolicy.gate, gate)
-    aligned = align_pairs(clouds, raster, before, guess, points, gate, tight)
+    aligned = align_pairs(raster, pairs_of(raster.clouds, before, lone), guess, gate, min(ObjectPolicy.gate, gate))
     fits = aligned.share >= RegistrationConfig.good_share
     found, laid = poses.copy(), lone[fits]
     found[laid] = se2.compose(poses[before[fits]], aligned.pose[fits])
@@ -344,12 +336,10 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
     return 3.0 * (sigma[:, 0] + sigma[:, 2] * arm)
 
 
-def _edges(
-    clouds: Clouds, raster: CloudRasters, i: Ints, step: Floats, gate: float
-) -> tuple[RelativePoseEdges, float]:
+def _edges(raster: CloudRasters, i: Ints, step: Floats) -> tuple[RelativePoseEdges, float]:
     """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches, and the standard
     deviation of a match, m."""
-    factors = match(clouds, raster, i, step, pair_points(clouds, i + 1, ObjectPolicy.points), gate, gate / 2.0)
+    factors = match(raster, pairs_of(raster.clouds, i, i + 1), step, ObjectPolicy.gate, ObjectPolicy.gate / 2.0)
     sigma = float(np.sqrt(factors.squared.sum() / max(factors.weight.sum(), 1.0))) if len(i) else TrackingConfig.sigma
     sigma = max(sigma, TrackingConfig.least_sigma)
     z, sqrt_information = measured(factors, step, np.full(len(i), sigma**2 * ObjectPolicy.correlation))

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
-from ..lidar.degeneracy import measured_part
+from ..lidar.scan_matching import measured_part
 from ..radio.range_errors import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
 

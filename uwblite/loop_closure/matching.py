@@ -16,12 +16,10 @@ from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.free_space import FreeSpace
 from ..lidar.overlap import net_overlap
-from ..lidar.pair_alignment import Aligned, align_pairs
-from ..lidar.scan_matching import match, pair_points
+from ..lidar.scan_matching import Aligned, align_pairs, match, pairs_of
 from ..lidar.submaps import Submaps
-from ..lidar.visibility import violates_free_space
+from ..lidar.visibility import FreeSpace, violates_free_space
 from .candidates import Candidates
 from .closures import LoopClosureConfig
 from .parallel import in_order
@@ -35,8 +33,6 @@ class MatchingPolicy:
     """Candidates of a batch."""
     many_places: ClassVar[int] = 20
     """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
-    many_points: ClassVar[int] = 1000
-    """Points of each of two long stretches that are compared at every place."""
     same_place: ClassVar[float] = 0.3
     """Matches nearer to each other than this, m and rad, are one place."""
     extent: ClassVar[float] = 0.95
@@ -110,21 +106,20 @@ def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     candidates, clouds, config = batch.candidates, batch.clouds, batch.config
     raster = rasterize(clouds, 0.1, 0.5)
     row, guess = _guesses(batch)
-    points = pair_points(clouds, candidates.source[row], config.points)
-    tries = align_pairs(clouds, raster, candidates.target[row], guess, points, 0.5, config.gate)
+    pairs = pairs_of(clouds, candidates.target[row], candidates.source[row], config.points)
+    tries = align_pairs(raster, pairs, guess, 0.5, config.gate)
     wide = np.full(len(candidates.target), candidates.long)
     score, some = tries.share, np.flatnonzero(wide[row])
     target, source = candidates.target[row[some]], candidates.source[row[some]]
     poses = tries.pose[some]
-    many, gate = MatchingPolicy.many_points, config.gate
-    score[some] = net_overlap(clouds, raster, batch.free, target, source, poses, many, gate, batch.spacing)
+    score[some] = batch.spacing * net_overlap(raster, batch.free, target, source, poses, config.gate)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
     net = np.full(len(place), np.inf)
     net[wide & found] = score[place[wide & found]]
     pose[found] = tries.pose[place[found]]
-    points = pair_points(clouds, candidates.source, config.points)
-    factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
+    pairs = pairs_of(clouds, candidates.target, candidates.source, config.points)
+    factors = match(raster, pairs, pose, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
     through = _free_space_violations(batch, best, _promising(best, net, config))
     return ClosureMatches(best, found, second, through, net), clouds.work

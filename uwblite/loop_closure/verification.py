@@ -20,10 +20,9 @@ from ..graph.graph import Graph
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
-from ..lidar.free_space import FreeSpace
-from ..lidar.pair_alignment import Aligned
-from ..lidar.scan_matching import measured
+from ..lidar.scan_matching import Aligned, measured
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import FreeSpace
 from ..map_result import LoopClosure
 from . import slid_stretches
 from .candidates import Candidates

@@ -15,7 +15,8 @@ from .. import se2
 from ..arrays import Bools, Ints
 from ..findings import Fact
 from ..graph.pose_edges import OdometryEdges, ScanEdges
-from ..lidar.object_likelihood import ObjectLikelihood, pairs_of
+from ..lidar.object_likelihood import ObjectLikelihood
+from ..lidar.scan_matching import pairs_of
 from ..lidar.scan_to_scan import TrackingConfig
 from ..odometry.slips import log_densities, with_slips
 from ..problem.solution import rough
@@ -147,7 +148,7 @@ def _likelihood(estimate: Estimate) -> ObjectLikelihood:
     """Return the likelihood of rays, with what matches by chance and what moves as neighbouring clouds show it."""
     lidar, i, j, poses = estimate.lidar, estimate.odometry.i, estimate.odometry.j, estimate.graph.poses
     pairs, steps = pairs_of(lidar.clouds, i, j), se2.between(poses[i], poses[j])
-    return ObjectLikelihood.of(lidar.clouds, lidar.raster, TrackingConfig.sigma, pairs, steps).learnt(pairs, steps)
+    return ObjectLikelihood.of(lidar.raster, TrackingConfig.sigma, pairs, steps).learnt(pairs, steps)
 
 
 def _fact(estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task) -> Fact:

@@ -12,8 +12,8 @@ from ..graph.joint_covariance import JointCovariance
 from ..graph.pose_edges import OdometryEdges
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
-from ..lidar.free_space import FreeSpace
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import FreeSpace
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, long_stretches, loose_links, paper_method, verification
 from ..loop_closure.candidates import Candidates

@@ -106,7 +106,7 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     """Return the optimum of odometry, weakly weighted ranges and the steps that descent from the odometry measured."""
     scans, twist = estimate.lidar, task.recordings.twist
-    found = scan_to_scan.descended_edges(scans.clouds, scans.raster, steps)
+    found = scan_to_scan.descended_edges(scans.raster, steps)
     names = scan_indices(estimate.graph.calibration)
     i, j, kernel = found.i, found.j, estimate.odometry.kernel
     edges = ScanEdges(i, j, found.T_i_j, found.sqrt_information, twist[i], twist[j], names, scans.delay, kernel)
@@ -176,13 +176,13 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     """Return the steps of the odometry as the clouds measure them from the estimate's poses."""
     scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i
     guess = se2.between(poses[i], poses[i + 1])
-    return scan_to_scan.match_plainly(scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate)
+    return scan_to_scan.match_plainly(scans.raster, i, guess, task.config.refinement.first_gate)
 
 
 def _followed(estimate: Estimate, steps: Steps) -> ScanOdometry:
     """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
     scans = estimate.lidar
-    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps)
+    return scan_to_scan.follow(scans.raster, estimate.odometry, estimate.graph, steps)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
@@ -227,7 +227,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
     refined = refine(weak, graph, settings, task, "scan-to-scan matching")
     ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
     poses, laid = scan_to_scan.reattached(
-        scans.clouds, scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
+        scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
         rules.first_gate,
     )
     if len(laid):
