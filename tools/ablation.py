@@ -98,7 +98,7 @@ INGREDIENTS: dict[str, LeftOut] = {
         ("pipeline.surface_adjustment.fitted_columns", lambda rays, poses, columns: columns),
     )),
     "walls that poses bend": LeftOut(patches=(
-        ("lidar.walls._halved", lambda number, *places: np.unique(number, return_inverse=True)[1]),
+        ("lidar.walls._curved", lambda lines, places: np.ones(len(lines.centre), dtype=bool)),
     )),
     "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
