@@ -18,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import expit
 
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, PairFactors, condensed, correspondences
@@ -121,21 +121,6 @@ class ObjectLikelihood:
             agreement.append([judged.likelihood, judged.most])
         likelihood, most = np.hstack(agreement)
         return concatenated(parts), likelihood, most
-
-    def moving(self, pairs: CloudPairs, poses: Floats, covariance: Floats) -> Bools:
-        """Return which points (p,) of all clouds belong to objects of sources that moved by themselves.
-
-        Parameters
-        ----------
-        poses, covariance : (e, 3) T_i_j and (e, 3, 3).
-        """
-        moves = np.zeros(len(self.clouds.points), dtype=bool)
-        for found, judged in self._judged(pairs, poses, ObjectPolicy.gate, covariance):
-            for source, static in zip(pairs.j[found.pairs].tolist(), judged.static, strict=True):
-                rows = slice(int(self.clouds.offsets[source]), int(self.clouds.offsets[source + 1]))
-                own = self.number[rows]
-                moves[rows] |= (static[np.minimum(own, len(static) - 1)] < ObjectPolicy.unlikely) & (own < len(static))
-        return moves
 
     def _judged(
         self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None

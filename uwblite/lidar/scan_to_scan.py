@@ -60,10 +60,6 @@ class TrackingConfig:
     """Clouds before a doubtful step with which the one after it is compared: they still see the same."""
     doubtful: ClassVar[float] = 0.02
     """Probability of a slip from which on a step is doubtful."""
-    steps_back: ClassVar[int] = 4
-    """Steps over which objects that move are sought: a second or two."""
-    longest_run: ClassVar[int] = 3
-    """Most consecutive keyframes that are placed between well matched ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +78,6 @@ class ScanOdometry:
     """Number of steps that were searched for."""
     slips: Floats
     """(e,) probability that the wheels slipped over each."""
-    moving: Bools
-    """(p,) points of the clouds that belong to objects that moved by themselves."""
     rejected: Bools
     """(e,) steps that contradict the wheels although the clouds are likelier as the wheels count; not among the measured."""
 
@@ -171,7 +165,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     learnt, miss = with_uncounted_ways(noise, edges, graph), _miss(raster.clouds, noise)
     return ScanOdometry(
         edges, learnt, with_slips(learnt, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
-        _moving(objects, i, mode, choice.covariance), rejected,
+        rejected,
     )
 
 
@@ -210,8 +204,6 @@ class _Choice:
     """(e)."""
     elsewhere: Bools
     """(e,) whether the wheels slipped or a message was lost."""
-    covariance: Floats
-    """(e, 3, 3) of the poses by matches and prior."""
     log_odds: Floats
     """(r,) of slips over doubtful steps, by what their clouds show."""
 
@@ -231,7 +223,7 @@ def _decided(
     parts = found.prior.sound, found.prior.slipped, found.prior.lost
     found = found.followed_by(rows, descend(objects, pairs.rows(rows), near[rows], parts[-1].rows(rows)))
     chain, choice, log_odds = found.sound.pose.copy(), np.arange(len(near)), np.zeros(len(rows))
-    part, tied = np.zeros(len(near), dtype=np.intp), np.ones(len(near), dtype=bool)
+    moved, tied = np.zeros(len(near), dtype=bool), np.ones(len(near), dtype=bool)
     odds = np.stack([slips, np.full(len(near), np.log(TrackingConfig.lost))])
     for number, row in enumerate(rows.tolist()):
         own = np.flatnonzero(found.pair == row)
@@ -246,14 +238,11 @@ def _decided(
         score = np.stack([odds_by_views(sound.max(axis=1, keepdims=True), each) for each in others])
         log_odds[number] = score[0].max()
         score += odds[:, row, None]
-        which, best = np.unravel_index(np.argmax(score), score.shape)
-        if score[which, best] > 0.0:
-            part[row], choice[row] = 1 + which, own[best]
-            chain[row] = some.pose[best]
+        best = int(np.argmax(score.max(axis=0)))
+        if score[:, best].max() > 0.0:
+            moved[row], choice[row], chain[row] = True, own[best], some.pose[best]
         tied[row] = _shown(found.candidates.rows(choice[row : row + 1]))[0]
-    placed = found.candidates.rows(choice)
-    covariances = np.stack([placed.covariance(each) for each in parts])
-    return found, _Choice(placed, part > 0, covariances[part, np.arange(len(part))], log_odds)
+    return found, _Choice(found.candidates.rows(choice), moved, log_odds)
 
 
 def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, tied: Bools, row: int, poses: Floats) -> Floats:
@@ -272,60 +261,6 @@ def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, tied: Boo
     compared = pairs.rows(np.full(len(at) * len(poses), row))
     compared = replace(compared, i=pairs.i[row] - np.repeat(np.arange(len(at)), len(poses)))
     return objects.log_likelihood(compared, np.concatenate(at)).reshape(len(at), len(poses))
-
-
-def _moving(objects: ObjectLikelihood, first: Ints, placed: Placed, spread: Floats) -> Bools:
-    """Return which points (p,) belong to objects that moved since the keyframe before, or one some steps before.
-
-    What moves slowly shows over several steps only; the uncertainty of a chain grows with their number, by (e, 3, 3) each.
-    """
-    i, j, pose, covariance = first, first + 1, placed.pose, spread
-    moves = np.zeros(len(objects.clouds.points), dtype=bool)
-    for _ in range(TrackingConfig.steps_back):
-        moves |= objects.moving(pairs_of(objects.clouds, i, j), pose, covariance)
-        after = np.flatnonzero(np.isin(j, first))
-        follows = np.searchsorted(first, j[after])
-        turn = se2.rotation(pose[after, 2])
-        covariance = covariance[after] + turn @ spread[follows] @ np.swapaxes(turn, 1, 2)
-        i, j, pose = i[after], j[after] + 1, se2.compose(pose[after], placed.pose[follows])
-    return moves
-
-
-def reattached(
-    raster: CloudRasters, poses: Floats, stamps: Floats, tied: Bools, gate: float
-) -> tuple[Floats, Ints]:
-    """Place keyframes that match none of their neighbours between these, where their clouds fit there.
-
-    A step may be wrong although its two clouds match; the keyframe after it then fits the one before it, and a single
-    keyframe that matches neither is misplaced.
-
-    Parameters
-    ----------
-    poses, stamps : (k, 3) and (k,) s. tied : (k,) keyframes that match a neighbour. gate : reach of the raster, m.
-
-    Returns
-    -------
-    Poses (k, 3), and the keyframes (r,) that were placed again.
-    """
-    lone = np.flatnonzero(~tied & (_lines_of(raster.clouds) >= TrackingConfig.min_points))
-    sound = np.flatnonzero(tied)
-    place = np.searchsorted(sound, lone)
-    inner = (place > 0) & (place < len(sound))
-    lone, before, after = lone[inner], sound[place[inner] - 1], sound[place[inner]]
-    near = after - before <= TrackingConfig.longest_run + 1
-    lone, before, after = lone[near], before[near], after[near]
-    share = (stamps[lone] - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1e-9)
-    guess = se2.between(poses[before], se2.interpolate(poses[before], poses[after], share))
-    aligned = align_pairs(raster, pairs_of(raster.clouds, before, lone), guess, gate, min(ObjectPolicy.gate, gate))
-    fits = aligned.share >= RegistrationConfig.good_share
-    found, laid = poses.copy(), lone[fits]
-    found[laid] = se2.compose(poses[before[fits]], aligned.pose[fits])
-    return found, laid
-
-
-def _lines_of(clouds: Clouds) -> Ints:
-    """Return the number (k,) of points with a normal of each cloud."""
-    return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:

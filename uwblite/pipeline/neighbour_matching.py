@@ -129,13 +129,7 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
-    estimate = replace(_without_moving(estimate, track, task), odometry=track.slipped)
-    return _match_neighbours(estimate, track, task)
-
-
-def _without_moving(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
-    """Return the estimate without the points of objects that move."""
-    return replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, task.config))
+    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -215,26 +209,15 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
         "searched": track.searched,
         "rejected": int(track.rejected.sum()),
         "slipped": int(np.sum(track.slips > NeighbourPolicy.likely)),
-        "moving": round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
     }
     return _refined_neighbours(estimate, graph, gate, task, figures)
 
 
 def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, figures: dict[str, object]) -> Estimate:
     """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
-    scans, rules = estimate.lidar, task.config.refinement
-    settings, weak = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate), _with_inflated_ranges(estimate)
+    rules, weak = task.config.refinement, _with_inflated_ranges(estimate)
+    settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     refined = refine(weak, graph, settings, task, "scan-to-scan matching")
-    ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
-    poses, laid = scan_to_scan.reattached(
-        scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
-        rules.first_gate,
-    )
-    if len(laid):
-        graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
-        settings = replace(settings, first_gate=rules.later_gate)
-        refined = refine(weak, graph, settings, task, "scan-to-scan matching")
-        figures = {**figures, "placed_again": len(laid)}
     own = {"gate": round(gate, 3), "sigma": round(refined.sigma, 4), "rounds": refined.rounds}
     task.stages.end("scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), **own, **figures)
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Bools, Ints
+from ..arrays import Ints
 from ..graph.work import POINTS, Work
 from ..lidar import cloud_rasters, clouds
 from ..lidar.cloud_rasters import ScanClouds
@@ -33,11 +33,6 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
     both = clouds.joined([old.clouds, *parts]).chosen(place)
     return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(p.points) for p in parts))
-
-
-def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
-    """Return the clouds with some of their points (p,) alone."""
-    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay, int(kept.sum()))
 
 
 def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
