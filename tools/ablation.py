@@ -102,7 +102,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     )),
     "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
     "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
-    "points between beams": LeftOut(patches=(("lidar.beam_gaps.filled", lambda rays: rays),)),
+    "points between beams": LeftOut(patches=(("lidar.clouds.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),

@@ -46,7 +46,7 @@ def test_many_error_codes_are_noted(errors, said):
 def turned(ratio=(1.0, 0.01), **values):
     """Return sensor and text of the findings of a comparison of turns that came out so."""
     plain = Turning(
-        pairs=40, typical=0.3, as_given=0.01, other=0.5, misfit=0.01, delay=0.0, delay_clear=True, ratio=1.0, ratio_sigma=0.01
+        pairs=40, typical=0.3, as_given=0.01, other=0.5, misfit=0.01, delay=0.0, delay_clear=True, ratio=1.0
     )
     return [(f.sensor, f.text) for f in check_turning(replace(plain, **values), ratio)]
 
