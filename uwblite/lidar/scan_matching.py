@@ -91,6 +91,11 @@ class PairFactors(Table):
         """(e,) share of the points looked up that match, 0..1."""
         return self.matched / np.maximum(self.asked, 1)
 
+    @property
+    def variance(self) -> float:
+        """m^2, mean squared distance of the matches of all pairs."""
+        return float(self.squared.sum() / max(self.weight.sum(), 1.0))
+
 
 def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = MatchingPolicy.points) -> CloudPairs:
     """Return pairs of targets i (e,) and sources j (e,), with up to `limit` evenly spread points with a normal of each."""

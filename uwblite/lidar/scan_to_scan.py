@@ -275,7 +275,7 @@ def _edges(raster: CloudRasters, i: Ints, step: Floats) -> tuple[RelativePoseEdg
     """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches, and the standard
     deviation of a match, m."""
     factors = match(raster, pairs_of(raster.clouds, i, i + 1), step, ObjectPolicy.gate, ObjectPolicy.gate / 2.0)
-    sigma = float(np.sqrt(factors.squared.sum() / max(factors.weight.sum(), 1.0))) if len(i) else TrackingConfig.sigma
+    sigma = float(np.sqrt(factors.variance)) if len(i) else TrackingConfig.sigma
     sigma = max(sigma, TrackingConfig.least_sigma)
     z, sqrt_information = measured(factors, step, np.full(len(i), sigma**2 * ObjectPolicy.correlation))
     return RelativePoseEdges(i, i + 1, z, sqrt_information), sigma
