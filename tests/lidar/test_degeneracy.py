@@ -7,7 +7,7 @@ from helpers.registration_worlds import CORRIDOR, ROOM, pair
 
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.scan_matching import MatchingPolicy, _relative_eigen, match, measured_part, nondegenerate_step, pairs_of
+from uwblite.lidar.scan_matching import PairPolicy, _relative_eigen, match, measured_part, nondegenerate_step, pairs_of
 
 CENTRE = (3.0, 1.5)
 
@@ -69,5 +69,5 @@ def test_the_measured_part_is_that_of_the_nondegenerate_step():
         step, root = nondegenerate_step(factors)
         np.testing.assert_allclose(information, np.swapaxes(root, 1, 2) @ root, atol=1e-6 * information.max())
         np.testing.assert_allclose(information @ step[:, :, None], -gradient[:, :, None], atol=1e-6 * np.abs(gradient).max())
-    nothing = measured_part(MatchingPolicy.measured * factors.spurious, factors.spurious, factors.gradient)[0]
+    nothing = measured_part(PairPolicy.measured * factors.spurious, factors.spurious, factors.gradient)[0]
     np.testing.assert_allclose(nothing, 0.0, atol=1e-6 * factors.spurious.max())

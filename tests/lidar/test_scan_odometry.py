@@ -35,7 +35,7 @@ def test_motions_are_found_whatever_the_mounting(mounting):
     right, wrong = (misfits(lidar, mounting, FIRST, SECOND, exact + off) for off in (np.zeros(3), np.array([0.1, 0.1, 0.0])))
     assert np.all(right < 0.2 * wrong)
     away = misfits(lidar, mounting, FIRST, SECOND, exact + np.array([90.0, 0.0, 0.0]))
-    np.testing.assert_allclose(away, ScanStepPolicy.first_gate**2)
+    np.testing.assert_allclose(away, ScanStepPolicy.reach**2)
 
 
 def test_along_a_bare_corridor_a_scan_matches_the_next_one_no_better_if_the_robot_stood():

@@ -18,22 +18,20 @@ class ColumnPolicy:
 
     radii: ClassVar[tuple[float, float]] = (0.04, 0.8)
     """m, smallest and largest."""
-    widest: ClassVar[float] = 2.5
-    """Largest distance between the ends of a run of rays, relative to the largest radius: 2 without noise."""
+    widest: ClassVar[float] = 2.0
+    """Largest distance between the ends of a run of rays, m."""
     jump: ClassVar[float] = 0.2
     """m, difference of neighbouring ranges that ends a run of rays, beside two standard deviations of them."""
     fewest: ClassVar[int] = 10
     """Least number of rays of a run that shows a curvature."""
     apart: ClassVar[float] = 0.12
-    """m between centres up to which two circles may be one column."""
-    unlike: ClassVar[float] = 0.3
-    """Relative difference of the radii up to which they are, beside half the smallest radius."""
+    """m between centres, and of radii, up to which two circles may be one column."""
     views: ClassVar[int] = 3
     """Least number of keyframes that see a column."""
-    gates: ClassVar[tuple[float, ...]] = (0.15, 0.15, 0.15)
-    """m, of the first steps towards a circle."""
     steps: ClassVar[int] = 8
     """Steps towards a circle."""
+    begin: ClassVar[float] = 0.15
+    """Gate of the first half of the steps, m."""
     gate: ClassVar[float] = 4.0
     """Gate of the other steps, standard deviations of the rays, beside the slack."""
     slack: ClassVar[float] = 0.02
@@ -44,11 +42,10 @@ class ColumnPolicy:
     """Share of the rays around it that must end on it."""
     probable: ClassVar[float] = 1.22
     """Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
-    square: ClassVar[float] = 0.2
-    """Size of a square of the map that is near a column or not, m; a larger map gets larger ones."""
-    most_squares: ClassVar[float] = 1e6
 
 
+_MOST_SQUARES = 1 << 20
+"""Squares of the map that are near a column or not; a larger map gets larger ones."""
 _SINGULAR = 1e-14
 """Determinant, m^4, of places on a line."""
 
@@ -103,7 +100,7 @@ def _short_runs(rays: ScanPoints) -> tuple[ScanPoints, Ints, Floats]:
     first = np.flatnonzero(begins_run(rays, np.abs(np.diff(reach)) > c.jump + 2.0 * range_sigma(reach[1:])))
     count = np.diff(np.append(first, len(reach)))
     wide = np.hypot(*(rays.points[first + count - 1] - rays.points[first]).T)
-    good = (count >= c.fewest) & (wide < c.widest * c.radii[1])
+    good = (count >= c.fewest) & (wide < c.widest)
     rows, kept = np.flatnonzero(np.repeat(good, count)), count[good]
     return rays.rows(rows), np.repeat(np.arange(len(kept)), kept), reach[rows]
 
@@ -112,8 +109,7 @@ def join_circles(found: Circles, poses: Floats) -> Floats:
     """Return the columns (n, 3), x, y, radius in the map, that circles of several keyframes at poses (k, 3) show."""
     c, at = ColumnPolicy, se2.transform(poses[found.keyframe], found.centre)
     one, other = cKDTree(at).query_pairs(c.apart, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
-    smaller = np.minimum(found.radius[one], found.radius[other])
-    alike = np.abs(found.radius[one] - found.radius[other]) < c.unlike * smaller + 0.5 * c.radii[0]
+    alike = np.abs(found.radius[one] - found.radius[other]) < c.apart
     number = connected(one[alike], other[alike], len(at))
     views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.intp))
     weight = np.bincount(number, found.rays).astype(np.float64)
@@ -164,11 +160,11 @@ class Surroundings:
 
 def surroundings(columns: Floats, margin: float) -> Surroundings:
     """Return the squares within a margin, m, of columns (c, 3)."""
-    size = ColumnPolicy.square
+    size = SurfacePolicy.around
     if not len(columns):
         return Surroundings(columns, np.zeros(2), size, np.zeros((1, 1), dtype=bool))
     reach, wide = columns[:, 2].max() + margin, np.ptp(columns[:, :2], axis=0)
-    size = max(size, float(np.sqrt(np.prod(wide + 2.0 * reach) / ColumnPolicy.most_squares)))
+    size = max(size, float(np.sqrt(np.prod(wide + 2.0 * reach) / _MOST_SQUARES)))
     corner = columns[:, :2].min(axis=0) - reach - 2.0 * size
     x, y = np.ceil((wide + 2.0 * reach) / size + 2.0 * 2.0).astype(np.intp)
     middle = corner + (np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1) + 0.5) * size
@@ -201,7 +197,7 @@ def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
     for turn in range(c.steps):
         centre, radius = columns[:, :2].take(own, axis=0), columns[:, 2].take(own)
         shift, normal, incidence = to_circle(at - centre, direction, radius)
-        gate = c.gates[turn] if turn < len(c.gates) else c.gate * sigma + c.slack
+        gate = c.begin if 2 * turn < c.steps else c.gate * sigma + c.slack
         near = (incidence < -c.incidence) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
         rows = np.flatnonzero(robust)

@@ -42,8 +42,9 @@ class RefinementConfig:
     first_gate: float = setting(0.5, above=0.0, advanced=True)
     """Farthest match in the first round, m."""
     later_gate: ClassVar[float] = 0.2
-    """Farthest match in the first round where poses are good already: after matching scan to scan, or once matched. From there
-    on the noise of matches is learnt."""
+    """Farthest match in the first round where poses are good already: after matching scan to scan, or once matched."""
+    learns: ClassVar[float] = 0.25
+    """Gate below which the noise of matches is learnt, m."""
     last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
     shrink: ClassVar[float] = 0.7
@@ -193,7 +194,7 @@ def refine(
         factors = match(scans.raster, looked_up, T_i_j, gate, _kernel(gate, sigma, config))
         used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
         counting = factors.rows(used)
-        if used.any() and gate <= config.later_gate:
+        if used.any() and gate < config.learns:
             sigma = max(float(np.sqrt(counting.variance)), config.quietest * config.sigma)
         z, sqrt_information = measured(factors, T_i_j, sigma**2 * _shared(looked_up, used, config))
         # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.

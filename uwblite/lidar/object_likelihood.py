@@ -21,7 +21,7 @@ from scipy.special import expit
 from ..arrays import Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .scan_matching import CloudPairs, Correspondences, PairFactors, condensed, correspondences
+from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
 from .visibility import free_space, in_free_space, nearest_by_bearing
 
 
@@ -29,10 +29,6 @@ from .visibility import free_space, in_free_space, nearest_by_bearing
 class ObjectPolicy:
     """Likelihood of surfaces."""
 
-    gate: ClassVar[float] = 0.15
-    """Farthest match, m."""
-    correlation: ClassVar[float] = 8.0
-    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
     outlier: ClassVar[float] = 9.0
     """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
     gap: ClassVar[float] = 0.4
@@ -100,14 +96,14 @@ class ObjectLikelihood:
         An empty hall has few things that move and a museum many: what contradicts the place of a cloud counts accordingly.
         """
         moved = stood = 0.0
-        for _, judged in self._judged(pairs, poses, ObjectPolicy.gate):
+        for _, judged in self._judged(pairs, poses, PairPolicy.gate):
             moved += float(np.sum(judged.static < ObjectPolicy.unlikely))
             stood += float(np.sum(judged.static > ObjectPolicy.sure))
         return replace(self, moves=(1.0 + moved) / (1.0 / ObjectPolicy.moves + moved + stood))
 
     def log_likelihood(self, pairs: CloudPairs, poses: Floats) -> Floats:
         """Return the log likelihood (e,) of sources at poses (e, 3) by that in unknown space."""
-        return np.concatenate([judged.likelihood for _, judged in self._judged(pairs, poses, ObjectPolicy.gate)])
+        return np.concatenate([judged.likelihood for _, judged in self._judged(pairs, poses, PairPolicy.gate)])
 
     def match(
         self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None
@@ -150,13 +146,13 @@ class ObjectLikelihood:
         many = int(group.max(initial=0)) + 1
         key = (np.arange(len(i))[:, None] * many + group)[usable]
         chi2, matched, asked = (
-            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / c.correlation
+            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / PairPolicy.correlation
             for v in (cost, found.good.astype(np.float64), usable.astype(np.float64))
         )
         # An object longer than any that moves by itself would be several that move together.
         most = np.full((len(i), many), -np.log(self.moves))
         most.reshape(-1)[key] *= np.maximum(self.length[found.row[usable]] / c.long, 1.0)
-        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
+        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * PairPolicy.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
         likelihood, largest = (
             np.logaddexp(fixed + agree, -most).sum(axis=1) for agree in (stays, np.minimum(gain * asked, most))
@@ -175,7 +171,7 @@ def matched_by_chance(raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> 
     sides = ObjectPolicy.gap * np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
     matched = np.full(len(pairs), beforehand)
     for aside in sides:
-        for found in correspondences(raster, pairs, mean + aside, ObjectPolicy.gate):
+        for found in correspondences(raster, pairs, mean + aside, PairPolicy.gate):
             matched[found.pairs] += found.good.sum(axis=1)
     chance = np.full(len(raster.clouds), beforehand / points)
     chance[pairs.i] = matched / (len(sides) * (pairs.points >= 0).sum(axis=1) + points)

@@ -33,8 +33,6 @@ class RayPolicy:
     """The same of one on a column, rad."""
     fewest: ClassVar[int] = 200
     """Least number of rays from which their noise is learnt."""
-    quietest: ClassVar[float] = 0.1
-    """Least noise, as a share of that by data sheets."""
     clip: ClassVar[float] = 3.0
     """Standard deviations at which residuals are clipped: outliers give no information about the noise of inliers."""
     places: ClassVar[int] = 5
@@ -195,7 +193,7 @@ def learnt_noise(residual: Floats, place: Ints, surface: Ints, curved: Bools) ->
     surface : (m,). curved : (s,) whether a surface is a column.
     """
     c = RayPolicy
-    ratio = max(spread(residual), c.quietest) if len(residual) >= c.fewest else 1.0
+    ratio = max(spread(residual), SurfacePolicy.quietest) if len(residual) >= c.fewest else 1.0
     clipped = np.where(np.abs(residual) < c.clip * ratio, residual / ratio, 0.0)
     return RayNoise(ratio, _design_effects(clipped, place, surface, curved))
 

@@ -9,7 +9,6 @@ are compared by their evidence, the marginal likelihood of the source's surfaces
 where the sum is that of object_likelihood. Two clouds may also show nothing of each other's place; then neither part gains.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -20,39 +19,31 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..odometry.slips import FalseMotions
 from . import correlative_matching
-from .object_likelihood import ObjectLikelihood, ObjectPolicy
-from .scan_matching import CloudPairs, MatchingPolicy, PairFactors, limited, measured_part, nondegenerate_step
+from .correlative_matching import CorrelativeConfig
+from .object_likelihood import ObjectLikelihood
+from .scan_matching import CloudPairs, PairFactors, PairPolicy, limited, measured_part, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationConfig:
     """Descent and search."""
 
-    first_gate: ClassVar[float] = 0.5
-    """Farthest match at the beginning of the descent, m; the reach of the rasters."""
     fewest: ClassVar[int] = 6
     """Matches from which on a pose is measured: twice its unknowns."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
     contradicts: ClassVar[float] = 16.266
     """Squared Mahalanobis distance beyond which two poses are not the same; one in a thousand exceeds it by chance."""
-    worth: ClassVar[float] = 0.02
-    """Posterior odds of a slip below which it is not searched for."""
-    good_share: ClassVar[float] = 0.75
-    """Share of matching points from which on matching begins at no further places."""
+    doubtful: ClassVar[float] = 0.02
+    """Probability of a slip from which on it is searched for."""
     least_share: ClassVar[float] = 0.5
-    """The same of an exhaustive search."""
-    places: ClassVar[int] = 4
-    """Best places of an exhaustive search from which matching descends."""
-    linear: ClassVar[float] = 0.1
-    """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
-    iterations: ClassVar[int] = 20
+    """Share of matching points below which the search is exhaustive."""
     cooling: ClassVar[float] = 0.6
     """Covariance of the prior that residuals may still have in an iteration, as a share of the one before."""
     cold: ClassVar[float] = 0.05
     """Share of the prior's covariance from which on descent may end."""
-    converged: ClassVar[float] = 1e-3
-    """Steps below this end the descent, m or rad."""
+    linear: ClassVar[float] = 0.1
+    """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,10 +222,6 @@ class Placement:
         return place, np.where(slid[:, None, None], broad, narrow), (1.0 - useless) * np.exp(likely)
 
 
-Starts = Callable[[ObjectLikelihood, CloudPairs, Gaussian], list[Floats]]
-"""Gives poses (e, 3) from which matching begins."""
-
-
 def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: Floats) -> Placement:
     """Place the sources of pairs (e,) in their targets.
 
@@ -245,13 +232,13 @@ def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: 
     c = RegistrationConfig
     sound = descend(objects, pairs, prior.sound.mean, prior.sound)
     bound = np.where(sound.factors.asked > 0, _most_odds(sound, prior), 0.0)
-    rows = np.flatnonzero((bound > np.log(c.worth)) & (sound.factors.asked > 0))
+    rows = np.flatnonzero((bound > np.log(c.doubtful)) & (sound.factors.asked > 0))
     some, wide = pairs.rows(rows), prior.slipped.rows(rows)
     slipped = descend(objects, some, other[rows], wide)
-    for least, starts in ((c.good_share, _shares), (c.least_share, _searched)):
-        poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
-        found, part = _from_best(objects, some.rows(poor), wide.rows(poor), starts), wide.rows(poor)
-        slipped = slipped.replaced(poor, found, found.evidence(part) > slipped.rows(poor).evidence(part))
+    poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < c.least_share)
+    part = wide.rows(poor)
+    found = search(objects, some.rows(poor), part)
+    slipped = slipped.replaced(poor, found, found.evidence(part) > slipped.rows(poor).evidence(part))
     return Placement(prior, sound, np.arange(len(pairs)), bound, rows).followed_by(rows, slipped)
 
 
@@ -277,32 +264,22 @@ def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placeme
 
 def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets, wherever the prior allows."""
-    return _from_best(objects, pairs, prior, _searched)
-
-
-def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:
-    """Place pairs (e,), each from the best of several starts."""
-    placed = [descend(objects, pairs, start, prior) for start in starts(objects, pairs, prior)]
+    placed = [descend(objects, pairs, start, prior) for start in _starts(objects, pairs, prior)]
     best = np.argmax([each.evidence(prior) for each in placed], axis=0)
     return concatenated(placed).rows(best * len(pairs) + np.arange(len(pairs)))
 
 
-def _shares(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
-    """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
-    return [share * prior.mean for share in (1.0, 0.5, 0.0)]
-
-
-def _searched(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
+def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
     """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view."""
-    within = 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
-    starts = np.tile(prior.mean, (RegistrationConfig.places, 1, 1))
+    config, within = CorrelativeConfig(), 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
+    starts = np.tile(prior.mean, (config.candidates, 1, 1))
     for row, (mean, reach) in enumerate(zip(prior.mean, within, strict=True)):
         target, source = (objects.clouds.chosen(which[row : row + 1]) for which in (pairs.i, pairs.j))
         view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (target, source))
         low, high = (np.clip(mean[:2] + side * reach[:2], -view, view) for side in (-1.0, 1.0))
         middle, (wide, tall) = np.append(0.5 * (low + high), mean[2]), 0.5 * (high - low)
         window = float(wide), float(tall), min(float(reach[2]), np.pi)
-        found = correlative_matching.search(target, source, middle, window).poses[: len(starts)]
+        found = correlative_matching.search(target, source, middle, window, config).poses
         starts[: len(found), row] = found
     return list(starts)
 
@@ -317,20 +294,20 @@ def _most_odds(placed: Placed, prior: Prior) -> Floats:
 
 def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets by matches and a prior, each from its start (e, 3)."""
-    c, scale = RegistrationConfig, objects.sigma**2 * ObjectPolicy.correlation
+    c, scale = PairPolicy, objects.sigma**2 * PairPolicy.correlation
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-    pose, gate, temper, left = start.copy(), c.first_gate, 1.0, np.arange(len(pairs))
+    pose, gate, temper, left = start.copy(), c.reach, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
         factors = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)[0]
         matches, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
         pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
         step = -limited(_solved(matches / scale + information[left], gradient / scale + pull))
         pose[left] += step
-        if gate <= ObjectPolicy.gate and temper < c.cold:
+        if gate <= c.gate and temper < RegistrationConfig.cold:
             left = left[np.abs(step).max(axis=1) >= c.converged]
-        gate, temper = max(gate * MatchingPolicy.shrink, ObjectPolicy.gate), temper * c.cooling
+        gate, temper = max(gate * c.shrink, c.gate), temper * RegistrationConfig.cooling
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
-    factors, likelihood, most = objects.match(pairs, pose, ObjectPolicy.gate)
+    factors, likelihood, most = objects.match(pairs, pose, c.gate)
     matches = measured_part(factors.hessian, factors.spurious, factors.gradient)[0] / scale
     return Placed(pose, factors, matches, likelihood, most)
 

@@ -23,11 +23,21 @@ from .clouds import Clouds
 
 
 @dataclass(frozen=True, slots=True)
-class MatchingPolicy:
+class PairPolicy:
     """Matches and descent."""
 
     points: ClassVar[int] = 150
     """Points looked up per pair."""
+    fewest: ClassVar[int] = 30
+    """Clouds with fewer points with a normal measure nothing."""
+    reach: ClassVar[float] = 0.5
+    """Farthest match at the beginning of a descent, m; the reach of the rasters."""
+    gate: ClassVar[float] = 0.15
+    """The same at its end, m."""
+    good_share: ClassVar[float] = 0.75
+    """Share of matching points from which on a pair needs no further search."""
+    correlation: ClassVar[float] = 8.0
+    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
     same_facing: ClassVar[float] = float(np.sqrt(0.5))
     """Least cosine between the normals of two matched points."""
     measured: ClassVar[float] = 2.0
@@ -38,8 +48,9 @@ class MatchingPolicy:
     """Gate of an iteration as a share of the one before, at most."""
     gate_per_step: ClassVar[float] = 10.0
     """Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
-    converged: ClassVar[float] = 1e-4
+    converged: ClassVar[float] = 1e-3
     """Steps below this end the descent, m or rad."""
+    iterations: ClassVar[int] = 20
 
 
 _AT_ONCE = 1 << 14
@@ -97,7 +108,7 @@ class PairFactors(Table):
         return float(self.squared.sum() / max(self.weight.sum(), 1.0))
 
 
-def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = MatchingPolicy.points) -> CloudPairs:
+def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = PairPolicy.points) -> CloudPairs:
     """Return pairs of targets i (e,) and sources j (e,), with up to `limit` evenly spread points with a normal of each."""
     usable = np.any(clouds.normals != 0.0, axis=1)
     ranks = np.concatenate([[0], np.cumsum(usable)])
@@ -191,7 +202,7 @@ def _looked_up(
     qx, qy, nx, ny = (column.take(target) for column in surface)
     dx, dy = x - qx, y - qy
     facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
-    good = near & (dx * dx + dy * dy <= square) & (facing > MatchingPolicy.same_facing) & (rows >= 0)
+    good = near & (dx * dx + dy * dy <= square) & (facing > PairPolicy.same_facing) & (rows >= 0)
     return Correspondences(part, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
@@ -251,7 +262,7 @@ def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tu
     A direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m.
     """
     basis, inverse, values = _relative_eigen(information, spurious)
-    kept = np.maximum(1.0 - MatchingPolicy.measured / np.maximum(values, _TINY), 0.0)
+    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _TINY), 0.0)
     share = (basis * kept[..., None, :]) @ inverse
     return share @ information, (share @ gradient[..., None])[..., 0]
 
@@ -260,7 +271,7 @@ def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
     L^T L the information in those directions, see measured_part (unscaled by noise)."""
     basis, inverse, values = _relative_eigen(factors.hessian, factors.spurious)
-    kept = np.maximum(values - MatchingPolicy.measured, 0.0)
+    kept = np.maximum(values - PairPolicy.measured, 0.0)
     divisor = np.where(kept > 0.0, values, np.inf)
     step = -np.einsum("eji,ej->ei", inverse, np.einsum("eij,ej->ei", inverse, factors.gradient) / divisor)
     return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis, 1, 2)
@@ -306,13 +317,14 @@ class Aligned:
 
 def limited(step: Floats) -> Floats:
     """Return steps (e, 3), m, m, rad, none of them longer than those of one iteration."""
-    distance, turn = MatchingPolicy.farthest
+    distance, turn = PairPolicy.farthest
     reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / distance, np.abs(step[:, 2]) / turn)
     return np.asarray(step / np.maximum(reach, 1.0)[:, None])
 
 
 def align_pairs(
-    raster: CloudRasters, pairs: CloudPairs, guess: Floats, first_gate: float, last_gate: float, iterations: int = 20
+    raster: CloudRasters, pairs: CloudPairs, guess: Floats, first_gate: float, last_gate: float,
+    iterations: int = PairPolicy.iterations,
 ) -> Aligned:
     """Align many pairs of clouds at once, each on its own: point-to-line ICP with a gate that shrinks with its steps.
 
@@ -322,7 +334,7 @@ def align_pairs(
     ----------
     guess : (e, 3) start poses of the source clouds. first_gate, last_gate : farthest match in the first and last iteration, m.
     """
-    c, pose, gate, moving = MatchingPolicy, guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
+    c, pose, gate, moving = PairPolicy, guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
     finished: list[tuple[Ints, PairFactors]] = []
     for _ in range(iterations):
         factors = match(raster, pairs.rows(moving), pose[moving], gate, gate / 2.0)

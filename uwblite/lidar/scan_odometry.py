@@ -18,7 +18,7 @@ from .cloud_rasters import CloudRasters, rasterize
 from .clouds import CloudConfig, Clouds, make_cloud
 from .correlative_matching import search
 from .overlap import directional_overlap
-from .scan_matching import CloudPairs, align_pairs, pairs_of
+from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
 from .visibility import free_around, violates_free_space
 
 
@@ -26,20 +26,10 @@ from .visibility import free_around, violates_free_space
 class ScanStepPolicy:
     """Matching of single scans a moment apart."""
 
-    first_gate: ClassVar[float] = 0.4
-    """Farthest match in the first iteration, m."""
-    last_gate: ClassVar[float] = 0.12
-    """The same in the last, m."""
-    points: ClassVar[int] = 200
-    """Points looked up per pair."""
-    good_share: ClassVar[float] = 0.75
-    """Pairs that share at least this part of their points need no search."""
-    gain: ClassVar[float] = 0.05
-    """A search must raise the share by this to count."""
+    reach: ClassVar[float] = 0.4
+    """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
     search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
     """Half-widths of the search, m, m, rad."""
-    least_points: ClassVar[int] = 25
-    """Clouds with fewer points measure nothing."""
     at_once: ClassVar[int] = 128
     """Pairs of scans whose rasters are in memory at once."""
     well_seen: ClassVar[float] = 0.9
@@ -69,14 +59,14 @@ def scan_steps(
     for low in range(0, len(first), ScanStepPolicy.at_once):
         rows = slice(low, low + ScanStepPolicy.at_once)
         raster, pairs = _pairs(scans, mounting, first[rows], second[rows])
-        aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.first_gate, ScanStepPolicy.last_gate)
-        enough = aligned.factors.asked >= ScanStepPolicy.least_points
+        aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, PairPolicy.gate)
+        enough = aligned.factors.asked >= PairPolicy.fewest
         pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
-        poor = np.flatnonzero((share < ScanStepPolicy.good_share) & enough)
+        poor = np.flatnonzero((share < PairPolicy.good_share) & enough)
         allowed = -(-searches * ScanStepPolicy.at_once // len(first))
         for row in poor[np.argsort(share[poor], kind="stable")][:allowed].tolist():
             found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[low + row])
-            if found[1] > share[row] + ScanStepPolicy.gain:
+            if found[1] > share[row]:
                 pose[row], share[row] = found
         steps.append(pose)
         shares.append(share)
@@ -91,7 +81,7 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
     """
     raster, pairs = _pairs(scans, mounting, first, second)
     pairs = _in_sight(raster.clouds, pairs, motion, scans, mounting)
-    gate = ScanStepPolicy.first_gate
+    gate = ScanStepPolicy.reach
     found = scan_matching.match(raster, pairs, motion, gate, gate)
     return (found.squared + gate**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
 
@@ -122,7 +112,7 @@ def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints,
     along the corridor show the motion.
     """
     raster, pairs = _pairs(scans, mounting, first, second)
-    return directional_overlap(raster, pairs.i, pairs.j, motion, ScanStepPolicy.last_gate)
+    return directional_overlap(raster, pairs.i, pairs.j, motion, PairPolicy.gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
@@ -138,8 +128,8 @@ def _pairs(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Int
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = rasterize(built, config.raster, ScanStepPolicy.first_gate)
-    return raster, pairs_of(built, i, j, ScanStepPolicy.points)
+    raster = rasterize(built, config.raster, ScanStepPolicy.reach)
+    return raster, pairs_of(built, i, j)
 
 
 def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
@@ -149,7 +139,7 @@ def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Fl
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))
-    aligned = align_pairs(raster, pairs, places, ScanStepPolicy.first_gate, ScanStepPolicy.last_gate)
+    aligned = align_pairs(raster, pairs, places, ScanStepPolicy.reach, PairPolicy.gate)
     best = int(np.argmax(aligned.share))
     return aligned.pose[best], float(aligned.share[best])
 

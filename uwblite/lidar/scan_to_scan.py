@@ -20,7 +20,7 @@ from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, w
 from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .object_likelihood import ObjectLikelihood, ObjectPolicy
+from .object_likelihood import ObjectLikelihood
 from .registration import (
     Placed,
     Placement,
@@ -33,7 +33,7 @@ from .registration import (
     search,
     with_neighbours,
 )
-from .scan_matching import CloudPairs, align_pairs, match, measured, pairs_of
+from .scan_matching import CloudPairs, PairPolicy, align_pairs, match, measured, pairs_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,24 +42,16 @@ class TrackingConfig:
 
     on: bool = True
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
-    min_points: ClassVar[int] = 30
-    """Clouds with fewer points with a normal measure nothing."""
-    sigma: ClassVar[float] = 0.03
-    """Standard deviation of a match where no step shows it, m."""
-    least_sigma: ClassVar[float] = 0.02
+    sigma: ClassVar[float] = 0.02
     """Standard deviation of a match that clouds cannot fall below, m: walls are no straighter."""
     median: ClassVar[float] = 2.366
     """Of chi2 with three degrees of freedom."""
-    elsewhere: ClassVar[float] = 0.12
-    """m or rad; an error that a step of faultless odometry never has."""
     laps: ClassVar[int] = 3
     """Times that steps with slips tell their neighbours."""
     lost: ClassVar[float] = 1e-3
     """Probability that a message of the odometry is lost over a step, or the robot carried."""
     views: ClassVar[int] = 6
     """Clouds before a doubtful step with which the one after it is compared: they still see the same."""
-    doubtful: ClassVar[float] = 0.02
-    """Probability of a slip from which on a step is doubtful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +92,8 @@ class Steps:
     def contradicted(self) -> Bools:
         """Return which steps (e,) the clouds contradict: few points match, or they fit at another pose."""
         off = se2.between(self.guess, self.pose)
-        elsewhere = (np.hypot(off[:, 0], off[:, 1]) > TrackingConfig.elsewhere) | (np.abs(off[:, 2]) > TrackingConfig.elsewhere)
-        return self.enough & ((self.share < RegistrationConfig.good_share) | elsewhere)
+        elsewhere = (np.hypot(off[:, 0], off[:, 1]) > PairPolicy.gate) | (np.abs(off[:, 2]) > PairPolicy.gate)
+        return self.enough & ((self.share < PairPolicy.good_share) | elsewhere)
 
 
 def match_plainly(raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> Steps:
@@ -111,8 +103,8 @@ def match_plainly(raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> 
     ----------
     gate : reach of the raster, m.
     """
-    aligned = align_pairs(raster, pairs_of(raster.clouds, i, i + 1), guess, gate, min(ObjectPolicy.gate, gate))
-    return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= TrackingConfig.min_points)
+    aligned = align_pairs(raster, pairs_of(raster.clouds, i, i + 1), guess, gate, min(PairPolicy.gate, gate))
+    return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= PairPolicy.fewest)
 
 
 def descended_edges(raster: CloudRasters, steps: Steps) -> RelativePoseEdges:
@@ -129,7 +121,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     wheels : edges between neighbouring keyframes; what is no scan and shows slips weighs as much as one pair of clouds.
     graph : holds their calibration. steps : the same steps after descent, see match_plainly.
     """
-    i, good = wheels.i, steps.enough & (steps.share >= RegistrationConfig.good_share)
+    i, good = wheels.i, steps.enough & (steps.share >= PairPolicy.good_share)
     certain, sigma = _edges(raster, i[good], steps.pose[good])
     noise = replace(reestimate_wheel_noise(wheels, certain, graph), slips=None)
     pairs, mean = pairs_of(raster.clouds, i, i + 1), noise.corrected(graph)
@@ -147,12 +139,12 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
         chain = posterior(log_odds + by_ranges, wheels.duration)
     found = with_neighbours(objects, pairs, found, expected)
     # Where neighbours share few points, or a slip is possible, clouds some steps before say where they lie.
-    doubtful = steps.enough & (~good | (chain.probability > TrackingConfig.doubtful))
+    doubtful = steps.enough & (~good | (chain.probability > RegistrationConfig.doubtful))
     rest = np.clip(logit(np.clip(chain.probability, 1e-9, 1.0 - 1e-9)) - log_odds, -np.inf, 0.0)
     found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
     log_odds[doubtful] = choice.log_odds
     slips = posterior(log_odds + by_ranges, wheels.duration).probability
-    variance, sound, mode = sigma**2 * ObjectPolicy.correlation, found.sound, choice.placed
+    variance, sound, mode = sigma**2 * PairPolicy.correlation, found.sound, choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
     tempting = found.candidates.rows(found.best(found.candidates.share))
     captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
@@ -274,8 +266,7 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
 def _edges(raster: CloudRasters, i: Ints, step: Floats) -> tuple[RelativePoseEdges, float]:
     """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches, and the standard
     deviation of a match, m."""
-    factors = match(raster, pairs_of(raster.clouds, i, i + 1), step, ObjectPolicy.gate, ObjectPolicy.gate / 2.0)
-    sigma = float(np.sqrt(factors.variance)) if len(i) else TrackingConfig.sigma
-    sigma = max(sigma, TrackingConfig.least_sigma)
-    z, sqrt_information = measured(factors, step, np.full(len(i), sigma**2 * ObjectPolicy.correlation))
+    factors = match(raster, pairs_of(raster.clouds, i, i + 1), step, PairPolicy.gate, PairPolicy.gate / 2.0)
+    sigma = max(float(np.sqrt(factors.variance)), TrackingConfig.sigma)
+    z, sqrt_information = measured(factors, step, np.full(len(i), sigma**2 * PairPolicy.correlation))
     return RelativePoseEdges(i, i + 1, z, sqrt_information), sigma

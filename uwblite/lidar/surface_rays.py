@@ -38,6 +38,8 @@ class SurfacePolicy:
     """Largest rms distance of rays from their surface, relative to their noise."""
     on: ClassVar[float] = 0.06
     """Distance from a surface up to which a place is on it, m."""
+    quietest: ClassVar[float] = 0.1
+    """Least noise of rays, as a share of that by data sheets."""
     around: ClassVar[float] = 0.3
     """Distance from a column's rim up to which rays are its surroundings, m."""
     alike: ClassVar[float] = 4.0

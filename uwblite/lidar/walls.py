@@ -25,14 +25,10 @@ from .surface_rays import MeasuredSurfaces, SurfacePolicy, SurfaceRays, as_rays,
 class WallPolicy:
     """What a straight piece is, and which pieces are of one wall, by what maps err by and objects stand off walls."""
 
-    gap: ClassVar[float] = 0.35
-    """m between the ends of neighbouring rays that cuts."""
     fewest: ClassVar[int] = 6
     """Least number of rays."""
     splits: ClassVar[int] = 7
     """Most rounds in which bent pieces are split, and most times that a bent wall is halved."""
-    quietest: ClassVar[float] = 0.1
-    """Least noise of rays, as a share of that by data sheets."""
     incidence: ClassVar[float] = 0.15
     """Least cosine of incidence: readings at a grazing angle are unreliable."""
     vague: ClassVar[float] = 0.2
@@ -40,19 +36,17 @@ class WallPolicy:
     every: ClassVar[float] = 0.5
     """m between the places at which pieces are compared."""
     reach: ClassVar[float] = 0.4
-    """m, largest distance of places."""
+    """m, largest distance of places, and of the ends of neighbouring rays."""
     lean: ClassVar[float] = 0.1
     """rad, largest difference of directions, beside two standard deviations of it."""
-    scatter: ClassVar[float] = 0.05
-    """m, rms scatter of places about a straight wall."""
     turned: ClassVar[float] = 2.0
     """Largest rms difference of directions from the wall's, in their standard deviations: what looks flat from every side, as a
     stem or a corner does, turns with the view."""
+    views: ClassVar[int] = 4
+    """Least number of keyframes that see a wall."""
     uneven: ClassVar[float] = 0.02
     """Standard deviation of pieces about the wall beside the noise of rays, m and rad: by the poses, and because walls are not
     straight."""
-    keyframes: ClassVar[int] = 4
-    """Least number that see it."""
 
 
 _TINY = 1e-9
@@ -115,7 +109,7 @@ def straight_pieces(rays: ScanPoints) -> tuple[Pieces, SurfaceRays]:
     """Return the straight pieces that rays (p,) show, and the rays on them with pieces as surfaces."""
     c, single = WallPolicy, as_rays(rays)
     ahead, reach = single.directions, dots(rays.points - rays.origins, single.directions)
-    begins = begins_run(rays, np.hypot(*np.diff(rays.points, axis=0).T) > c.gap)
+    begins = begins_run(rays, np.hypot(*np.diff(rays.points, axis=0).T) > c.reach)
     moments = _Moments(rays.points, ahead, single.sigma * _noise(reach, single.sigma, begins))
     first, last = _straight(moments, begins)
     centre, normal, noise = moments.lines(first, last)
@@ -144,7 +138,7 @@ def _noise(reach: Floats, sigma: Floats, begins: Bools) -> float:
         return 1.0
     # Those of white noise have six times its variance.
     bend = np.diff(reach, 2)[inside] / (np.sqrt(6.0) * sigma[1:-1][inside])
-    return float(np.clip(spread(bend), WallPolicy.quietest, 1.0))
+    return float(np.clip(spread(bend), SurfacePolicy.quietest, 1.0))
 
 
 def _straight(moments: _Moments, begins: Bools) -> tuple[Ints, Ints]:
@@ -263,7 +257,7 @@ def find_walls(pieces: Pieces, poses: Floats, some: Bools) -> StraightWalls:
     number, many = lines.number, len(lines.centre)
     seen = np.bincount(unique_rows(np.stack([number, places.keyframe], axis=1))[0][:, 0], minlength=many)
     turned = _across(places.normal, lines.facing[number]) / np.hypot(places.deviation, WallPolicy.uneven)
-    good = (seen >= WallPolicy.keyframes) & (lines.scatter < WallPolicy.scatter)
+    good = (seen >= WallPolicy.views) & (lines.scatter < SurfacePolicy.on)
     good &= _rms(number, turned, many) < WallPolicy.turned
     of_piece = np.full(len(some), -1)
     of_piece[places.piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
@@ -328,7 +322,7 @@ def _halved(number: Ints, places: _Places) -> _Lines:
     """
     c, shape = WallPolicy, (places.at, places.normal, places.deviation)
     lines = _Lines.fitted(number, *shape)
-    bent = (lines.scatter > c.scatter) & (_rms(number, lines.along(places.at), len(lines.centre)) > c.reach)
+    bent = (lines.scatter > SurfacePolicy.on) & (_rms(number, lines.along(places.at), len(lines.centre)) > c.reach)
     bent &= ~_curved(lines, places)
     for _ in range(c.splits):
         if not bent.any():
@@ -336,7 +330,7 @@ def _halved(number: Ints, places: _Places) -> _Lines:
         beyond = bent[lines.number] & (lines.along(places.at) < 0.0)
         halves, number = np.unique(2 * lines.number + beyond, return_inverse=True)
         lines = _Lines.fitted(number, *shape)
-        bent = bent[halves // 2] & (lines.scatter > c.scatter)
+        bent = bent[halves // 2] & (lines.scatter > SurfacePolicy.on)
     return lines
 
 
@@ -344,7 +338,7 @@ def _curved(lines: _Lines, places: _Places) -> Bools:
     """Return which sets of places (m,) are not straight in most of the keyframes that see them."""
     seen, own = unique_rows(np.stack([lines.number, places.keyframe], axis=1))
     alone = _Lines.fitted(own, places.at, lines.facing[lines.number], np.ones(len(own)))
-    return np.asarray(np.bincount(seen[:, 0], np.where(alone.scatter > WallPolicy.scatter, 1.0, -1.0)) > 0.0)
+    return np.asarray(np.bincount(seen[:, 0], np.where(alone.scatter > SurfacePolicy.on, 1.0, -1.0)) > 0.0)
 
 
 def _rms(number: Ints, values: Floats, many: int) -> Floats:
