@@ -126,7 +126,7 @@ def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], sta
         number, way = int(recording[first]), first - last - 1
         name, next_name = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": next_name}
+        figures: dict[str, Any] = {"anchor": name, "distance": distance, "recording": number + 1, "new_id": next_name}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
             between = [*(float(stamps[row] - start) for row in (last + 1, first)), way]

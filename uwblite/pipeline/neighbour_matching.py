@@ -157,7 +157,7 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
     estimate = with_keyframes(estimate, before, later(before, late))
     task = task.following(estimate)
     estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
-    task.stages.end("clouds made again", laser_delay=round(delay, 4))
+    task.stages.end("clouds made again", laser_delay=delay)
     return estimate
 
 
@@ -215,7 +215,7 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
         "searched": track.searched,
         "rejected": int(track.rejected.sum()),
         "slipped": int(np.sum(track.slips > NeighbourPolicy.likely)),
-        "moving": round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
+        "moving": float(track.moving.mean()) if len(track.moving) else 0.0,
     }
     return _refined_neighbours(estimate, graph, gate, task, figures)
 
@@ -235,7 +235,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         settings = replace(settings, first_gate=rules.later_gate)
         refined = refine(weak, graph, settings, task, "scan-to-scan matching")
         figures = {**figures, "placed_again": len(laid)}
-    own = {"gate": round(gate, 3), "sigma": round(refined.sigma, 4), "rounds": refined.rounds}
+    own = {"gate": gate, "sigma": refined.sigma, "rounds": refined.rounds}
     task.stages.end("scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), **own, **figures)
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
     return calibration_checks.with_constant_turn_scales(estimate, task)

@@ -51,7 +51,7 @@ class LapPolicy:
 def first_optimisation(task: Task) -> Estimate:
     """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
     recordings = task.recordings
-    task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
+    task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=recordings.travelled)
     estimates = [dead_reckoning(recording, task.config, task.stages.work) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
@@ -82,7 +82,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | Non
 
 def tag_rises(recording: Recording) -> tuple[float, ...]:
     """Return the height of each of a robot's tags above the first tag, m."""
-    heights = recording.log.mounting.tags[:, 2]
+    heights = recording.log.mounting.tags[:, -1]
     return tuple((heights - heights[0]).tolist())
 
 
@@ -123,7 +123,7 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     measured = Measured(estimate.odometry, ranges, path - path[0])
     result = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
     number_if_several = {"recording": number + 1} if len(recordings) > 1 else {}
-    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(result.placed.sum()), **number_if_several)
+    task.stages.end("bootstrap", range_sigma=sigma, placed=int(result.placed.sum()), **number_if_several)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.
     back = se2.compose(estimate.graph.poses[0], se2.inverse(result.graph.poses[0]))
     graph = estimate.graph.with_estimates_of(map_frame.moved(result.graph, back))
@@ -141,7 +141,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
     assumed_noise = wheels = estimate.odometry
-    slips, factors = np.zeros(len(wheels)), np.ones(3)
+    slips, factors = np.zeros(len(wheels)), np.ones_like(estimate.graph.poses[0])
     # Recordings that were joined have their slips in their odometry.
     if len(estimate.bootstrap.slips) and not estimate.alone:
         slips = estimate.bootstrap.slips
@@ -230,9 +230,8 @@ def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tup
 def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate anchors and range noise on the trajectory that matches of neighbouring clouds have stiffened.
 
-    Odometry alone can be bent until ranges with errors that last for minutes seem to fit. On the stiffer chain of scan
-    matches, beside which ranges had little weight so far, such errors show in the residuals, unless scans see so little that
-    this chain can be bent as well.
+    Odometry alone bends until ranges with errors that last for minutes seem to fit. On the stiffer chain of scan matches such
+    errors show in the residuals, unless scans see so little that it bends as well.
     """
     if estimate.ranges is None or estimate.steps is None:
         return estimate

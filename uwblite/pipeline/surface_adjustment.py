@@ -153,8 +153,8 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
         walls=walls,
         columns=columns,
         rays=len(found.rays.keyframe),
-        shift=round(estimate.moved_since(before), 5),
-        alike=found.noise.alike.round(1).tolist(),
+        shift=estimate.moved_since(before),
+        alike=found.noise.alike.tolist(),
     )
     found = replace(found, surfaces=found.surfaces.seen_from(graph.poses[0]))
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
