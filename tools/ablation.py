@@ -106,10 +106,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),
-    "loose links": LeftOut(patches=(
-        ("pipeline.closure_rounds._with_loose_links_tied", lambda base, estimate, task: (base, estimate.closures, estimate)),
-    )),
-    "long stretches": LeftOut(patches=(("loop_closure.long_stretches.any_uncertain", lambda *given: False),)),
+    "long stretches": LeftOut(patches=(("loop_closure.candidates.any_uncertain", lambda *given: False),)),
     "joint refinement": LeftOut(("refinement.rounds=0",)),
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "corners": LeftOut(("clouds.linearity=0.85",)),

@@ -189,7 +189,7 @@ def test_a_column_is_found_beside_its_given_place():
     ring = np.column_stack([4.0 + 0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle)])
     pose = np.array([[1.0, 2.0, 0.7]])
     given = tuple(se2.transform(pose[0], np.array([4.15, 0.9])).tolist())
-    keyframe, position = observations(GivenLandmark("c", given, 0.3), one_cloud(ring), pose, np.zeros(1))
+    _, position = observations(GivenLandmark("c", given, 0.3), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(position, [[4.0, 1.0]], atol=0.01)
     _, plain = observations(GivenLandmark("c", given), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(plain, [[4.15, 0.9]], atol=1e-12)

@@ -17,7 +17,6 @@ from .estimate import Estimate, Task
 from .progress import solver_figures
 from .radio_stages import evidence_against, with_range_noise
 
-
 _TO_COME = 1e-3
 """Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
 _STILL = 1e-3
