@@ -115,8 +115,8 @@ INGREDIENTS: dict[str, LeftOut] = {
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),
-    "mirror images": _stage("mirror_images.find_mirror_images"),
-    "sides of a line of anchors": _stage("line_sides.choose_side"),
+    "mirror images": _stage("range_alternatives.find_mirror_images"),
+    "sides of a line of anchors": _stage("range_alternatives.choose_side"),
     "priors of ranges selected": _stage("radio_stages.select_range_priors"),
     "tag pattern": _stage("lidar_stages._without_pattern"),
     "marginal likelihood of the radio's priors": LeftOut(

@@ -28,7 +28,7 @@ from ..radio.bootstrap_attempt import Measured
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
 from ..radio.range_noise import assumed, short_term_sigma
-from . import anchor_heights, joining, line_sides, map_frame
+from . import joining, map_frame, range_alternatives
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -57,9 +57,9 @@ def first_optimisation(task: Task) -> Estimate:
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
-        return anchor_heights.choose_heights(estimates[0], task.config)
+        return range_alternatives.choose_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
-    return anchor_heights.choose_heights(joined, task.config)
+    return range_alternatives.choose_heights(joined, task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | None = None) -> Estimate:
@@ -163,7 +163,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
-    sided = estimate if have_scans or estimate.alone else line_sides.choose_side(estimate, task)
+    sided = estimate if have_scans or estimate.alone else range_alternatives.choose_side(estimate, task)
     if sided is not estimate:
         estimate, result = _lap(sided, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
