@@ -18,14 +18,13 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.object_likelihood import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import keyframe_data
-from uwblite.pipeline.broken_steps import broken_steps
+from uwblite.pipeline.broken_steps import broken_steps, range_evidence
 from uwblite.pipeline.broken_stretches import _likelihood, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
-from uwblite.pipeline.radio_tracks import range_evidence
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog, SensorMounting

@@ -19,10 +19,9 @@ from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain
 from ..sensor_log.sensors import place_name, radio_name
-from .broken_steps import BreakPolicy, without_moves_of_path
+from .broken_steps import BreakPolicy, RadioTrack, radio_tracks, without_moves_of_path
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors
-from .radio_tracks import RadioTrack, radio_tracks
 
 
 def decide_places(estimate: Estimate, task: Task) -> Estimate:
