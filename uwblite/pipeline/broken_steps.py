@@ -245,7 +245,7 @@ class BrokenStep:
         return np.asarray(se2.compose(se2.compose(origin, self.motion), se2.inverse(origin)))
 
     def _evidence(self, radios: Sequence[int], worth: Sequence[Floats]) -> float:
-        """Return the evidence of some radios' ranges, of a worth (m,) each, with the stretch moved, places at their likeliest."""
+        """Return the evidence of some radios' ranges, of a worth (m,) each, with the stretch moved and places likeliest."""
         moved = self._displacement()
         for k in radios:
             radio = self.radios[k]
@@ -283,8 +283,13 @@ class BrokenStep:
         """Return motions (3,) of the stretch that would move the anchors of the moves back to where they were."""
         if not self.moves:
             return []
-        ends = [(self.before[m.radio], m.before, int(self.before[m.radio].place[m.interval[0]])) for m in self.moves]
-        here, there = (se2.transform(home, np.array([each[0].places[each[k]] for each in ends])) for k in (1, 2))
+        places = [self.before[move.radio].places for move in self.moves]
+        former = [move.before for move in self.moves]
+        later = [int(self.before[move.radio].place[move.interval[0]]) for move in self.moves]
+        here, there = (
+            se2.transform(home, np.array([of[k] for of, k in zip(places, numbers, strict=True)]))
+            for numbers in (former, later)
+        )  # fmt: skip
         shift = np.append((here - there).mean(axis=0), 0.0)
         return [shift, se2.align(there, here)] if len(here) > 1 else [shift]
 
