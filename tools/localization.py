@@ -36,7 +36,7 @@ from uwblite.localization import Localizer, LocalizerState, Scanner
 from uwblite.localization.comparison import INDEPENDENT_RAYS, LOOK_BACK
 from uwblite.localization.hypotheses import apart
 from uwblite.localization.known_map import KnownMap
-from uwblite.localization.range_likelihood import expected_errors, range_likelihood
+from uwblite.localization.range_model import expected_errors, range_likelihood
 from uwblite.localization.walls import walls_of
 
 WORLDS = ("hall", "lab", "corridor", "warehouse")

@@ -6,8 +6,7 @@ from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.comparison import PlaceSearch, _no_repetition
 from uwblite.localization.known_map import KnownAnchors, KnownMap
-from uwblite.localization.range_likelihood import range_errors
-from uwblite.localization.range_update import RangeFacts
+from uwblite.localization.range_model import RangeFacts, range_errors
 from uwblite.localization.search import UNIT
 from uwblite.localization.verdict import CERTAIN
 from uwblite.localization.window import Window, WindowRange

@@ -9,10 +9,10 @@ from helpers.localization_room import ANCHORS, ODD, ROUND, cast, grid_of, known,
 from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
-from uwblite.localization import scale
-from uwblite.localization.scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
+from uwblite.localization import verdict
+from uwblite.localization.range_model import Ranges
+from uwblite.localization.verdict import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
 from uwblite.localization.walls import Rays, walls_of
-from uwblite.localization.window import Ranges
 
 POSES = np.array([[1.0, 2.5, 0.0], [2.0, 2.5, 0.4], [3.0, 2.6, 0.9]])
 
@@ -100,6 +100,6 @@ def test_a_map_of_another_scale_is_never_certain(factor, scans):
 def test_a_ray_counts_once_however_many_looks_there_were():
     """Beyond as many looks as rays are worth, more of them make the scale no surer."""
     walls, rays = known().walls, rays_of(POSES[-1:])
-    few, enough, more = (scale._matched(walls, POSES[-1], rays, looks, 0.1)[1] for looks in (1, 10, 2000))
+    few, enough, more = (verdict._matched(walls, POSES[-1], rays, looks, 0.1)[1] for looks in (1, 10, 2000))
     assert few > 1.2 * enough
     assert more == enough

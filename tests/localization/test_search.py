@@ -8,9 +8,9 @@ from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
 from uwblite.localization import search
+from uwblite.localization.range_model import Ranges
 from uwblite.localization.search import FARTHEST, LEVELS, field_of
 from uwblite.localization.walls import Rays, walls_of
-from uwblite.localization.window import Ranges
 
 BOUNDS = (np.array([-1.0, -1.0]), np.array([6.0, 5.0]))
 NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((5, 0)))

@@ -7,12 +7,13 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, concatenated
-from . import hypotheses, range_likelihood, search, verdict
+from . import hypotheses, range_model, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
+from .range_model import Ranges
 from .sensing import TRACK_RAYS
 from .walls import PER_FACTOR, PER_RAY, Rays, Walls
-from .window import Ranges, Window
+from .window import Window
 
 INDEPENDENT_RAYS = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
@@ -144,10 +145,10 @@ class PlaceSearch:
                 fit[part], judged[part], known[part] = agreement.log_likelihood, agreement.fit, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
         weight = independent * fit
-        for part in search.units(len(poses), (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(ranges)):
-            expected = range_likelihood.expected_errors(poses[part], ranges, self._errors) if self._errors else None
-            weight[part] += range_likelihood.range_likelihood(poses[part], ranges, expected=expected)
-            yield (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(poses[part]) * len(ranges)
+        for part in search.units(len(poses), (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(ranges)):
+            expected = range_model.expected_errors(poses[part], ranges, self._errors) if self._errors else None
+            weight[part] += range_model.range_likelihood(poses[part], ranges, expected=expected)
+            yield (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(poses[part]) * len(ranges)
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])
         parts_of = (weight[new], judged[new], known[new], rays, looks, ranges, independent)
@@ -167,9 +168,9 @@ class PlaceSearch:
         walls = self.walls if few.hit.sum() >= verdict.FEW_BESIDE else None
         if walls is not None:
             poses = _refined(walls, poses, ranges, few)
-        hessian, _ = range_likelihood.range_factors(poses, ranges)
-        covariances = np.linalg.inv(hessian + range_likelihood.POOR) + np.diag(np.square(_SIGMA_FLOOR))
-        effect = range_likelihood.bias_effect(poses, ranges, len(self._biases))
+        hessian, _ = range_model.range_factors(poses, ranges)
+        covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
+        effect = range_model.bias_effect(poses, ranges, len(self._biases))
         fresh = hypotheses.started(poses, covariances, self._biases, self._slow)
         fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
@@ -182,9 +183,9 @@ def _refined(walls: Walls, poses: Floats, ranges: Ranges, rays: Rays) -> Floats:
     """
     poses = poses.copy()
     for gate, width in hypotheses.GATES:
-        information, gradient = range_likelihood.range_factors(poses, ranges)
+        information, gradient = range_model.range_factors(poses, ranges)
         seen, slope = hypotheses.scan_factors(walls, poses, rays, gate, width)
-        total = information + seen + range_likelihood.POOR
+        total = information + seen + range_model.POOR
         poses -= np.linalg.solve(total, (gradient + slope)[:, :, None])[:, :, 0]
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     return poses

@@ -14,7 +14,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..lidar.degeneracy import measured_part
-from ..radio.range_errors import HARMONICS, PATTERN_SIGMA
+from ..radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
+from .range_model import ANYWHERE_WIDTH, RangeFacts, judged
 from .walls import Rays, Walls
 
 POSE, WHEELS = slice(0, 3), slice(3, 6)
@@ -204,6 +205,52 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     mean[:, 2] = se2.wrap_angle(mean[:, 2])
     covariance = bank.covariance + gain @ (posterior - prior) @ gain.transpose(0, 2, 1)
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
+
+
+def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) -> tuple[Hypotheses, Floats, Floats, Floats]:
+    """Correct every hypothesis by one range.
+
+    Parameters
+    ----------
+    tag : (2,) place of the tag at the range's time in the present frame of the base, m. share : of an independent range's
+        information that it has, 0..1; the likelihood is that of the whole.
+
+    Returns
+    -------
+    The hypotheses, and for each the weight (h,), 0..1, that the range got, its log-likelihood (h,), 0 = the likeliest, and
+    that of a range from anywhere (h,).
+
+    Notes
+    -----
+    How the pattern and the place's error change with the pose is left out of the Jacobian: 0.1 m per radian, 0.05 m per metre.
+    """
+    theta = bank.mean[:, 2]
+    lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
+    offset = bank.mean[:, :2] + lever - fact.place
+    distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, 1e-4))
+    columns = fact.anchor + np.array([FIRST_ANCHOR, (FIRST_ANCHOR + bank.mean.shape[1]) // 2])
+    waves = pattern_waves(np.arctan2(-offset[:, 1], -offset[:, 0]) - theta)
+    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, columns].sum(axis=1)
+    if fact.errors is not None:
+        shift += fact.errors.at(offset + fact.place)
+    error = fact.range - (1.0 + fact.scale) * distance - shift
+    jacobian = np.zeros(bank.mean.shape)
+    jacobian[:, PATTERN] = waves
+    unit = (1.0 + fact.scale) * offset / distance[:, None]
+    jacobian[:, :2] = unit
+    jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]
+    jacobian[:, columns] = 1.0
+    spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
+    own = np.einsum("hi,hi->h", jacobian, spread)
+    sigma = np.sqrt(own + fact.sigma**2)
+    weight, likelihood = judged(error, sigma)
+    gain = spread / (own + fact.sigma**2 / (share * np.maximum(weight, 1e-3)))[:, None]
+    gain *= (weight > 1e-3)[:, None]
+    mean = bank.mean + gain * error[:, None]
+    mean[:, 2] = se2.wrap_angle(mean[:, 2])
+    covariance = symmetric(bank.covariance - gain[:, :, None] * spread[:, None, :])
+    anywhere = np.log(sigma * np.sqrt(2.0 * np.pi) / ANYWHERE_WIDTH)
+    return Hypotheses(mean, covariance, bank.log_weight), weight, likelihood, anywhere
 
 
 def reweighted(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:

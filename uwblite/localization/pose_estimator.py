@@ -18,8 +18,7 @@ from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .known_map import KnownMap
-from .range_likelihood import MOMENTS, bias_effect, range_moments
-from .range_update import RangeFacts, ranged, repeated
+from .range_model import MOMENTS, RangeFacts, bias_effect, range_moments, repeated
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
 from .walls import PER_FACTOR, PER_RAY, Rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
@@ -140,7 +139,7 @@ class PoseEstimator:
         driven = self._way - self._range_way[fact.anchor]
         share = 1.0 / float(repeated((fact.white / fact.sigma) ** 2, fact.length, driven))
         self._range_way[fact.anchor] = self._way
-        bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm, share)
+        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm, share)
         self.work += 8 * bank.covariance.size
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .range_likelihood import PER_RANGE, range_likelihood, refined_by_ranges
+from .range_model import PER_RANGE, Ranges, range_likelihood, refined_by_ranges
 from .verdict import FEW_BESIDE, FEW_ENDS
 from .walls import Rays, Walls
-from .window import Ranges
 
 CELL = 0.1
 """m; cell of the likelihood field."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table, concatenated
+from ..arrays import Floats, concatenated
 from .hypotheses import BIAS_SIGMA
-from .range_update import RangeFacts
+from .range_model import DRIFT, RangeFacts, Ranges
 from .walls import Rays
 
 LENGTH = 10.0
@@ -54,31 +54,6 @@ class WindowLook:
     """Odometer at its time, m."""
     stamp: float
     """s."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ranges(Table):
-    """The window's ranges as arrays."""
-
-    anchor: Ints
-    """(m,)."""
-    places: Floats
-    """(m, 2) of the anchors, m."""
-    tags: Floats
-    """(m, 2) of the tag, in the present frame of the base, m."""
-    values: Floats
-    """(m,) horizontal distances, m."""
-    sigma: Floats
-    """(m,) m; including the drift since then."""
-    way: Floats
-    """(m,) odometer at each, m; ascending."""
-    white: Floats
-    """(m,) m; the part of it that is new in every range."""
-    length: Floats
-    """(m,) correlation length of the rest, m."""
-
-    def __len__(self) -> int:
-        return len(self.values)
 
 
 @dataclass(slots=True)
@@ -151,10 +126,6 @@ class Window:
         anchor = np.array([r.fact.anchor for r in rows], dtype=np.intp)
         noise = np.array([(r.fact.white, r.fact.length) for r in rows]).reshape(-1, 2).T
         return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma, way - ago, *noise)
-
-
-DRIFT = 0.03
-"""m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 
 
 def way_of(step: Floats) -> float:
