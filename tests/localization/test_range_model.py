@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import ndtr
 
 from uwblite import se2
 from uwblite.localization import hypotheses, range_model
-from uwblite.localization.range_model import Ranges, gross_share
+from uwblite.localization.range_model import Ranges
+from uwblite.radio.nlos_mixture import RangeMixture
 from uwblite.radio.range_errors import RangeErrors
 from uwblite.radio.range_noise import RangeNoise
 
@@ -38,7 +38,7 @@ def test_factors_of_ranges_are_the_numeric_gradient_of_their_cost():
 
 def test_moments_are_wide_where_the_ranges_say_little_and_hold_the_truth():
     pose, ranges = some_ranges(4)
-    mean, covariance = range_model.range_moments(range_model.refined_by_ranges(pose[None], ranges)[0], ranges)
+    mean, covariance = range_model.range_moments(hypotheses.refined(pose[None], ranges)[0], ranges)
     off = mean - pose
     assert off @ np.linalg.solve(covariance, off) < 16.0
     near = np.abs(ranges.anchor) == 0
@@ -46,18 +46,12 @@ def test_moments_are_wide_where_the_ranges_say_little_and_hold_the_truth():
     assert np.trace(less) > 2.0 * np.trace(covariance)
 
 
-def test_the_errors_alone_are_those_of_the_factors():
-    pose, ranges = some_ranges(5)
-    poses = pose + np.random.default_rng(5).normal(0.0, 1.0, (20, 3))
-    np.testing.assert_allclose(range_model._misfits(poses, ranges), range_model.range_errors(poses, ranges)[0], atol=1e-12)
-
-
 def test_likelihoods_in_single_precision_are_those_in_double_to_a_thousandth():
     pose, ranges = some_ranges(6)
     poses = pose + np.random.default_rng(6).normal(0.0, 2.0, (200, 3))
-    error = range_model._misfits(poses, ranges)
-    z = error / ranges.sigma
-    terms = 0.7 * np.exp(-0.5 * z**2) + 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z) + gross_share(ranges.sigma)
+    error, law = range_model.range_errors(poses, ranges)[0], range_model.NEW_PLACE
+    mixtures = [RangeMixture(0.0, s, law.share, law.mean, 0.05, 60.0) for s in ranges.sigma]
+    terms = np.stack([m.density(e) * m.sigma * np.sqrt(2.0 * np.pi) for m, e in zip(mixtures, error.T, strict=True)], axis=1)
     # One after another: the error stays what it was, or is drawn anew.
     chain = range_model.series(ranges)
     for k in range(3, 12):
@@ -108,7 +102,7 @@ def test_a_common_error_moves_the_pose_as_its_effect_says():
     np.testing.assert_array_equal(effect[:, 3], 0.0)
     for anchor in range(3):
         shifted = replace(exact, values=true + 1e-4 * (exact.anchor == anchor))
-        found = range_model.refined_by_ranges(pose[None], shifted)[0] - pose
+        found = hypotheses.refined(pose[None], shifted)[0] - pose
         np.testing.assert_allclose(found, 1e-4 * effect[:, anchor], atol=2e-6)
 
 

@@ -180,7 +180,9 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
     report : called with the events that are done and their number.
     """
     sign, s = -1.0 if backwards else 1.0, log.scans
-    scanner = s and Scanner(s.angle_min, s.angle_increment, sign * s.time_increment, s.range_min, s.range_max)
+    scanner = None
+    if s is not None:
+        scanner = Scanner(s.angle_min, s.angle_increment, sign * s.time_increment, s.range_min, s.range_max)
     localizer = Localizer(replace(known, laser_delay=sign * known.laser_delay), log.mounting, scanner)
     poses, covariances = np.full((len(log.odometry.stamps), 3), np.nan), np.full((len(log.odometry.stamps), 3, 3), np.nan)
     times, kinds, numbers = _events(log, known, sign)
@@ -249,6 +251,6 @@ def smoothed(one: Pass, other: Pass, of_map: Callable[[Floats], Floats]) -> tupl
     poses[both] = np.where(far[:, None], surer, mean)
     covariances[both] = np.where(far[:, None, None], wide, 0.5 * (joint + joint.transpose(0, 2, 1)))
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    contradicting = both.copy()
+    contradicting = np.zeros(len(a), dtype=bool)
     contradicting[both] = far
     return poses, covariances + common, contradicting
