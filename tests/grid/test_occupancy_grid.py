@@ -327,7 +327,7 @@ def test_progress_over_several_recordings_counts_all_their_scans_twice():
 
 def test_the_grid_ends_where_knowledge_ends():
     # Neither walls nor the first pose lie on edges of cells, where rounding decides.
-    poses = drive(30) + [0.012, 0.013, 0.0]
+    poses = np.add(drive(30), [0.012, 0.013, 0.0])
     scans = room_scans(poses, half=2.01)
     grid = from_scans(poses, scans, last=np.add(poses, [0.0, 0.0, 0.5]))
     known = grid.log_odds != 0

@@ -1,8 +1,7 @@
 """Scans of recordings traced into one map.
 
-A beam without a reading is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
-Such beams never mark cells as occupied; runs of adjacent ones clear space, with less weight, up to a given distance and never
-beyond a wall that other beams have drawn. This needs a second pass over the scans, once the walls are known.
+A beam without a reading is a weak observation: "nothing there", or "too dark or too oblique". Runs of adjacent ones clear
+space, with less weight, up to a distance and never beyond a wall that other beams have drawn: in a second pass over the scans.
 """
 
 import math

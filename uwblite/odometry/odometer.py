@@ -43,14 +43,11 @@ class Odometer:
 
         A jump goes into the trajectory, with what was there before moved along: what is relative to the last pose stays there.
         """
-        if not np.isfinite(stamp) or not np.isfinite(pose).all():
+        if not np.isfinite([stamp, *pose]).all() or stamp <= self.stamp:
             self.late += 1
             return None
         if not len(self):
             self._append(stamp, pose)
-            return None
-        if stamp <= self.stamp:
-            self.late += 1
             return None
         step = se2.between(self.pose, pose)
         if np.abs(step).max() > max(_LEAST_STEP, _FASTEST * (stamp - self.stamp)):
@@ -78,7 +75,7 @@ class Odometer:
         self._end += 1
 
     def _shift(self) -> None:
-        """Make room: remove old poses, and where that is not enough, allocate more memory."""
+        """Remove old poses, and allocate as much memory again as the others take."""
         recent = int(np.searchsorted(self._stamps[: self._end], self.stamp - _SECONDS))
         first = max(self._begin, min(recent, self._end - 2))
         stamps, poses = self._stamps[first : self._end].copy(), self._poses[first : self._end].copy()
