@@ -14,6 +14,7 @@ from ..arrays import Bools, Floats
 from ..findings import Fact
 from ..graph.calibration import CalibrationConfig
 from ..sensor_log import Gyro, Odometry, SensorLog
+from .odometer import FASTEST
 from .wheels import OdometryNoiseConfig
 
 GAP = 0.25
@@ -36,8 +37,8 @@ one robot. Slipping wheels do not reach it."""
 READINGS = {
     1.0: "",
     -1.0: "it turns against the wheels, and is turned over (a sensor upside down, or one that counts clockwise)",
-    np.pi / 180.0: "it counts degrees",
-    -np.pi / 180.0: "it counts degrees, and turns against the wheels",
+    np.radians(1.0): "it counts degrees",
+    -np.radians(1.0): "it counts degrees, and turns against the wheels",
 }
 """Factor that converts a heading to radians counter-clockwise -> the reason."""
 SLIP = 3.0
@@ -145,8 +146,6 @@ _SECONDS = 60.0
 """s; length of the time that is compared."""
 _LEAST, _EVERY = 15.0, 5.0
 """s from which the gyro is tested, and between two tests: three windows of the comparison."""
-_FASTEST = 5.0
-"""rad/s; a faster turn is not real: the gyro's heading was reset."""
 
 
 class GyroTurns:
@@ -187,7 +186,7 @@ class GyroTurns:
         step, elapsed = se2.between(before[1], pose), stamp - before[0]
         if self._factor and heading is not None and last is not None:
             change = self._factor * (heading - last) - self._bias * elapsed
-            step = _turned(step, np.array(change)) if abs(change) < _FASTEST * elapsed else step
+            step = _turned(step, np.array(change)) if abs(change) < FASTEST * elapsed else step
         self._pose = se2.compose(self._pose, step)
         return self._pose
 

@@ -214,9 +214,8 @@ def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] 
     """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s."""
     near, far = window
     moments = np.clip(stamps + np.array([[-far], [-near], [near], [far]]), odometry.stamps[0], odometry.stamps[-1])
-    poses = [odometry.at(moment) for moment in moments]
-    motion = se2.log(se2.between(poses[0], poses[1])) + se2.log(se2.between(poses[2], poses[3]))
-    span = (moments[1] - moments[0] + moments[3] - moments[2])[:, None]
+    begin, end = moments[::2], moments[1::2]
+    motion, span = se2.log(se2.between(odometry.at(begin), odometry.at(end))).sum(axis=0), (end - begin).sum(axis=0)[:, None]
     return np.where(span > 0, motion / np.where(span > 0, span, 1.0), 0.0)
 
 

@@ -151,6 +151,10 @@ def _squared(vector: Floats, matrix: Floats) -> Floats:
     return np.asarray(np.einsum("ei,ei->e", vector, np.linalg.solve(matrix, vector[..., None])[..., 0]))
 
 
+def _diagonal(values: Floats) -> Floats:
+    return values[:, :, None] * np.eye(values.shape[1])
+
+
 def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
     """Return the logarithm of the density (e,) of each step at a graph's poses, sound or slipping with their shares of time."""
     sound, slipping = _of_either(wheels, graph)
@@ -166,7 +170,7 @@ def slipped(wheels: OdometryEdges, graph: Graph) -> Floats:
 def _of_either(wheels: OdometryEdges, graph: Graph) -> tuple[Floats, Floats]:
     """Return the logarithm of the density (e,) of each step, sound and slipping."""
     sound = covariance_of(wheels, graph)
-    slipping = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
+    slipping = sound + _diagonal(slip_sigma(wheels) ** 2)
     off = se2.between(graph.poses[wheels.i], graph.poses[wheels.j]) - wheels.corrected(graph)
     off[:, 2] = se2.wrap_angle(off[:, 2])
     sound, slipping = (-0.5 * (_squared(off, c) + np.linalg.slogdet(2.0 * np.pi * c)[1]) for c in (sound, slipping))
@@ -178,7 +182,7 @@ def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2
     slips = 1.0 / (slip_sigma(wheels) ** 2 + 1.0 / sound)
     diagonal = np.sqrt((1.0 - probability[:, None]) * sound + probability[:, None] * slips)
-    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3), slips=None)
+    return replace(wheels, sqrt_information=_diagonal(diagonal), slips=None)
 
 
 def expected(wheels: OdometryEdges) -> OdometryEdges:

@@ -201,41 +201,6 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Rate at which the frequency of the first chirp grows: no ratio is farther from all fractions."""
 
 
-def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
-    """Give wheels that count nothing over a step the noise of the distance that the lidar clearly measures there.
-
-    An odometry that stands still while the robot drives would otherwise have a standing robot's noise of half a millimetre:
-    even a robust kernel would not reject such a step.
-
-    Parameters
-    ----------
-    wheels : edges between neighbouring poses, in the order of the poses. steps : see reestimate_wheel_noise.
-    """
-    own, counted = np.searchsorted(wheels.i, steps.i), wheels.corrected(graph)
-    variance, way = 1.0 / np.einsum("eii->ei", wheels.sqrt_information) ** 2, _way(counted)
-    missed, moving, root = np.zeros(len(wheels)), way > _MOVING, steps.sqrt_information
-    off = root @ se2.between(steps.T_i_j, counted[own])[:, :, None]
-    scatter = np.eye(3) + root * variance[own, None, :] @ np.swapaxes(root, 1, 2)
-    stood = ~moving[own] & (np.sum(off * np.linalg.solve(scatter, off), axis=(1, 2)) > _CERTAIN**2)
-    missed[own[stood]] = _way(steps.T_i_j[stood])
-    if not stood.any() or not moving.any():
-        return wheels
-    least = missed[:, None] * np.median(variance[moving] / way[moving, None], axis=0)
-    factor = np.sqrt(np.maximum(least / variance, 1.0))
-    return replace(wheels, sqrt_information=wheels.sqrt_information / factor[:, None])
-
-
-def _way(motion: Floats) -> Floats:
-    """Return the distance plus the turn of motions (e, 3), m + rad."""
-    return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + np.abs(motion[:, 2]))
-
-
-_CERTAIN = 5.0
-"""Standard deviations of their difference from which on a measured step clearly contradicts the wheels."""
-_MOVING = 0.05
-"""m + rad; over shorter steps wheels may count nothing, and do not show how noise grows with the distance."""
-
-
 _TURNING = 0.1
 """rad; steps that turn by less, on average of lidar and wheels, do not show a ratio."""
 _STRETCHES = 4
