@@ -1,7 +1,7 @@
 """Odometry and ranges: from dead reckoning to the first optimisation, and re-estimating the ranges later.
 
 Each recording is bootstrapped on its own, then the recordings are joined. Once the lidar has stiffened the trajectory,
-the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
+the ranges are re-estimated: their noise and the priors of their systematic errors.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
 from ..radio.bootstrap_attempt import Measured
 from ..radio.line_of_sight import blocked
-from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
+from ..radio.range_measurements import learn_noise, log_densities, range_edges
 from ..radio.range_noise import assumed, short_term_sigma
 from . import joining, map_frame, range_alternatives
 from .estimate import Estimate, Task
@@ -76,7 +76,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | Non
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    ranges = range_edges(attached, ids, log.mounting, block, config.ranges, config.trilateration)
+    ranges = range_edges(attached, ids, log.mounting, block, config.ranges, config.trilateration.max_range)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 
@@ -223,7 +223,7 @@ def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tup
     assert ranges is not None
     graph = estimate.problem
     squared = edge_cost(ranges, ranges.residuals(graph))
-    density, share = log_densities(ranges, graph, config.ranges)
+    density, share = log_densities(ranges, graph, config.ranges.min_sigma)
     return (laplace_marginal_likelihood(graph) + 0.5 * squared, density), share
 
 
@@ -239,9 +239,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     held = estimate.solved(rough(config.solver), optimizer)[0]
     estimate = held if _let_go(held, estimate) else estimate
     for solver in (rough(config.solver), config.solver):
-        assert estimate.ranges is not None
-        graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
-        estimate = with_range_noise(replace(estimate, graph=graph), config).solved(solver, optimizer)[0]
+        estimate = with_range_noise(estimate, config).solved(solver, optimizer)[0]
     task.stages.end("ranges re-estimated")
     return estimate
 

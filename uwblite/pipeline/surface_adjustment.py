@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, entries, factor, side_by_side
+from ..graph.eliminated import Blocks, entries, factor
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
@@ -46,8 +46,8 @@ from ..lidar.surface_rays import (
     surfaces_of,
 )
 from ..lidar.walls import Pieces, find_walls, straight_pieces
-from ..odometry import floor as floors
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
+from ..odometry.wheels import noise_at
 from .estimate import Estimate, Task
 
 
@@ -195,19 +195,19 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
 def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, MeasuredSurfaces]:
     """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; unchanged without rays."""
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
-    floor, rules = floors.even(wheels), SurfacePolicy
+    certainty, rules = np.zeros((0, 3, 3)), SurfacePolicy
     assert joint is not None
     report = task.stages.reporter("surfaces")
     report(0, rules.steps + 1)
     found = find_surfaces(_lidar(graph, joint, task).sensors, estimate.lidar, task)
     others = () if estimate.ranges is None else (estimate.ranges,)
-    step, sums, kind = np.inf, None, np.zeros(0, dtype=np.int8)
+    step, kind = np.inf, np.zeros(0, dtype=np.int8)
     for turn in range(rules.steps):
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
-        if sums is not None and turn == 1:
-            wheels, floor = floors.learnt(wheels, graph, sums.poses)
+        if turn == 1:
+            wheels = noise_at(graph, wheels, certainty)
             kind = points_on(estimate.lidar.clouds, found, lidar.sensors)
         if not len(found.rays.keyframe):
             break
@@ -218,14 +218,12 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
         normal = filled(problem, subtrees=True, like=normal)
         task.stages.work[RAYS] += len(found.rays.keyframe)
         sums = weighted_sums(found, lidar.sensors, poses, rules.kernel * max(rules.wider * 0.5**turn, 1.0))
-        rays = _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)
-        both = side_by_side(rays, floors.equations(wheels, floor, graph, normal.unknowns))
-        known = factor(normal, both, order)
-        (change, by_block), order = known.step(normal, both), known.order
+        certainty, rays = sums.poses, _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)
+        known = factor(normal, rays, order)
+        (change, by_surface), order = known.step(normal, rays), known.order
         del known
-        many = len(found.surfaces.facing)
-        graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
-        found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
+        graph = moved(graph, normal.unknowns, change)
+        found = replace(found, surfaces=found.surfaces.moved(by_surface))
         before, step = step, rms_length((graph.poses - poses)[:, :2])
         # Steps get smaller by the same factor each.
         if turn >= rules.settling and step * min(step, before) <= rules.still * before:
