@@ -18,13 +18,13 @@ from ..graph.work import POINTS, Work
 from ..lidar import cloud_rasters, clouds
 from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.clouds import Clouds
-from ..odometry.attached import attach_ranges, choose_scans, scan_points
+from ..odometry.attached import ScanPoints, attach_ranges, choose_scans, scan_points
 from ..odometry.wheels import drift_time
 from .estimate import Estimate
 from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings
 
-_AT_ONCE = 32
+_AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
 _LEAST_REACH = 0.2
 """m; least reach of the rasters."""
@@ -36,7 +36,7 @@ _LEAST_SHARE = 1e-6
 
 def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
     """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
-    built = clouds.joined([part for recording in recordings.each for part in _blocks(recording, config, delay)])
+    built = clouds.joined([part for recording in recordings.each for part in _clouds_of(recording, config, delay)])
     return _with_raster(replace(built, work=work), config, delay, len(built.points))
 
 
@@ -52,19 +52,30 @@ def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -
     return ScanClouds(built, raster, delay)
 
 
-def _blocks(recording: Recording, config: MappingConfig, delay: float) -> Iterator[Clouds]:
-    """Yield the clouds of the keyframes of a recording, a block at a time; empty ones without lidar."""
+def _clouds_of(recording: Recording, config: MappingConfig, delay: float) -> Iterator[Clouds]:
+    """Yield the clouds of the keyframes of a recording, some at a time; empty ones without lidar."""
+    if not recording.has_scans:
+        none, offsets = np.zeros(0, dtype=np.intp), np.zeros(len(recording.frames) + 1, dtype=np.intp)
+        yield Clouds(offsets, np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))
+    for some, rays in rays_of(recording, config, delay):
+        yield clouds.build(replace(rays, keyframe=rays.keyframe - some.start), some.stop - some.start, config.clouds)
+
+
+def rays_of(
+    recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None
+) -> Iterator[tuple[slice, ScanPoints]]:
+    """Yield some keyframes of a recording at a time, and the rays of those wanted (k,), None = of all."""
     log, frames = recording.log.with_later_scans(delay), recording.frames
     if log.scans is None:
-        none = np.zeros(0, dtype=np.intp)
-        yield Clouds(np.zeros(len(frames) + 1, dtype=np.intp), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))
         return
     owner, chosen = choose_scans(log.scans, frames, config.keyframes)
+    if wanted is not None:
+        owner, chosen = owner[wanted[owner]], chosen[wanted[owner]]
     for first in range(0, len(frames), _AT_ONCE):
-        count = min(_AT_ONCE, len(frames) - first)
-        own = (owner >= first) & (owner < first + count)
-        rays = scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
-        yield clouds.build(replace(rays, keyframe=rays.keyframe - first), count, config.clouds)
+        some = slice(first, min(first + _AT_ONCE, len(frames)))
+        own = (owner >= some.start) & (owner < some.stop)
+        if wanted is None or own.any():
+            yield some, scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
 
 
 def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) -> Estimate:
