@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats
-from ..assessment.repairs import check_recording
+from ..assessment.facts import check_recording
 from ..errors import Cancelled, DataError
 from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..screening.screen import screen
