@@ -21,8 +21,8 @@ from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import LEAST_POINTS, blocked
 from ..radio.range_noise import short_term_sigma
+from .facts import listed
 from .moments import between_keyframes, seconds
-from .repairs import listed
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
