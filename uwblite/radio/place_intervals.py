@@ -17,7 +17,7 @@ def explain(model: PlaceModel) -> Explanation:
     """Return the explanation of greatest evidence."""
     search = _Search(model)
     best = search.one_place(model.track.heights[0])
-    for others in (search.divided, search.returned, search.united):
+    for others in (search.divided, search.returned):
         while (better := others(best)) is not None:
             best = better
     return best
@@ -86,17 +86,6 @@ class _Search:
                 place = best.place.copy()
                 place[own[start:end]] = k
                 better += self._better(best, place, best.found, self.model.worth(place))
-        return max(better, key=_evidence, default=None)
-
-    def united(self, best: Explanation) -> Explanation | None:
-        """Return the explanation with two of the places as one; None where none is better."""
-        better = []
-        for k in range(len(best.found)):
-            for other in range(k):
-                place = np.where(best.place == k, other, best.place)
-                rows = np.flatnonzero(place == other)
-                found = [*best.found[:other], *self.model.likeliest(best.height, [rows]), *best.found[other + 1 :]]
-                better += self._better(best, place, found, self.model.worth(best.place))
         return max(better, key=_evidence, default=None)
 
     def _better(self, best: Explanation, place: Ints, found: Sequence[AnchorHypothesis], shares: Floats) -> list[Explanation]:
