@@ -115,12 +115,7 @@ def _choose(today: Floats, gains: Floats, places: Floats, taken: Bools, count: i
 
 
 def _best(base: Floats, gains: Floats, taken: Bools) -> int:
-    """Return the candidate with which the mean error is least.
-
-    Raises
-    ------
-    ConfigError : all are taken.
-    """
+    """Return the candidate with which the mean error is least."""
     if taken.all():
         raise ConfigError(f"the map has no room for so many anchors {_APART:g} m apart; ask for fewer")
     means = np.array([np.inf if skip else position_errors(base + gain).mean() for gain, skip in zip(gains, taken, strict=True)])

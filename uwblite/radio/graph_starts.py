@@ -149,13 +149,8 @@ def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
 
 
 def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floats, Floats, Floats]:
-    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them.
-
-    Parameters
-    ----------
-    anchors : (a, 2) m, places measured from the placed poses; nan: none.
-    mine, here : (n,) poses of the chain, and those that are placed.
-    """
+    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them; anchors (a, 2)
+    as measured from the poses that are placed (here), nan: none, and from those of the chain (mine)."""
     there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):

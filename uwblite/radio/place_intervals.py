@@ -155,10 +155,7 @@ def _evidence(each: Explanation) -> float:
 
 def _times(one: Floats, other: Floats, carried: Floats, least: int) -> tuple[float, tuple[int, int]]:
     """Return the greatest sum of logarithms of likelihoods (m,) at one place, on the way, and at the other place, and when the
-    way begins and ends; at least so many ranges are of either place.
-
-    A few ranges of neither place are gross errors: that a radio is carried for a time takes a time more to say.
-    """
+    way begins and ends, a time more to say; at least so many ranges are of either place."""
     low, high = least, len(one) - least
     until, since = (np.append(0.0, np.cumsum(each - carried)) for each in (one, other))
     begun = until[low : high + 1]
