@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import WIDE, Ints, Wides
+from ..arrays import WIDE, Ints, Wides, concatenated
 from ..errors import FormatError
 from ..graph.graph import Graph
 from .files import replacing
@@ -73,8 +73,7 @@ _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
     """Read a planar pose graph, g2o or TORO, plain or gzip; ``-`` = standard input.
 
-    Poses without a VERTEX line are reached from the others along edges; in a file without any, the first pose is the
-    origin. Landmarks without one are placed by the first edge that sees them, or stay nan.
+    What has no VERTEX line is reached along edges, see graph_file.along_edges.
 
     Parameters
     ----------
@@ -150,8 +149,7 @@ def write_g2o(
 
     gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
     them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is
-    fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
-    worked in at the present estimate (see plain_edges); robust kernels are not written.
+    fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow; for what is written see plain_edges.
 
     Parameters
     ----------
@@ -194,9 +192,8 @@ def _lines(graph: Graph, plain: dict[str, Measured], ranges: bool, number: Ints)
 
 def _together(a: Records, b: Records) -> Records:
     """Return the lines of both kinds in the order of the file."""
-    order = np.argsort(np.concatenate([a.lines, b.lines]), kind="stable")
-    columns = zip((a.lines, a.stamps, a.names, a.numbers), (b.lines, b.stamps, b.names, b.numbers), strict=True)
-    return Records(*(np.concatenate(pair)[order] for pair in columns))
+    both = concatenated([a, b])
+    return both.rows(np.argsort(both.lines, kind="stable"))
 
 
 def _ids(content: RecordFile) -> Wides:

@@ -1,7 +1,4 @@
-"""Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common.
-
-Measurements stand in files between poses and landmarks, without calibration.
-"""
+"""Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common."""
 
 import math
 import re
@@ -63,11 +60,9 @@ def measured(kind: str, parts: Sequence[Measured] = ()) -> Measured:
 def plain_edges(graph: Graph) -> dict[str, Measured]:
     """Return a graph's measurements by kind with calibration and lever arms worked in at the present estimate.
 
-    Odometry and scan edges become measurements between the poses of the base. A range becomes the range from the pose
-    itself that leaves the same residual at the present estimate. Weights scale the information; robust kernels and
-    priors on calibration have no place in the formats and are left out. Where nothing is calibrated and lever arms are
-    zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out. Directions that
-    an edge does not measure get an information too small to matter (see `definite`).
+    Odometry and scan edges become measurements between the poses of the base, a range that from the pose itself which leaves
+    the same residual. Weights scale the information. Robust kernels, priors on calibration, and ranges to anchors without a
+    position are left out. Directions that an edge does not measure get an information too small to matter (see `definite`).
     """
     kinds: dict[str, list[Measured]] = {kind: [] for kind in ENDS}
     for edges in graph.edges:
@@ -220,9 +215,8 @@ class GraphFile:
 def along_edges(graph: Graph) -> tuple[Graph, Ints]:
     """Return a graph with a start for its poses, and for the landmarks that edges see or priors place; and chains (n,).
 
-    Chain 0 stands in the map's frame: what is given, what has a prior, and what edges tie to these; in a graph that holds
-    nothing anywhere, the part of the first pose, which is the origin. Every other chain, which only ranges and landmarks
-    may tie to it, begins at the origin and wants a place.
+    Chain 0 stands in the map's frame: what is given, has a prior, or is tied to these by edges, else the part of the first
+    pose, which is the origin. Every other chain, which only ranges and landmarks may tie to it, begins at the origin.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ the true poses as vertices: see `from_odometry`.
 import os
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,8 +131,7 @@ def write_pyfg(
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
-    Calibration and lever arms are worked in at the present estimate (see plain_edges); robust kernels
-    are not written. The vertices hold the estimate.
+    For what is written see plain_edges. The vertices hold the estimate.
 
     Parameters
     ----------
@@ -212,5 +212,5 @@ def _kinds_of_ranges(ranged: Records, pose_of: Ints, landmark_of: Ints) -> tuple
     names[swapped] = names[swapped, ::-1]
     first, second = pose_of[names[:, 0]] >= 0, pose_of[names[:, 1]] >= 0
     kinds = (first & ~second, first & second, ~first)
-    mixed, meetings, surveys = (Records(ranged.lines[k], ranged.stamps[k], names[k], ranged.numbers[k]) for k in kinds)
+    mixed, meetings, surveys = (replace(ranged, names=names).rows(kind) for kind in kinds)
     return mixed, meetings, surveys
