@@ -99,10 +99,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),
-    "loose links": LeftOut(patches=(
-        ("pipeline.closure_rounds._with_loose_links_tied", lambda base, estimate, task: (base, estimate.closures, estimate)),
-    )),
-    "long stretches": LeftOut(patches=(("loop_closure.long_stretches.any_uncertain", lambda *given: False),)),
+    "long stretches": LeftOut(patches=(("loop_closure.candidates.any_uncertain", lambda *given: False),)),
     "joint refinement": LeftOut(("refinement.rounds=0",)),
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "corners": LeftOut(("clouds.linearity=0.85",)),
@@ -111,8 +108,8 @@ INGREDIENTS: dict[str, LeftOut] = {
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),
-    "mirror images": _stage("mirror_images.find_mirror_images"),
-    "sides of a line of anchors": _stage("line_sides.choose_side"),
+    "mirror images": _stage("range_alternatives.find_mirror_images"),
+    "sides of a line of anchors": _stage("range_alternatives.choose_side"),
     "priors of ranges selected": _stage("radio_stages.select_range_priors"),
     "tag pattern": _stage("lidar_stages._without_pattern"),
     "marginal likelihood of the radio's priors": LeftOut(
