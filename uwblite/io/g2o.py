@@ -32,10 +32,9 @@ from .graph_file import (
     ENDS,
     GraphFile,
     Measured,
-    assembled,
+    Vertices,
     check_lines,
     check_planar,
-    given_places,
     measured,
     measurements,
     plain_edges,
@@ -113,18 +112,12 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
             raise
         raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
     plain["landmark_range"] = measured("landmark_range")
-    poses = given_places(vertices, pose_of, len(pose_ids), content)
-    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
     fixed = records["FIX"].names[:, 0]
-    graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
-    file = GraphFile.checked(
-        graph,
-        tuple(map(str, pose_ids.tolist())),
-        tuple(map(str, landmark_ids.tolist())),
-        np.arange(len(pose_ids), dtype=np.float64),
-        content,
-        from_odometry,
+    poses, landmarks = (
+        Vertices(tuple(map(str, ids.tolist())), place, given, place[fixed][place[fixed] >= 0])
+        for ids, place, given in ((pose_ids, pose_of, vertices), (landmark_ids, landmark_of, records["VERTEX_XY"]))
     )
+    file = GraphFile.of(content, plain, (poses, landmarks), np.arange(len(pose_ids), dtype=np.float64), from_odometry)
     return replace(file, warnings=(*_degrees(steps), *file.warnings))
 
 

@@ -29,10 +29,9 @@ from .graph_file import (
     ENDS,
     GraphFile,
     Measured,
-    assembled,
+    Vertices,
     check_lines,
     check_planar,
-    given_places,
     measurements,
     plain_edges,
     rows_of,
@@ -112,12 +111,11 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
         inverse, least = _inverted(measured.information)
         check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
         plain[kind] = measured._replace(information=inverse)
-    poses = given_places(vertices, pose_of, len(pose_ids), content)
-    anchors = given_places(landmarks, landmark_of, len(landmark_ids), content)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
-    return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content, from_odometry)
+    of = Vertices(pose_ids, pose_of, vertices), Vertices(landmark_ids, landmark_of, landmarks)
+    return GraphFile.of(content, plain, of, stamps, from_odometry)
 
 
 def write_pyfg(

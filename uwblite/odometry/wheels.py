@@ -79,8 +79,8 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see, or much worse than
-        the wheels do, do not count.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count, nor
+        those that it measures much worse than the wheels do, where these differ by much more.
     """
     if len(steps) < _ENOUGH:
         return wheels
@@ -94,12 +94,14 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(off.shape[1])
     for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH):
-        factor[k] = np.clip(_growing(off[well[:, k], k], own[well[:, k]]), _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
+        by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
+        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
 
-_MUCH_WORSE = 6.0
-"""Ratio of a measured step's standard deviation to that of the wheels, from which on their difference shows its errors."""
+_MUCH_WORSE, _ALIKE = 6.0, 2.0
+"""Ratio of a measured step's standard deviation to that of the wheels, from which on their difference may show its errors; it
+does where the noise by all steps is so many times that by the better ones."""
 
 
 def _growing(off: Floats, step: Ints) -> float:
