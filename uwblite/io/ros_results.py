@@ -42,9 +42,7 @@ def write_result_bag(
 
     Parameters
     ----------
-    path : file (.mcap) or folder to make.
     logs : its recordings in their order, or none; frames and topics of the second begin with ``recording_2/``.
-    storage : 'mcap' or 'sqlite3'.
 
     Raises
     ------
