@@ -114,8 +114,8 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
-    of = Vertices(pose_ids, pose_of, vertices), Vertices(landmark_ids, landmark_of, landmarks)
-    return GraphFile.of(content, plain, of, stamps, from_odometry)
+    named = Vertices(pose_ids, pose_of, vertices), Vertices(landmark_ids, landmark_of, landmarks)
+    return GraphFile.of(content, plain, named, stamps, from_odometry)
 
 
 def write_pyfg(
