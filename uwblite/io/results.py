@@ -1,7 +1,6 @@
 """The folder that `uwblite map` writes, all of its files or none; docs/formats.md lists them.
 
-A result is replaced as a whole, see folders.py: a full disk or a crash leaves the previous one. report.json holds the
-hash of every other file.
+A result is replaced as a whole, see folders.py. report.json holds the hash of every other file.
 """
 
 import hashlib
@@ -60,14 +59,7 @@ def repair_result(folder: str | os.PathLike[str]) -> None:
 
 
 def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
-    """Refuse a folder that cannot or must not be written, before the work is done.
-
-    Raises
-    ------
-    ConfigError : it holds a result and force is not given, it is not a folder, a folder in it has the name of a file, or a
-        file of such a name is no part of a result, or was changed since.
-    OSError : it cannot be written.
-    """
+    """Refuse a folder that cannot be written (OSError), or that holds a result or files that must stay (ConfigError)."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is not a folder; choose another `folder`")
@@ -93,7 +85,7 @@ def _is_written(folder: Path, name: str) -> bool:
 
 
 def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> list[str]:
-    """Write a result into a folder, made where it is missing; files of an earlier result are replaced.
+    """Write a result into a folder, made where it is missing, in place of an earlier one, untouched where an error is raised.
 
     Parameters
     ----------
@@ -102,10 +94,6 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     Returns
     -------
     Names of the files, in the order in which a user wants to see them.
-
-    Raises
-    ------
-    ConfigError, OSError : as for `check_target`, or the disk is full; an earlier result is untouched.
     """
     check_target(folder, force=True)
     with replacing_folder(folder, is_of_result) as waiting:
