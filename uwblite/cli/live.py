@@ -19,8 +19,7 @@ from ..io.stored_result import StoredResult, read_result
 from ..localization import LocalizerState
 from ..localization.known_map import KnownMap, from_result
 from ..localization.live_feed import LiveFeed, Patience
-from ..server.live import LivePage
-from ..server.pose_status import PoseStatus
+from ..server.live import LivePage, PoseStatus
 from . import console
 from .inputs import mounted
 from .interruption import stopped_by

@@ -5,9 +5,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 from urllib.parse import quote
 
-from .html import escape
-from .page import PAGE, STYLE
-from .printable import csv_field
+from .page import document
+from .printable import csv_field, escape
 
 OUTCOMES = ("mapped", "doubted", "failed")
 
@@ -93,10 +92,12 @@ def table_html(rows: Sequence[BatchRow], title: str) -> str:
     head = "".join(f"<th>{escape(_HEADINGS.get(name, name))}</th>" for name in _COLUMNS if name != "folder")
     body = "".join(_table_row(row) for row in rows)
     table = f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-    body = f"<h1>{escape(title)}</h1><p>{len(rows)} recordings: {counts}</p>{table}"
-    return PAGE.format(title=escape(title), style=STYLE + "main{max-width:none}", script="", body=body)
+    name = escape(title)
+    body = f"<h1>{name}</h1><p>{len(rows)} recordings: {counts}</p>{table}"
+    return document(f"{name} \u2013 uwblite", body, _STYLE)
 
 
+_STYLE = "body{padding:1rem}.scroll{overflow-x:auto}td,th{padding:.2rem .6rem;border-bottom:1px solid var(--line)}"
 _SHADES = {"mapped": "good", "doubted": "warn", "failed": "bad"}
 
 

@@ -1,5 +1,6 @@
 """The requests and answers of `uwblite view`, without a socket."""
 
+import itertools
 import json
 import secrets
 from collections.abc import Callable, Sequence
@@ -13,21 +14,12 @@ from ..io.files import write_text
 from ..io.results import is_of_result
 from ..io.source import read_settings
 from ..io.stored_result import StoredResult, read_result
-from .edits import edits_text, parse_edits, with_anchor, with_closure
-from .page import page
-from .remap import remap_command
-from .requests import HTML, PNG, Response, json_response, path_of, refusal, text_response
+from .edits import PINNED_SIGMA, edits_text, parse_edits, remap_command, with_anchor, with_closure
+from .pages import view_page
 from .shown_results import ShownResult, described, shown_result
+from .web import HTML, JSON, PNG, TEXT, Response, json_response, path_of, refusal, text_response
 
-_TYPES = {
-    ".html": HTML,
-    ".png": PNG,
-    ".json": "application/json",
-    ".csv": "text/plain; charset=utf-8",
-    ".toml": "text/plain; charset=utf-8",
-    ".tum": "text/plain; charset=utf-8",
-    ".yaml": "text/plain; charset=utf-8",
-}
+_TYPES = {".html": HTML, ".png": PNG, ".json": JSON, **dict.fromkeys((".csv", ".toml", ".tum", ".yaml"), TEXT)}
 _FARTHEST = 1e7
 """m; no anchor is pinned beyond it."""
 
@@ -63,10 +55,9 @@ class App:
     job: Job | None = None
     making: Path | None = None
 
-    def load(self) -> None:
-        """Read the constraints file, where there is one."""
-        if self.constraints.is_file():
-            self.own, self.edits = parse_edits(read_settings(str(self.constraints)), str(self.constraints))
+    def show(self, result: StoredResult) -> None:
+        """Put a result beside the others."""
+        self.results.append(shown_result(result, f"/result/{len(self.results)}/grid.png"))
 
     def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
         """Answer a request.
@@ -85,7 +76,7 @@ class App:
 
     def _get(self, path: str) -> Response:
         if path == "/":
-            return Response(200, _TYPES[".html"], page(self.token).encode())
+            return Response(200, HTML, view_page(self.token).encode())
         if path == "/state":
             return json_response(self._state())
         parts = path.strip("/").split("/")
@@ -137,7 +128,7 @@ class App:
             raise ConfigError("there is no such anchor in this result")
         if place is None:
             return with_anchor(self.edits, str(name), None)
-        sigma = wish.get("sigma", 0.05)
+        sigma = wish.get("sigma", PINNED_SIGMA)
         numbers = [*place, sigma] if isinstance(place, list) and len(place) == 2 else []
         good = all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _FARTHEST for v in numbers)
         if not numbers or not good or sigma <= 0:
@@ -154,7 +145,7 @@ class App:
         if self.job is not None and self.job.code() is None:
             raise ConfigError("a map is being made already")
         folder = shown.result.folder.resolve()
-        out = next(p for k in range(2, 10_000) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
+        out = next(p for k in itertools.count(2) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
         if not self.constraints.exists():
             self._keep(self.edits)
         self.job = self.launch(remap_command(shown.result.report, folder, self.recordings, self.constraints, out))
@@ -166,7 +157,7 @@ class App:
             return
         made, self.making = self.making, None
         if self.job.code() in (0, 3):
-            self.results.append(shown_result(read_result(made)))
+            self.show(read_result(made))
 
 
 def app_of(
@@ -178,8 +169,11 @@ def app_of(
     ------
     ConfigError : the constraints file is there and is none.
     """
-    app = App([shown_result(r) for r in results], recordings, constraints, launch, secrets.token_urlsafe(24))
-    app.load()
+    app = App([], recordings, constraints, launch, secrets.token_urlsafe(24))
+    for result in results:
+        app.show(result)
+    if constraints.is_file():
+        app.own, app.edits = parse_edits(read_settings(str(constraints)), str(constraints))
     return app
 
 
