@@ -97,6 +97,8 @@ def share(colour: Colour, alpha: float = 1.0) -> tuple[float, float, float, floa
     return (r, g, b, alpha)
 
 
+_Place = NDArray[np.signedinteger]
+"""(2,) column and row of a pixel."""
 _FINE = 3
 """Sub-pixels per pixel and axis: ink is laid on a finer grid and averaged, which smooths the edges."""
 _HALO = 0.85
@@ -171,7 +173,7 @@ class Canvas:
             ink[places + offset] = True
         self._lay(ink.reshape(centre.shape), low, colour, opacity)
 
-    def _lay(self, ink: Bools, place: NDArray[np.signedinteger], colour: Colour, opacity: float) -> None:
+    def _lay(self, ink: Bools, place: _Place, colour: Colour, opacity: float) -> None:
         """Average fine ink to pixels and blend it in with its first pixel at a place."""
         rows = ink.view(np.uint8).reshape(len(ink) // _FINE, _FINE, -1).sum(axis=1, dtype=np.uint8)
         cover = np.sum([rows[:, k::_FINE] for k in range(_FINE)], axis=0)
