@@ -223,7 +223,6 @@ class LinesTo(LogFile):
         self.head, self.path, self.first, self.bytes, self.part = [], Path("-"), Path("-"), 0, 1
 
     def write(self, lines: list[str]) -> None:
-        """Hand lines on."""
         if lines:
             data = ("\n".join(lines) + "\n").encode("ascii", "replace")
             self.bytes += len(data)

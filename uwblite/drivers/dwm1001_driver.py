@@ -143,11 +143,9 @@ class Dwm1001Driver(Driver):
         return [event for event in events if not isinstance(event, Corrupt)]
 
     def spacing(self, event: Any) -> float | None:
-        """Return the time between two lines of the stream, s."""
         return self.period if self._streaming and isinstance(event, RangeLine) else None
 
     def stop(self) -> list[Action]:
-        """Return what ends a stream; polling ends by itself."""
         noise = self._noise if self._text and self._binary else []
         return [*noise, *self._guard.finish(), *([Send(b"lec\r")] if self._streaming else [])]
 
@@ -299,7 +297,6 @@ class Dwm1001Driver(Driver):
     # ---- for people
 
     def identity(self) -> Identity:
-        """Say who answered."""
         details = {}
         node, network = self.values.get("node_id"), self.values.get("pan_id", self.info.pan_id)
         if node is not None:

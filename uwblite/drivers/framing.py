@@ -148,7 +148,6 @@ class HeadedFrames(FrameReader):
         """
 
     def measure(self, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
         size = self.frame_size(bytes(buffer[offset : offset + self.head_size]))
         if size < 0:
@@ -170,7 +169,6 @@ class HeadedFrames(FrameReader):
         return 0
 
     def overlap(self, frame: bytes) -> int:
-        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
         sizes = range(min(self.head_size, len(frame)) - 1, 0, -1)
         return next((k for k in sizes if self.frame_size(frame[-k:]) >= 0), 0)
 
@@ -194,7 +192,6 @@ class PacketReader(FrameReader):
         return True
 
     def measure(self, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
         size, behind = self.size_at(buffer, offset), offset + 1
         end = len(buffer) if size == 0 else offset + size if size > 0 and not self.is_checked(buffer[offset]) else offset
@@ -223,7 +220,6 @@ class FixedPackets(PacketReader):
         """Return whether a whole packet with the right head has a right check, and holds what the device can send."""
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        """Return the size of the good packet at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[offset] != self.head[0]:
             return to_next(buffer, offset, self.head[0])
         packet = buffer[offset : offset + self.size]

@@ -92,7 +92,6 @@ class BaseDriver(Driver):
         return Note("warning", "odometry-gap", f"odometry: the base {what} meanwhile is unknown")
 
     def identity(self) -> Identity:
-        """Say who answered."""
         if self._voltage is None:
             return Identity(self.title)
         findings = []

@@ -97,7 +97,6 @@ class OdometryLineDriver(LineDriver):
         self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
 
     def time_of(self, content: dict[str, float]) -> float | None:
-        """Return the base's time in a line, its own unit; None = there is none."""
         return content.get("t")
 
     def follows(self, before: Line, after: Line) -> bool:
@@ -115,7 +114,6 @@ class OdometryLineDriver(LineDriver):
         return max(ways) <= LEAP_SPEED * seconds and turn <= LEAP_TURN * seconds
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into a pose."""
         self.ready, values, unit = True, line.content, self._format
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
@@ -188,11 +186,9 @@ class GyroLineDriver(LineDriver):
         self._last = None
 
     def time_of(self, content: dict[str, float]) -> float | None:
-        """Return the gyro's time in a line, its own unit; None = there is none."""
         return content.get("t")
 
     def follows(self, before: Line, after: Line) -> bool:
-        """Return whether a robot can have turned so meanwhile."""
         step = {name: (after.content[name] - before.content[name]) * self._angle_unit for name in after.content}
         seconds = max(after.stamp - before.stamp, 0.0)
         rate, turn = step.get("turn_rate", 0.0), math.remainder(step.get("theta", 0.0), 2 * math.pi)
@@ -200,7 +196,6 @@ class GyroLineDriver(LineDriver):
         return smooth and super().follows(before, after)
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into a heading."""
         self.ready, values = True, line.content
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:

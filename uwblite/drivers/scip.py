@@ -118,13 +118,11 @@ class ScipProtocol:
         self.reset()
 
     def reset(self) -> None:
-        """Forget half a reply."""
         self._lines = LineReader(MAX_LINE, keep=LONGEST_ECHO, ends=(b"\n",))
         self._frame: list[tuple[float, bytes]] = []
         self._text_owner = ""
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Event] = []
         for line in self._lines.feed(data, stamp):
             if not isinstance(line, Corrupt):

@@ -58,7 +58,6 @@ class ScipDriver(ScipUnit):
         self._series = Continuity(_follows, "scan whose time", summed=True)
 
     def stop(self) -> list[Action]:
-        """Return what switches the laser off and ends the stream."""
         return [*self._series.unconfirmed(), Send(b"QT\n")]
 
     def script(self) -> Script[None]:
@@ -203,7 +202,6 @@ class ScipDriver(ScipUnit):
     # ---- for people
 
     def identity(self) -> Identity:
-        """Say who answered."""
         unit, facts, findings = self.geometry, self.facts, []
         fields = (("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT"))
         details = [(name, facts[key]) for name, key in fields if key in facts]

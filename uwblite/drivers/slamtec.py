@@ -116,5 +116,4 @@ class SlamtecDriver(SpinningDriver):
         yield from self.sleep(0.1)
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, tuple(self.facts.items()), self._findings())

@@ -210,7 +210,6 @@ class SpinningDriver(Driver):
         self._last, self._time, self._map = None, 0.0, rhythm_map()
 
     def script(self) -> Script[None]:
-        """Start the lidar and listen, again and again."""
         while True:
             if self.dtr is not None:
                 yield SetDtr(self.dtr)
@@ -240,17 +239,14 @@ class SpinningDriver(Driver):
                 yield from self.take(event)
 
     def stop(self) -> list[Action]:
-        """Return what stops the motor."""
         return [] if self.dtr is None else [SetDtr(not self.dtr)]
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, tuple(self.facts.items()))
 
     # ---- readings
 
     def take(self, event: Samples) -> list[Action]:
-        """Turn readings into the scans that they complete."""
         self.ready = True
         last, lost = self._host_time(event) if self._clock is None else self._device_time(event, self._clock)
         count = len(event.ranges)

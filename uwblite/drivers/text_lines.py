@@ -97,11 +97,9 @@ class LineProtocol:
         self.reset()
 
     def reset(self) -> None:
-        """Forget half a line."""
         self._lines = LineReader(self._most)
 
     def feed(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Line | Corrupt] = []
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):
@@ -186,5 +184,4 @@ class LineDriver(Driver, ABC):
         return reading.stamp, reading.elapsed, [Lost(reading.stamp, reading.missing)] if reading.missing else []
 
     def stop(self) -> list[Action]:
-        """Return Corrupt for lines that nothing confirmed."""
         return self._series.unconfirmed()

@@ -127,11 +127,9 @@ class SocketPort:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def fileno(self) -> int | None:
-        """Return the descriptor to select on."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return what has arrived."""
         try:
             data = self._socket.recv(CHUNK)
         except BlockingIOError:
@@ -143,7 +141,6 @@ class SocketPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Write all bytes."""
         try:
             sent = self._socket.send(data)
         except OSError as error:
@@ -158,7 +155,6 @@ class SocketPort:
         """Do nothing: a bridge has no DTR line."""
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()
 
 
@@ -196,14 +192,12 @@ class SerialPort:
             self._serial.set_low_latency_mode(True)
 
     def fileno(self) -> int | None:
-        """Return the descriptor to select on, or None where the port has none."""
         try:
             return int(self._serial.fileno())
         except (AttributeError, OSError, ValueError):
             return None
 
     def read(self) -> bytes:
-        """Return what has arrived."""
         try:
             if not self._local:
                 return bytes(self._serial.read(min(self._serial.in_waiting, CHUNK)))
@@ -223,7 +217,6 @@ class SerialPort:
         return any(flags & ~select.POLLIN for _, flags in poller.poll(0))
 
     def write(self, data: bytes) -> None:
-        """Write all bytes in one write."""
         try:
             sent = self._serial.write(data)
         except self._errors as error:
@@ -232,17 +225,14 @@ class SerialPort:
             raise DeviceError(f"{self.url}: it takes no bytes")
 
     def set_baud(self, rate: int) -> None:
-        """Set the speed, bit/s."""
         with contextlib.suppress(ValueError, *self._errors):
             self._serial.baudrate = rate
 
     def set_dtr(self, on: bool) -> None:
-        """Set the DTR line."""
         with contextlib.suppress(ValueError, *self._errors):
             self._serial.dtr = on
 
     def close(self) -> None:
-        """Close the port."""
         with contextlib.suppress(*self._errors):
             self._serial.close()
 

@@ -239,7 +239,6 @@ class UwbDriver(LineDriver):
         self._guard = RangeGuard(self.health)
 
     def time_of(self, content: Ranges | Refused) -> float | None:
-        """Return the board's time, its own unit; None = there is none."""
         return content.time if isinstance(content, Ranges) else None
 
     def members(self, event: Line | Corrupt) -> tuple[str, ...]:
@@ -248,7 +247,6 @@ class UwbDriver(LineDriver):
         return tuple(f"{content.tag}/{r.anchor_id}" for r in content.readings) if isinstance(content, Ranges) else ()
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into ranges."""
         if isinstance(line.content, Refused):
             text = f"uwb: it prints {line.content.what}, which are no ranges: set it to two-way ranging, and to print distances"
             return self.say_once(Note("error", "uwb-no-ranges", text))
@@ -289,9 +287,7 @@ class UwbDriver(LineDriver):
         return leap if 0 < step <= NEAR else 0
 
     def stop(self) -> list[Action]:
-        """Return Corrupt for what nothing confirmed."""
         return [*super().stop(), *[Corrupt(b"", OTHER_TAG)] * (self._first is not None), *self._guard.finish()]
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, (("tag", self._tag),) if self._tag else ())
