@@ -33,7 +33,6 @@ class Outcome(NamedTuple):
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     name_recordings_once(args)
     tasks = tasks_of(args)
     refuse_foreign(unmarked(Path(args.out), ("batch.csv", "batch.html"), "batch.csv", table_csv([])))

@@ -29,7 +29,6 @@ DEVICES = ("odometry", "lidar", "uwb", "gyro")
 
 
 def run_live(args: argparse.Namespace) -> int:
-    """Say poses until the log ends or somebody says stop."""
     devices = any(getattr(args, name) for name in DEVICES)
     if devices == bool(args.log):
         raise UsageError("--live needs either a log to follow (- = standard input) or devices: --odometry, --lidar, --uwb")
@@ -46,7 +45,6 @@ def run_live(args: argparse.Namespace) -> int:
 
 
 def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
-    """Follow devices or a log and return the exit code."""
     with stopped_by(signal.SIGINT, signal.SIGTERM) as stopped:
         if devices:
             from .record import record_into
@@ -62,8 +60,6 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
 
 
 class Tracker:
-    """From pieces of a log to lines on stdout."""
-
     def __init__(self, known: KnownMap, args: argparse.Namespace) -> None:
         self.state: LocalizerState | None = None
         self.on_state: Callable[[LocalizerState], None] = lambda _: None
@@ -75,7 +71,6 @@ class Tracker:
         self._said, self._was_lost = -float("inf"), True
 
     def take(self, data: bytes) -> None:
-        """Use a piece of the log."""
         for state in self._feed.take(data):
             self._say(state)
         self._heard = self._clock()

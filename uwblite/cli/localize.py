@@ -25,7 +25,6 @@ from .live import run_live, tell_doubts
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     if args.live:
         return run_live(args)
     if not args.log or not args.out:
@@ -81,7 +80,6 @@ _OWN = {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"
 
 
 def _files(args: argparse.Namespace) -> dict[str, str]:
-    """Return the files to be written, by what they hold."""
     if args.out.endswith((".tum", ".tum.gz")):
         named = {"trajectory": args.out, "covariance": args.covariance, "picture": args.picture}
         return {what: name for what, name in named.items() if name}
@@ -97,7 +95,6 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
-    """Return what was found, ready for JSON."""
     return {
         "files": files,
         "poses": len(localization.stamps),

@@ -20,7 +20,6 @@ _HEAD = "x,y,theta,distance,clearance"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
@@ -56,7 +55,6 @@ def _leaving(path: PlannedPath, radius: float) -> float:
 
 
 def _table(path: PlannedPath) -> str:
-    """Return the path as CSV; m, m, rad, m from the start, m from the nearest obstacle."""
     rows = zip(path.poses.tolist(), path.distances.tolist(), path.clearances.tolist(), strict=True)
     lines = [f"{x:.4f},{y:.4f},{theta:.4f},{far:.4f},{clear:.3f}" for (x, y, theta), far, clear in rows]
     return "\n".join([_HEAD, *lines]) + "\n"

@@ -21,7 +21,6 @@ _HEAD = "id,x,y,mean_error,error_95"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
@@ -64,7 +63,6 @@ def _figures(args: argparse.Namespace, plan: AnchorPlan, today: int) -> dict[str
 
 
 def _table(figures: dict[str, Any]) -> str:
-    """Return the places as CSV; lengths in metres; errors with this anchor and those before it."""
     lines = [_HEAD]
     lines += [f"{a['id']},{a['x']:.3f},{a['y']:.3f},{a['mean_error']:.3f},{a['error_95']:.3f}" for a in figures["anchors"]]
     return "\n".join(lines) + "\n"

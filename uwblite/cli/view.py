@@ -16,7 +16,6 @@ from .child import Child
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     folders = [path for path in args.paths if format_of(path) == "map"]
     if not folders:
         raise ConfigError(f"{args.paths[0]} holds no result; map it first: uwblite map {args.paths[0]} --out map")

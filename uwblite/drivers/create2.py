@@ -75,10 +75,7 @@ class Create2Protocol(FixedPackets):
 class Create2Driver(BaseDriver):
     """A Create 2 or Roomba. It is only listened to: the stream is asked for, no motor is ever moved.
 
-    Parameters
-    ----------
-    start : pose of the base at the first frame; m, m, rad.
-    baud : bit/s; a robot that was switched on with its clean button held for 10 s talks at 19200.
+    One that was switched on with its clean button held for 10 s talks at 19200 bit/s.
     """
 
     frame, rhythm = Encoders, PERIOD

@@ -56,10 +56,7 @@ _SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly
 def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float) -> list[Note]:
     """Name every setting that makes ranges rare or absent, the worst first, and how to mend each.
 
-    Parameters
-    ----------
-    tag : the node is a tag, not an anchor. active : its radio is on. stationary : stationary detection is on.
-    joined : it is part of a network; None = not known yet. low_power : low-power mode is on. period : s between fixes.
+    The node is a `tag`, `active` = its radio is on, `joined` None = not known yet, `period` s between fixes.
     """
     resting = f"stationary detection is on: the rate falls to once in 10 s at rest: {_SHELL}, `acts` shows its arguments;"
     rows = (
@@ -84,13 +81,7 @@ def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, lo
 
 
 class Dwm1001Driver(Driver):
-    """One DWM1001 tag.
-
-    Parameters
-    ----------
-    shell : read the text stream instead of polling TLV.
-    stream : False: stop after the queries (for a look at what is plugged in).
-    """
+    """One DWM1001 tag, by TLV or its `shell`; without `stream` it stops after the queries, for a look at what is plugged in."""
 
     baud = BAUD
 

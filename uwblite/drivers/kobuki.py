@@ -107,12 +107,7 @@ def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
 
 
 class KobukiDriver(BaseDriver):
-    """A Kobuki base. Nothing is ever sent.
-
-    Parameters
-    ----------
-    start : pose of the base at the first packet; m, m, rad.
-    """
+    """A Kobuki base. Nothing is ever sent."""
 
     frame, rhythm = Feedback, PERIOD
 

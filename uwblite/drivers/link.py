@@ -69,13 +69,7 @@ class Host:
 
 
 class Opening:
-    """A port that is being opened by a thread of its own, so that nobody has to wait for it.
-
-    Parameters
-    ----------
-    open_port : (url, baud) -> Port; raises DeviceError.
-    url, baud : as for `open_port`.
-    """
+    """A port that is being opened by a thread of its own, so that nobody has to wait for it."""
 
     def __init__(self, open_port: Callable[[str, int], Port], url: str, baud: int) -> None:
         self._open, self._place = open_port, (url, baud)
@@ -109,15 +103,7 @@ class Opening:
 
 
 class Link:
-    """One device: its port, session and counts.
-
-    Parameters
-    ----------
-    sensor : "uwb", "lidar" or "odometry".
-    url : of the port.
-    session : start-up, running and recovery.
-    number : the robot's first (1), second ... of its kind.
-    """
+    """One device: its port, session and counts; the robot's first (1), second ... of its kind."""
 
     def __init__(self, sensor: str, url: str, session: Session, number: int = 1) -> None:
         self.name = sensor if number == 1 else f"{sensor}{number}"
@@ -138,13 +124,7 @@ class Link:
     # ---- its port
 
     def connect(self, now: float, open_port: Callable[[str, int], Port]) -> Port | DeviceError | None:
-        """Open the port in the background; return it once it is open, why not, None while that is unknown.
-
-        Parameters
-        ----------
-        now : s.
-        open_port : (url, baud) -> Port.
-        """
+        """Open the port in the background; return it once it is open, why not, None while that is unknown."""
         if self.opening is None:
             self.opening = Opening(open_port, self.url, self.session.baud)
         port = self.opening.result()

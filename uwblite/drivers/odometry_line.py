@@ -45,11 +45,7 @@ class LineFormat:
 
 
 def odometry_format(columns: str = "t,x,y,theta", **units: Any) -> LineFormat:
-    """Build the form of a base's lines.
-
-    Parameters
-    ----------
-    columns : names from COLUMNS, parted by commas. units : other fields of LineFormat.
+    """Return the form of a base's lines, from column names parted by commas and other fields of LineFormat.
 
     Raises
     ------
@@ -80,14 +76,7 @@ def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str
 
 
 class OdometryLineDriver(LineDriver):
-    """A base that prints text lines.
-
-    Parameters
-    ----------
-    line_format : columns and units.
-    baud : bit/s.
-    start : pose at the first line, where the lines hold ticks; m, m, rad.
-    """
+    """A base that prints text lines; where these hold ticks, its pose at the first one is `start`."""
 
     def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
         unit = line_format.time_unit
@@ -144,17 +133,11 @@ LEAP_RATE, LEAP_ACCELERATION = 1.0, 50.0
 
 
 def gyro_format(columns: str, time_unit: float = 1.0, angle_unit: float = 1.0, prefix: str = "") -> LineFormat:
-    """Build the form of a gyro's lines.
-
-    Parameters
-    ----------
-    columns : names of ``t``, ``turn_rate``, ``theta``, ``-``, with one of turn_rate and theta.
-    time_unit : s per unit of t. angle_unit : rad per unit of theta, rad/s per unit of turn_rate; below 0 = clockwise.
-    prefix : what the lines begin with.
+    """Return the form of a gyro's lines; units are s of t, rad of theta and rad/s of turn_rate, below 0 = clockwise.
 
     Raises
     ------
-    ConfigError : other columns, or neither rate nor heading.
+    ConfigError : other columns than t, turn_rate, theta and -, or neither rate nor heading.
     """
     names = named_columns(columns, ("t", "turn_rate", "theta"), "gyro line")
     if not {"turn_rate", "theta"} & set(names):
@@ -167,10 +150,6 @@ class GyroLineDriver(LineDriver):
 
     A heading that the gyro sends is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
     the heading stays: the mapper sees the gap by the stamps.
-
-    Parameters
-    ----------
-    line_format : columns and units. baud : bit/s.
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:

@@ -180,13 +180,7 @@ def _decode_capsule(capsule: bytes, stamp: float, first: int, step: float, perio
 
 
 class RpLidarDriver(SlamtecDriver):
-    """An RPLIDAR.
-
-    Parameters
-    ----------
-    express : 4000 readings a second and more, where the firmware has it (from 1.17); otherwise standard scan.
-    baud : bit/s to try first.
-    """
+    """An RPLIDAR; `express` = 4000 readings a second and more, where the firmware has it (from 1.17)."""
 
     title, dtr = "Slamtec RPLIDAR", False
 

@@ -29,17 +29,14 @@ class Geometry:
 
     @property
     def step_angle(self) -> float:
-        """Angle between steps, rad."""
         return 2 * math.pi / self.resolution
 
     @property
     def step_time(self) -> float:
-        """Time between steps, s."""
         return 60.0 / self.speed / self.resolution
 
     @property
     def period(self) -> float:
-        """Time of a turn, s."""
         return 60.0 / self.speed
 
 
@@ -74,13 +71,9 @@ class ScanRequest:
 
 
 def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = None) -> tuple[float, ...]:
-    """Return raw values in m; +inf = nothing seen, nan = invalid (REP-117).
+    """Return raw values, mm, in m; +inf = nothing seen, nan = invalid (REP-117).
 
-    Parameters
-    ----------
-    values : mm, below DMIN codes of the model.
-    geometry : gives DMIN and DMAX.
-    limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
+    Below DMIN values are codes of the model; 2 characters hold at most `limit`, mm.
     """
     low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
     nothing = NOTHING_SEEN.get(geometry.model[:3], ())
@@ -148,17 +141,9 @@ STATUS_OF_ALL = {
 
 
 def status_meaning(command: str, status: str) -> tuple[str, str]:
-    """Name a status code.
+    """Return the kind of a status that came with a command, and what it means.
 
-    Parameters
-    ----------
-    command : the echo it came with.
-    status : two characters.
-
-    Returns
-    -------
-    kind : "ok", "paused", "resumed", "hardware-fault", "refused" or "scip1".
-    text : what it means.
+    Kinds are "ok", "paused", "resumed", "hardware-fault", "refused" and "scip1".
     """
     if len(status) == 1:
         return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit has SCIP 1.1; send SCIP2.0")

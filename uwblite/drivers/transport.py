@@ -58,7 +58,6 @@ def check_pyserial(url: str) -> None:
 
 
 def is_socket(url: str) -> bool:
-    """Return whether a URL names a TCP port."""
     return url.lower().startswith("socket://")
 
 
@@ -96,11 +95,6 @@ class Port(Protocol):
 def open_port(url: str, baud: int) -> Port:
     """Open a port, which may take seconds where it is behind a network.
 
-    Parameters
-    ----------
-    url : a path, ``socket://host:port``, or what `serial.serial_for_url` takes.
-    baud : bit/s.
-
     Raises
     ------
     DeviceError : cannot be opened; the message says how to fix it.
@@ -109,12 +103,7 @@ def open_port(url: str, baud: int) -> Port:
 
 
 class SocketPort:
-    """A TCP bridge such as ser2net or an emulator. See `Port` for the methods.
-
-    Parameters
-    ----------
-    url : ``socket://host:port``.
-    """
+    """A TCP bridge such as ser2net or an emulator, ``socket://host:port``."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -159,13 +148,7 @@ class SocketPort:
 
 
 class SerialPort:
-    """A port that pyserial opens. See `Port` for the methods.
-
-    Parameters
-    ----------
-    url : what `serial.serial_for_url` takes.
-    baud : bit/s.
-    """
+    """A port that pyserial opens: a path, or what `serial.serial_for_url` takes."""
 
     def __init__(self, url: str, baud: int) -> None:
         serial = pyserial()
@@ -262,12 +245,7 @@ def _explain(url: str, error: Exception) -> str:
 
 
 def stable_name(url: str) -> str | None:
-    """Return the by-id path of a port that was named by a number that changes with the order of plugging.
-
-    Parameters
-    ----------
-    url : as the user gave it.
-    """
+    """Return the by-id path of a port that was named by a number that changes with the order of plugging."""
     if "://" in url or "/serial/by-" in url or not BY_ID.is_dir():
         return None
     target = os.path.realpath(url)

@@ -60,9 +60,9 @@ def _each(whole: str, row: str, part: str, unit: float = 1.0, number: str = "$^"
 
     Parameters
     ----------
-    whole : form of a line. row : of each range in it, with a group for the anchor and one for the range, empty = none.
+    row : of each range in it, with a group for the anchor and one for the range, empty = none; `unit` m.
     part : what such lines alone hold: another line that has it was one of them.
-    unit : m per unit of range. number : of the round, where the line states it.
+    number : of the round, where the line states it.
     """
     whole_form, row_form, part_form, number_form = (re.compile(form) for form in (whole, row, part, number))
 
@@ -221,11 +221,7 @@ MUCH = 50
 class UwbDriver(LineDriver):
     """A UWB tag that sends its ranges unasked. Nothing is ever sent.
 
-    Parameters
-    ----------
-    protocol : bytes to Line of Ranges or Refused.
-    title, baud, clock, unit : as for `LineDriver`.
-    tag : the tag whose ranges to take, where lines name several; "" = the first that is seen twice.
+    Of several tags in its lines `tag` counts; "" = the first that is seen twice.
     """
 
     def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = "") -> None:

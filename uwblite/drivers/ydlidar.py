@@ -40,12 +40,7 @@ _FAR = math.atan(-_OFFSET / _BASE) / (2.0 * math.pi)
 
 
 class YdLidarProtocol(PacketReader):
-    """Bytes of the lidar in, Samples, Reply and Corrupt out.
-
-    Parameters
-    ----------
-    rate : readings per second.
-    """
+    """Bytes of the lidar in, Samples, Reply and Corrupt out."""
 
     smallest = DESCRIPTOR
 
