@@ -38,12 +38,7 @@ _UNKNOWN = "1f 11 11 11 11 11 1f"
 
 
 def text_mask(text: str, scale: int = 1) -> Bools:
-    """Return the ink of a line of text (height, width); characters the font lacks become boxes.
-
-    Parameters
-    ----------
-    scale : pixels of the picture per pixel of the font.
-    """
+    """Return the ink of a line of text (height, width), so many pixels per pixel of the font; what it lacks becomes boxes."""
     ink = np.zeros((HEIGHT, max(len(text), 1) * (WIDTH + 1) - 1), dtype=np.bool_)
     for place, character in enumerate(text):
         for row, bits in enumerate(_ROWS.get(character, _UNKNOWN).split()):
@@ -106,12 +101,7 @@ _HALO = 0.85
 
 
 class Canvas:
-    """A picture to draw on; coordinates are pixels, (x, y) with y down, pixel centres at .5.
-
-    Parameters
-    ----------
-    image : (height, width, 3) uint8; drawn on in place.
-    """
+    """A picture (height, width, 3) to draw on in place; coordinates are pixels, (x, y) with y down, pixel centres at .5."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         self.image = image
@@ -131,7 +121,6 @@ class Canvas:
         self._dab(start[owner] + fraction[:, None] * way[owner], width / 2.0, colour, opacity)
 
     def polyline(self, points: Floats, width: float, colour: Colour, opacity: float = 1.0) -> None:
-        """Draw a line through points (n, 2)."""
         self.lines(np.concatenate([points[:-1], points[1:]], axis=1), width, colour, opacity)
 
     def discs(self, centres: Floats, radius: float, colour: Colour) -> None:

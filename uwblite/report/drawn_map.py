@@ -72,7 +72,6 @@ class DrawnMap:
     """(n, 2) x, y along each stretch of a path that is not to be trusted, m."""
 
     def placed(self) -> list[DrawnAnchor]:
-        """Return the anchors that have a place."""
         return [a for a in self.anchors if np.isfinite(a.position).all()]
 
     def box(self) -> Floats:
@@ -164,10 +163,6 @@ def free_sides(drawn: DrawnMap, frame: Floats, heights: Sequence[float]) -> list
     ----------
     frame : lower and upper corner of the map (2, 2), m.
     heights : of a line of text, as shares of the map's longer side; more than one where it is shown in several sizes.
-
-    Returns
-    -------
-    "right", "left", "below" or "above", the first of those that are equally good.
     """
     walls = np.zeros((0, 2)) if drawn.grid is None else drawn.grid.occupied_points()
     lines = float(np.ptp(frame, axis=0).max()) * np.asarray(heights)

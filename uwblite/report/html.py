@@ -77,12 +77,7 @@ class Heading:
 
 
 def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    grid_png : picture of the bare grid, one pixel a cell, highest y first.
-    """
+    """Return the page; `grid_png` is the picture of the bare grid, one pixel a cell, highest y first."""
     again = f"<p>{escape(_WHERE.format(heading.title))}</p><pre>{escape(heading.command)}</pre>"
     table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in heading.facts)
     sections = (

@@ -116,13 +116,7 @@ POLICY = (
 
 
 def document(title: str, body: str, style: str = "", script: str = "", head: str = POLICY) -> str:
-    """Return a page.
-
-    Parameters
-    ----------
-    title, body : markup.
-    style, script : its own, after those of all pages.
-    """
+    """Return a page from markup; style and script are its own, after those of all pages."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -75,7 +75,6 @@ class Key(NamedTuple):
 
     @property
     def wide(self) -> int:
-        """Pixels that it takes with the space before the next one."""
         return math.ceil(self.width) + _GAP + _SCALE * (WIDTH + 1) * len(self.text) + _PAD + _GAP
 
 
@@ -134,11 +133,9 @@ def draw_map(drawn: DrawnMap, *, caption: str = "", size: int = SIZE, tint: Tint
 
 
 def draw_errors(grid: OccupancyGrid, points: Floats, errors: Floats, anchors: Sequence[DrawnAnchor], caption: str) -> Image:
-    """Draw a map whose free space is coloured by the expected error of a position.
+    """Draw a map whose free space is coloured by the expected errors (m,), m, of a position at places (m, 2), m, of it.
 
-    Parameters
-    ----------
-    points, errors : (m, 2) m, (m,) m: the error at places of the free space; a cell has that of the nearest.
+    A cell has the error of the nearest place.
     """
     colours = np.zeros((*grid.log_odds.shape, 3), dtype=np.uint8)
     rows, cols = np.nonzero(grid.states() == FREE)
@@ -150,7 +147,6 @@ def draw_errors(grid: OccupancyGrid, points: Floats, errors: Floats, anchors: Se
 
 
 def side_by_side(images: Sequence[Image]) -> Image:
-    """Return pictures beside each other, the lower ones filled up below."""
     height = max(len(image) for image in images)
     fill = [((0, height - len(image)), (0, 0), (0, 0)) for image in images]
     return np.concatenate([np.pad(i, f, constant_values=FLOOR[0]) for i, f in zip(images, fill, strict=True)], axis=1)

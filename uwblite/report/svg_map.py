@@ -21,9 +21,7 @@ _BAR, _BELOW = 1 / 5, 1 / 40
 def map_svg(drawn: DrawnMap, image: str = "") -> str:
     """Return the map as SVG markup, with the style of `page`.
 
-    Parameters
-    ----------
-    image : address of the picture of the bare grid, one pixel a cell, highest y first; "" = none.
+    `image` is the address of the picture of the bare grid, one pixel a cell, highest y first; "" = none.
     """
     box = drawn.box()
     (left, _), (width, height) = box[0].tolist(), np.ptp(box, axis=0).tolist()

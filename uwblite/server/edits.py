@@ -18,7 +18,7 @@ from ..io.stored_result import StoredClosure
 MARK = "# Below this line: made by uwblite view, which writes it again. Constraints of your own belong above."
 _FORCED_SIGMA = (0.1, 0.1, 0.05)
 """m, m, rad; of a closure that was forced: its match is taken at its word."""
-PINNED_SIGMA = 0.05
+_PINNED_SIGMA = 0.05
 """m; of an anchor that was pinned."""
 _SAME = 1e-4
 """s by which stamps that were written and read again may differ."""
@@ -83,14 +83,13 @@ def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Const
     return replace(left, closures=(*left.closures, forced))
 
 
-def with_anchor(edits: Constraints, name: str, place: tuple[float, float] | None, sigma: float = PINNED_SIGMA) -> Constraints:
+def with_anchor(edits: Constraints, name: str, place: tuple[float, float] | None) -> Constraints:
     """Return the edits with an anchor pinned at a place, m, or with None no longer pinned."""
     others = tuple(a for a in edits.anchors if a.id != name)
-    return replace(edits, anchors=others if place is None else (*others, GivenAnchor(name, place, sigma)))
+    return replace(edits, anchors=others if place is None else (*others, GivenAnchor(name, place, _PINNED_SIGMA)))
 
 
 def wish_for(edits: Constraints, closure: StoredClosure) -> str:
-    """Return the edit of a closure: 'reject', 'force' or 'leave'."""
     if any(_same(c, closure) for c in edits.forbidden):
         return "reject"
     return "force" if any(_same(c, closure) for c in edits.closures) else "leave"
@@ -112,10 +111,7 @@ def _numbers(values: tuple[float, ...]) -> str:
 def remap_command(report: dict[str, Any], folder: Path, recordings: dict[str, Path], constraints: Path, out: Path) -> list[str]:
     """Return the arguments of `uwblite` that map a result's recordings again, in their order.
 
-    Parameters
-    ----------
-    folder : of the result; config.toml there holds the settings.
-    recordings : files at hand by the SHA-256 of their bytes.
+    Recordings at hand go by the SHA-256 of their bytes; config.toml in the result's folder holds the settings.
 
     Raises
     ------

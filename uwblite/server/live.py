@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import secrets
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -21,7 +20,7 @@ from ..report.svg_map import map_svg
 from .advice import SensorState, advice, silent_after
 from .pages import live_page
 from .shown_results import drawn_result, grid_png, shown_anchors, shown_head
-from .web import HTML, PNG, Response, path_of, refusal, text_response
+from .web import HTML, PNG, Page, Response
 
 _PATIENCE = 10.0
 """s of silence after which a line goes out all the same: it shows who has left, and keeps lines open in between."""
@@ -55,7 +54,6 @@ class Feed:
                 self._news.notify_all()
 
     def close(self) -> None:
-        """End all listening."""
         with self._news:
             self._closed = True
             self._news.notify_all()
@@ -75,15 +73,13 @@ class Feed:
             yield b"".join(message for _, message in news) or b": still here\n\n"
 
 
-class LivePage:
+class LivePage(Page):
     """The page's state; threads may show and serve at will."""
 
     def __init__(self, title: str) -> None:
-        self.host = ""
-        self.names: tuple[str, ...] | None = None
+        super().__init__()
         self.feed = Feed()
         self._title = title
-        self._token = secrets.token_urlsafe(24)
         self._picture: bytes | None = None
         self._maps = 0
 
@@ -97,25 +93,20 @@ class LivePage:
         self._picture = grid_png(result)
         self._maps += 1
         drawn = replace(drawn_result(result), closures=())
-        svg = map_svg(drawn if paths else replace(drawn, paths=()), f"/grid.png?{self._token[:8]}-{self._maps}")
+        svg = map_svg(drawn if paths else replace(drawn, paths=()), f"/grid.png?{self.token[:8]}-{self._maps}")
         self.feed.publish("map", shown_head(result) | {"svg": svg, "anchors": shown_anchors(result)})
 
     def show_status(self, status: Mapping[str, Any]) -> None:
         """Show the present state: summary, advice, sensors, pose, trail; see `watch_status`."""
         self.feed.publish("status", dict(status))
 
-    def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
-        """Answer a request; nothing can be changed."""
-        if refused := refusal(self, self._token, method, headers):
-            return refused
-        path = path_of(target)
+    def get(self, path: str) -> Response | None:
+        """Return the page, its events or the picture of its grid."""
         if path == "/":
-            return Response(200, HTML, live_page(self._title).encode())
+            return Response(HTML, live_page(self._title).encode())
         if path == "/events":
-            return Response(200, "text/event-stream", b"", stream=self.feed.events)
-        if path == "/grid.png" and self._picture is not None:
-            return Response(200, PNG, self._picture)
-        return text_response("there is no such page", 404)
+            return Response("text/event-stream", b"", stream=self.feed.events)
+        return Response(PNG, self._picture) if path == "/grid.png" and self._picture is not None else None
 
 
 def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rounds: str) -> dict[str, Any]:
