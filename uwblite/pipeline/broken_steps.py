@@ -251,7 +251,7 @@ class BrokenStep:
         here, there = (
             se2.transform(home, np.array([of[k] for of, k in zip(places, numbers, strict=True)]))
             for numbers in (former, later)
-        )  # fmt: skip
+        )
         shift = np.append((here - there).mean(axis=0), 0.0)
         return [shift, se2.align(there, here)] if len(here) > 1 else [shift]
 
