@@ -18,7 +18,7 @@ from ..loop_closure.chain_breaks import untied_breaks
 from ..loop_closure.closures import LoopClosureConfig
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
-from ..radio.line_of_sight import LEAST_POINTS, blocked
+from ..radio.line_of_sight import blocked
 from ..radio.range_noise import short_term_sigma
 from .facts import listed
 
@@ -90,8 +90,8 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
     most = min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES)
     typical = _typical_spread(residuals[alive], ranges.anchor[alive])
     if most < typical < NO_DISTANCES and grid is not None and np.mean(residuals[alive] < -most) < _EARLY:
-        walls = np.repeat(grid.occupied_points(), LEAST_POINTS, axis=0)
-        free = alive & ~blocked(ranges.tag_positions(estimate.graph.poses), estimate.graph.anchors[ranges.anchor], walls)
+        tags, anchors = ranges.tag_positions(estimate.graph.poses), estimate.graph.anchors[ranges.anchor]
+        free = alive & ~blocked(tags, anchors, grid.occupied_points(), least=1)
         if free.sum() > _FREE * alive.sum():
             typical = _typical_spread(residuals[free], ranges.anchor[free])
     if typical <= most:

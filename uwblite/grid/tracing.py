@@ -123,7 +123,7 @@ class Sweeps:
 
     def __post_init__(self) -> None:
         count, first, last = len(self.scans.stamps), self.first, self.last
-        if first.shape != (count, 3) or (last is not None and last.shape != first.shape):
+        if len(first) != count or (last is not None and last.shape != first.shape):
             raise DataError(f"{count} scans need as many poses, not {first.shape}")
 
     def rays(self, chosen: Ints, reach: NDArray[np.float32]) -> ScanRays:
@@ -193,13 +193,13 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
     """
     met = lost = 0
     states, g = np.pad(grid.states(), 1, constant_values=UNKNOWN), grid.geometry
-    for sweeps in recordings:
+    for sweeps in (each for each in recordings if len(each.first)):
         chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.intp))
         far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
         far[:, ::_EVERY] = reach
         readings, rays = sweeps.scans.ranges[chosen][:, ::_EVERY].reshape(-1), sweeps.rays(chosen, far)
         along = np.linspace(0.0, 1.0, int(np.ceil(reach / g.resolution)) + 1)[1:]
-        for part in np.array_split(np.arange(len(rays.origins)), max(len(chosen) // 16, 1)):
+        for part in np.array_split(np.arange(len(rays.origins)), len(chosen)):
             origins, way = rays.origins[part], rays.endpoints[part] - rays.origins[part]
             row, col = g.cell_of(origins + along[:, None, None] * way)
             inside = g.inside(row, col)

@@ -1,8 +1,6 @@
-"""A bag that is open for reading: ROS 1 or 2, one file or several, closed properly or not.
+"""A bag that is open for reading: ROS 1 (2.0) or 2 (sqlite3, MCAP 0), one file or several, closed properly or not.
 
-A message whose definition cannot be read matters only where somebody wants its topic. A recorder that was killed leaves no
-index: such a file is read record by record, and of a block that is cut off the messages that are complete count. Formats: ROS 1
-bags (2.0), MCAP (0).
+A recorder that was killed leaves no index: such a file is read record by record.
 """
 
 import bz2

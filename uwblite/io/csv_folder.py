@@ -1,9 +1,4 @@
-"""A recording as a folder of CSV files, for spreadsheets, pandas and other languages; docs/formats.md lists files and columns.
-
-Stamps in seconds, lengths in metres, angles in radians. Columns are found by the names of the header, others are skipped;
-where the header has names of its own, or is missing, they stand in this order. The quality may be missing. Files of sensors
-that were not there are not there either.
-"""
+"""A recording as a folder of CSV files, for spreadsheets and other programs; docs/formats.md lists files and columns."""
 
 import dataclasses
 import hashlib

@@ -33,7 +33,7 @@ class BreakPolicy:
     """Standard deviation of the error of such a step, m and rad."""
     turns: ClassVar[int] = 8
     """Headings from which the error of the step is sought."""
-    rounds: ClassVar[int] = 4
+    rounds: ClassVar[int] = MovePolicy.laps
     """Most solutions of a path that ranges hold; two are usual."""
     near: ClassVar[int] = 3
     """Ranges by which the time of a change may be off."""
@@ -289,7 +289,7 @@ class BrokenStep:
         here, there = (
             se2.transform(home, np.array([of[k] for of, k in zip(places, numbers, strict=True)]))
             for numbers in (former, later)
-        )  # fmt: skip
+        )
         shift = np.append((here - there).mean(axis=0), 0.0)
         return [shift, se2.align(there, here)] if len(here) > 1 else [shift]
 
