@@ -34,7 +34,6 @@ class UnclosedBag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.connections: list[Any] = []
-        self._numbers: dict[int, int] = {}
         counts, times = Counter[int](), [0]
         for number, time, _ in self._messages():
             counts[number] += 1
@@ -50,8 +49,7 @@ class UnclosedBag:
     def _add(self, number: int, topic: str, kind: str, definition: Any) -> None:
         from rosbags.interfaces import Connection
 
-        if number not in self._numbers:
-            self._numbers[number] = len(self.connections)
+        if all(connection.id != number for connection in self.connections):
             self.connections.append(Connection(number, topic, kind, definition, "", 0, None, self))  # type: ignore[arg-type]
 
     def _messages(self) -> Iterator[Message]:
