@@ -19,7 +19,7 @@ from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..odometry.wheels import TurnScale, turn_scales
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
-from .decisions import shown
+from .facts import shown
 from .moments import between_keyframes, seconds
 
 _SIGMAS = 2.5

@@ -20,10 +20,9 @@ from ..screening.units import likely_unit
 from ..sensor_log.sensors import name_and_number
 from .causes import explained
 from .certainty import check_certainty, check_other_side
-from .decisions import RULES
 from .drift_tests import check_drifts, check_turn_scales
+from .facts import check_recordings, say
 from .range_agreement import DISAGREE, check_range_agreement, check_wheels_against_lidar
-from .repairs import check_recordings, say
 from .residual_tests import check_range_scatter, check_residuals
 from .untied_parts import check_untied_parts, check_untied_recordings
 
@@ -59,7 +58,7 @@ class ResultView:
 
 
 RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
-    lambda view: say(view.task.stages.facts, RULES),
+    lambda view: say(view.task.stages.facts),
     lambda view: check_repairs(view.task),
     lambda view: check_certainty(view.estimate, view.sigma, view.task),
     lambda view: check_anchors(view.anchors),

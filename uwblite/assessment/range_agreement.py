@@ -10,7 +10,7 @@ from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 from ..sensor_log.sensors import first_place, name_and_number
-from .repairs import check_recordings, spans
+from .facts import check_recordings, spans
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:

@@ -14,12 +14,21 @@ from ..findings import DOUBT, NOTE, WARNING, WHEELS_AGAINST_LIDAR, Finding, of_s
 from ..lidar.laser_mounting import Turning
 from ..map_result import MapResult
 from ..screening.screen import screen
+from ..screening.wheel_motion import show_motion
 from ..sensor_log import LogNotes, SensorLog
 from .causes import explained
-from .lidar_figures import check_lidar, check_turning, lidar_figures, shows_turns, turning_figures
-from .odometry_figures import check_odometry, odometry_figures
-from .radio_figures import calibration_figures, check_radio, radio_figures
-from .repairs import check_recording
+from .facts import check_recording
+from .sensor_checks import (
+    calibration_figures,
+    check_lidar,
+    check_odometry,
+    check_radio,
+    check_turning,
+    lidar_figures,
+    odometry_figures,
+    radio_figures,
+    turning_figures,
+)
 
 _BROKEN = 0.001
 """Share of broken lines from which on a disk, cable or writer is bad."""
@@ -165,7 +174,7 @@ def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
         yield from check_radio(view.figures["uwb"])
     if "lidar" in view.figures:
         yield from _as_written(view, check_lidar(view.figures["lidar"]))
-        if shows_turns(view.log.scans):
+        if show_motion(view.log.scans):
             yield from check_turning(view.turning, view.turn_ratio)
 
 

@@ -19,10 +19,10 @@ from ..loop_closure.chain_breaks import untied_breaks
 from ..loop_closure.closures import LoopClosureConfig
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
-from ..radio.line_of_sight import LEAST_POINTS, blocked
+from ..radio.line_of_sight import blocked
 from ..radio.range_noise import short_term_sigma
+from .facts import listed
 from .moments import between_keyframes, seconds
-from .repairs import listed
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -91,8 +91,7 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
 
 def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Bools:
     """Return which ranges (m,) lead through an occupied cell of the map, cells as wide as those of line_of_sight or less."""
-    walls = np.repeat(grid.occupied_points(), LEAST_POINTS, axis=0)
-    return blocked(ranges.tag_positions(graph.poses), graph.anchors[ranges.anchor], walls)
+    return blocked(ranges.tag_positions(graph.poses), graph.anchors[ranges.anchor], grid.occupied_points(), least=1)
 
 
 def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:

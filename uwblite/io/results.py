@@ -12,12 +12,12 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ConfigError
 from ..map_result import MapResult
+from ..report.drawn_map import drawn_map
 from ..report.html import Heading, render
-from ..report.picture import Overlay, PictureAnchor, draw_map
+from ..report.picture import draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
 from .files import sha256_of, write_text
@@ -112,7 +112,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
             grid_png = encode_png(trinary_image(result.grid))
             if record.scale_map:
                 write_map(waiting, result.grid, name="map_scale", mode="scale")
-        write_png(waiting / "map.png", picture(result, _caption(logs, result)))
+        write_png(waiting / "map.png", draw_map(drawn_map(result), caption=_caption(logs, result)))
         ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
         write_g2o(waiting / "graph.g2o", result.graph, plain=plain)
         write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
@@ -142,15 +142,6 @@ def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
     driven = f"{sums['travelled']:.0f} m in {duration(sums['duration'])}"
     counts = f"{driven}, {len(result.anchors)} anchors, {kept} closures"
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
-
-
-def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
-    """Return the picture of the map with path, anchors and accepted closures."""
-    parts = [np.vstack([result.trajectory[result.recording == s, :2], [[np.nan, np.nan]]]) for s in np.unique(result.recording)]
-    places = result.graph.poses[:, :2]
-    closures = np.array([(*places[c.i], *places[c.j]) for c in result.closures if c.accepted]).reshape(-1, 4)
-    anchors, doubted = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors], result.doubted_paths()
-    return draw_map(result.grid, np.vstack(parts), Overlay(anchors, closures, doubted), caption=caption)
 
 
 def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:

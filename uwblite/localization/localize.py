@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..assessment.repairs import check_recording
+from ..assessment.facts import check_recording
 from ..errors import Cancelled, DataError
 from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..screening.screen import screen

@@ -33,7 +33,7 @@ class BreakPolicy:
     """Standard deviation of the error of such a step, m and rad."""
     turns: ClassVar[int] = 8
     """Headings from which the error of the step is sought."""
-    rounds: ClassVar[int] = 4
+    rounds: ClassVar[int] = MovePolicy.laps
     """Most solutions of a path that ranges hold; two are usual."""
     near: ClassVar[int] = 3
     """Ranges by which the time of a change may be off."""

@@ -35,25 +35,21 @@ class BootstrapConfig:
     """Bootstrap of the first estimate."""
 
     seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
-    """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
     starts: ClassVar[int] = 5
-    """Most places of a first stretch of one length."""
+    """Travelled distances of the first stretch, m, tried at so many places in this order until the anchors in it are clear;
+    then all of the path."""
     clear_enough: ClassVar[float] = 0.35
-    """A first stretch is good when its anchors (up to `seen`) have this mean score; 1 = placed without error, 0 = unclear."""
     seen: ClassVar[int] = 3
-    """Anchors that constrain a pose with its heading."""
+    """Mean score of the anchors in a good first stretch, up to as many as constrain a pose; 1 = without error, 0 = unclear."""
     piece: ClassVar[float] = 0.3
-    """Distance appended at once, as a share of the first stretch; never less."""
     growth: ClassVar[tuple[float, float]] = (1.5, 0.8)
-    """Factors on the distance where the prediction held and where it did not."""
+    """Distance appended at once, as a share of the first stretch, and factors on it where the prediction held and where not."""
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
     scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, 3.0)
-    """Scales of the ranges' kernel, one after the other, standard deviations."""
     first_scales: ClassVar[tuple[float, ...]] = (10.0, 3.0)
-    """The same of the first stretch."""
+    """Scales of the ranges' kernel, one after the other, standard deviations; and those of the first stretch."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
-    """Of each scale."""
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
     drift: ClassVar[float] = 0.015
@@ -61,10 +57,10 @@ class BootstrapConfig:
     heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
     """Relative heading errors of the odometry, tried until the ranges agree: a wrong track width in the base's settings is the
     most frequent gross fault, and a factor of two its most frequent value."""
-    agreement: ClassVar[float] = 2.0
-    """Ranges agree when their median error is below so many standard deviations."""
     enough: ClassVar[float] = 50.0
     """Travelled distance over which a heading error is tried before the whole path is, m."""
+    agreement: ClassVar[float] = 2.0
+    """Ranges agree when their median error is below so many standard deviations."""
     tear: ClassVar[float] = 1.0
     """Largest error of a step between keyframes by slip, m or rad; with a larger one a piece was appended mirrored or in the
     wrong place, even if its ranges agree well."""
@@ -143,7 +139,11 @@ class Attempt:
         torn : continue where the trajectory has a jump; no attempt with a jump agrees with the ranges later.
         """
         if self.high == 0:
-            self._begin()
+            self.piece = self.config.piece * self._seed()
+            self.first = self.low, self.high
+            self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
+            if self.placed.any():
+                self._solve(self.config.first_scales)
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
             held, failed = self.config.growth
             self.piece = held * self.piece if self._extend(self.piece) else max(failed * self.piece, self.smallest)
@@ -162,7 +162,7 @@ class Attempt:
         length, agrees = self.config.enough, True
         while agrees and not self.complete:
             self.run(length, torn=False)
-            length, agrees = 2.0 * length, self.misfit() < self.config.agreement
+            length, agrees = 2.0 * length, bool(self.placed.any()) and self.misfit() < self.config.agreement
         self._place_the_rest()
         return agrees and self.complete
 
@@ -199,14 +199,6 @@ class Attempt:
         errors = [e.residuals(part)[:, 0] * e.sigma for e in part.edges if isinstance(e, RangeEdges)]
         median = spread(errors[0]) / self.config.range_sigma if errors else 0.0
         return max(median, self.config.agreement) if self._is_torn() else median
-
-    def _begin(self) -> None:
-        """Solve the clearest stretch."""
-        self.piece = self.config.piece * self._seed()
-        self.first = self.low, self.high
-        self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
-        if self.placed.any():
-            self._solve(self.config.first_scales)
 
     def _place_the_rest(self) -> None:
         """Put the anchors that stay unclear at their likeliest places."""
@@ -301,8 +293,8 @@ class Attempt:
         up to the slip before. Anchors and calibration are fixed.
         """
         part = self._part(low, high)
-        errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
-        if not errors or float(np.median(np.abs(errors[0]))) < self.config.agreement:
+        errors = [np.abs(e.residuals(part)) for e in part.edges if isinstance(e, RangeEdges)]
+        if not errors or float(np.median(errors[0])) < self.config.agreement:
             return True
         self._anneal(low, high, end, self.config.scales)
         slips, forward = np.flatnonzero(self.slips > 0.0) + 1, end == low
@@ -316,18 +308,14 @@ class Attempt:
         return False
 
     def _with_slip(self, low: int, high: int, motion: Floats, *, forward: bool) -> None:
-        """Let the wheels slip once in [low, high), where all is much likelier then than with wheels that are bent.
-
-        Parameters
-        ----------
-        motion : (n - 1, 3) of the wheels, calibrated. forward : whether the pose at the lower end is known, not the other one.
-        """
+        """Let the wheels slip once in [low, high), where all is much likelier then than with wheels that are bent; forward: the
+        pose at the lower end is known, not the other one."""
         rows, duration = self.ranges.rows(self._rows(low, high, self.placed)), self.odometry.duration[low : high - 1]
         prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
         # Half the chi2 of a sound range is a half.
         if bent - 0.5 * len(rows) + prior < EvidencePolicy.positive:
             return
-        arm = rows.lever_arm + se2.rotate(rows.turn, np.broadcast_to(rows.tag, (len(rows), 2)))
+        arm = rows.tag_positions(np.zeros_like(self.poses))
         pose, steps, start = rows.pose - low, motion[low : high - 1], self.poses[low]
         if not forward:
             pose, steps, start = high - low - 1 - pose, se2.inverse(steps)[::-1], self.poses[high - 1]

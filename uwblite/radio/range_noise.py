@@ -180,12 +180,8 @@ def independent_shares(positions: Floats, groups: Iterable[Ints | Bools], config
 
 
 def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
-    """Return the standard deviation (m,) of each of one anchor's ranges for their common error by direction and distance.
-
-    Parameters
-    ----------
-    offsets : (m, 2) from the anchor to the tag, m.
-    """
+    """Return the standard deviation (m,) of each of one anchor's ranges for their common error by direction and distance;
+    offsets (m, 2) from the anchor to the tag, m."""
     return np.sqrt(_common_variance(_polar(offsets), config.steady, _STEADY_LENGTH, weights))
 
 

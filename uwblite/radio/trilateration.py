@@ -35,19 +35,17 @@ class TrilaterationConfig:
     ambiguity: float = setting(0.2, advanced=True)
     """An anchor is ambiguous where a second hypothesis costs less than this more: of 100 ranges, a likelihood ratio of e^10."""
     looked_at: ClassVar[int] = 200
-    """Cells of the raster, the best first, among which starts are chosen."""
     starts: ClassVar[int] = 10
-    """Cells from which descent starts."""
+    """Cells of the raster, the best first, among which so many are chosen from which descent starts."""
     apart: ClassVar[float] = 1.5
     """Cells between two starts, and the width of the first kernel."""
-    steps: ClassVar[int] = 25
-    """Most steps of descent."""
     shrinking: ClassVar[float] = 0.7
     """Factor on the kernel from step to step; in cells, the error at which a cell is no place for a range."""
     finest: ClassVar[float] = 0.05
     """m; least width of the kernel."""
+    steps: ClassVar[int] = 25
     still: ClassVar[float] = 1e-3
-    """m; a step that ends descent; also the damping, as a share of the information."""
+    """Most steps of descent, and m of one that ends it; also the damping, as a share of the information."""
 
 
 _NEAREST = 1e-9
@@ -168,15 +166,10 @@ def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
 def _refine(
     paths: Floats, ranges: Floats, starts: Floats, steps: Floats, drift: float, config: TrilaterationConfig
 ) -> tuple[Floats, Floats, Floats]:
-    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel, each with its own ranges.
+    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel, each with its own path (s, m, 2), ranges (s, m) and cell of
+    the raster (s,), m.
 
-    Parameters
-    ----------
-    paths : (s, m, 2) positions of the tag, m. ranges : (s, m) m. steps : (s,) cell of the raster of each start, m.
-
-    Returns
-    -------
-    Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
+    Returns position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
     """
     eye, state, on = np.eye(starts.shape[1]), starts.copy(), np.arange(len(starts))
     x, y = np.ascontiguousarray(paths[:, :, 0]), np.ascontiguousarray(paths[:, :, 1])
