@@ -188,12 +188,7 @@ class OpenBag:
         return tuple(topics[name] for name in sorted(topics))
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yield topic, time of recording, ns, and message of every message of some topics, in the order of recording.
-
-        Raises
-        ------
-        FormatError : the definition of such a message cannot be read.
-        """
+        """Yield topic, time of recording, ns, and message of every message of some topics, in the order of recording."""
         parts = []
         for reader in self.readers:
             wanted = [c for c in reader.connections if c.topic in topics]
@@ -265,11 +260,7 @@ def _words(error: Exception, most: int) -> str:
 
 @contextmanager
 def open_bag(path: str | os.PathLike[str]) -> Iterator[OpenBag]:
-    """Open a bag.
-
-    Parameters
-    ----------
-    path : a file of any name, told by its content, or the folder of a ROS 2 bag, with or without its metadata.yaml.
+    """Open a bag: a file of any name, told by its content, or the folder of a ROS 2 bag, with or without its metadata.yaml.
 
     Raises
     ------
