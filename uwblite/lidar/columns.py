@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, connected, dots
 from ..odometry.attached import ScanPoints
-from .surface_rays import SurfacePolicy, SurfaceRays, begins_run, range_sigma, to_circle
+from .surface_rays import ShapePolicy, SurfaceRays, begins_run, range_sigma, to_circle
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +87,8 @@ def fitted_circles(rays: ScanPoints) -> Circles:
     off = np.sqrt(mean((np.hypot(*(np.stack([x, y]) - centre.T.take(number, axis=1))) - radius.take(number)) ** 2))
     flat = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy))
     sigma = mean(range_sigma(reach))
-    good = (radius > c.radii[0]) & (radius < c.radii[1]) & (off < SurfacePolicy.scatter * sigma)
-    good &= (count * (flat - off**2) > SurfacePolicy.bend * sigma**2) & (dots(centre, origin - middle) < 0.0)
+    good = (radius > c.radii[0]) & (radius < c.radii[1]) & (off < ShapePolicy.scatter * sigma)
+    good &= (count * (flat - off**2) > ShapePolicy.bend * sigma**2) & (dots(centre, origin - middle) < 0.0)
     chosen = np.flatnonzero(good)
     keyframe = rays.keyframe[np.searchsorted(number, chosen)]
     return Circles(keyframe, (middle + centre)[chosen], radius[chosen], count[chosen].astype(np.float64))
@@ -160,7 +160,7 @@ class Surroundings:
 
 def surroundings(columns: Floats, margin: float) -> Surroundings:
     """Return the squares within a margin, m, of columns (c, 3)."""
-    size = SurfacePolicy.around
+    size = ShapePolicy.around
     if not len(columns):
         return Surroundings(columns, np.zeros(2), size, np.zeros((1, 1), dtype=bool))
     reach, wide = columns[:, 2].max() + margin, np.ptp(columns[:, :2], axis=0)
@@ -174,7 +174,7 @@ def surroundings(columns: Floats, margin: float) -> Surroundings:
 def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end near columns."""
     rows, which, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
-    return rays.rows(rows[away < columns.columns[which, 2] + SurfacePolicy.around])
+    return rays.rows(rows[away < columns.columns[which, 2] + ShapePolicy.around])
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
@@ -205,7 +205,7 @@ def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
         whole, right = _summed(own.take(rows), robust.take(rows), normal.take(rows, axis=0), residual, len(columns))
         columns = columns + np.linalg.solve(whole + np.eye(columns.shape[1]), right[:, :, None])[:, :, 0]
         columns[:, 2] = np.clip(columns[:, 2], *c.radii)
-    ended = (incidence < -c.incidence) & (np.abs(shift) < SurfacePolicy.around)
+    ended = (incidence < -c.incidence) & (np.abs(shift) < ShapePolicy.around)
     count, around, probable = (
         np.bincount(own, flags, len(columns)) for flags in (near, ended, near & (np.abs(shift) < c.probable * sigma))
     )

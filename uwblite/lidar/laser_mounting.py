@@ -142,7 +142,7 @@ def _differences(turn: Floats, sharp: Floats, wheels: Floats, sign: float) -> tu
 def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints, Ints]:
     """Choose scan pairs about half a second apart between which the robot turns and hardly drives, or drives least."""
     c = TurningPolicy
-    step = max(1, round(c.apart / max(float(np.median(np.diff(scans.stamps))), np.finfo(np.float32).eps)))
+    step = max(1, round(c.apart / max(float(np.median(np.diff(scans.stamps))), float(np.finfo(np.float32).eps))))
     first = np.arange(len(scans.stamps) - step)
     second = first + step
     near = scans.stamps[second] - scans.stamps[first] < c.longest

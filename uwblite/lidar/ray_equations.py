@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, spread
-from .surface_rays import MeasuredSurfaces, RayNoise, SurfacePolicy, SurfaceRays, Surfaces, to_circle
+from .surface_rays import MeasuredSurfaces, RayNoise, ShapePolicy, SurfaceRays, Surfaces, to_circle
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def _bounded(incidence: Floats) -> Floats:
 
 
 def _information(rays: SurfaceRays, incidence: Floats) -> Floats:
-    return np.asarray(1.0 / ((rays.sigma.astype(np.float64) * incidence) ** 2 + SurfacePolicy.roughness**2))
+    return np.asarray(1.0 / ((rays.sigma.astype(np.float64) * incidence) ** 2 + ShapePolicy.roughness**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +193,7 @@ def learnt_noise(residual: Floats, place: Ints, surface: Ints, curved: Bools) ->
     surface : (m,). curved : (s,) whether a surface is a column.
     """
     c = RayPolicy
-    ratio = max(spread(residual), SurfacePolicy.quietest) if len(residual) >= c.fewest else 1.0
+    ratio = max(spread(residual), ShapePolicy.quietest) if len(residual) >= c.fewest else 1.0
     clipped = np.where(np.abs(residual) < c.clip * ratio, residual / ratio, 0.0)
     return RayNoise(ratio, _design_effects(clipped, place, surface, curved))
 
@@ -208,7 +208,7 @@ def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools)
     places = np.bincount(of, minlength=len(curved))
     # The unknowns of a wall's line or a column's circle reduce the sums.
     share = np.where(places >= RayPolicy.places, places / np.maximum(places - (2 + curved), 1), 0.0)[of]
-    found = np.full(2, SurfacePolicy.alike)
+    found = np.full(2, ShapePolicy.alike)
     for kind in range(2):
         own = (curved[of] == bool(kind)) & (share > 0.0)
         if own.any():

@@ -20,7 +20,7 @@ from ..odometry.attached import ScanPoints
 
 
 @dataclass(frozen=True, slots=True)
-class SurfacePolicy:
+class ShapePolicy:
     """Rays, and what a surface is."""
 
     noise: ClassVar[tuple[float, float]] = (0.01, 0.01)
@@ -165,20 +165,20 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     """Return rays of which it is not known yet on which surface they end."""
     way = rays.points - rays.origins
     reach = np.maximum(np.hypot(*way.T), _TINY)
-    bundle = (rays.scan * _MOST_RAYS + rays.ray) // SurfacePolicy.bundle
+    bundle = (rays.scan * _MOST_RAYS + rays.ray) // ShapePolicy.bundle
     return SurfaceRays(rays.keyframe, np.full(len(reach), -1), rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 
 def range_sigma(reach: Floats) -> Floats:
     """Return the standard deviation, m, of ranges (n,), m, by data sheets."""
-    near, share = SurfacePolicy.noise
+    near, share = ShapePolicy.noise
     return np.maximum(near, share * reach)
 
 
 def begins_run(rays: ScanPoints, apart: Bools) -> Bools:
     """Return which rays (m,) begin another run of neighbours; apart (m - 1,) are those that do not belong to the one before."""
     begins = np.ones(len(rays.ray), dtype=bool)
-    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > SurfacePolicy.missing) | apart
+    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > ShapePolicy.missing) | apart
     return begins
 
 
@@ -207,7 +207,7 @@ class RayNoise:
         return 1.0 / (self.ratio**2 * float(self.alike[int(curved)])), 1.0 / (kernel * self.ratio) ** 2
 
 
-UNLEARNT = RayNoise(1.0, np.full(2, SurfacePolicy.alike))
+UNLEARNT = RayNoise(1.0, np.full(2, ShapePolicy.alike))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

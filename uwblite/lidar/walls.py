@@ -18,7 +18,7 @@ from ..arrays import Bools, Floats, Ints, Table, connected, dots, spread, unique
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
 from .columns import surroundings
-from .surface_rays import MeasuredSurfaces, SurfacePolicy, SurfaceRays, as_rays, begins_run
+from .surface_rays import MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, begins_run
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +108,19 @@ class _Moments:
 def straight_pieces(rays: ScanPoints) -> tuple[Pieces, SurfaceRays]:
     """Return the straight pieces that rays (p,) show, and the rays on them with pieces as surfaces."""
     c, single = WallPolicy, as_rays(rays)
-    ahead, reach = single.directions, dots(rays.points - rays.origins, single.directions)
+    ahead, sigma = single.directions, single.sigma.astype(np.float64)
     begins = begins_run(rays, np.hypot(*np.diff(rays.points, axis=0).T) > c.reach)
-    moments = _Moments(rays.points, ahead, single.sigma * _noise(reach, single.sigma, begins))
+    noise = _noise(dots(rays.points - rays.origins, ahead), sigma, begins)
+    moments = _Moments(rays.points, ahead.astype(np.float64), sigma * noise)
     first, last = _straight(moments, begins)
-    centre, normal, noise = moments.lines(first, last)
+    centre, normal, across = moments.lines(first, last)
     incidence = dots(normal, ahead[(first + last) // 2])
     normal = normal * np.where(incidence > 0.0, -1.0, 1.0)[:, None]
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     begin, end = (dots(rays.points[rows] - centre, tangent) for rows in (first, last - 1))
     middle, length = centre + 0.5 * (begin + end)[:, None] * tangent, np.abs(end - begin)
     # Of a line through evenly spread points.
-    deviation = noise * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, _TINY)
+    deviation = across * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, _TINY)
     good = (np.abs(incidence) > c.incidence) & (deviation < c.vague)
     first, last = first[good], last[good]
     found = Pieces(rays.keyframe[first], middle[good], normal[good], length[good], deviation[good])
@@ -138,7 +139,7 @@ def _noise(reach: Floats, sigma: Floats, begins: Bools) -> float:
         return 1.0
     # Those of white noise have six times its variance.
     bend = np.diff(reach, 2)[inside] / (np.sqrt(6.0) * sigma[1:-1][inside])
-    return float(np.clip(spread(bend), SurfacePolicy.quietest, 1.0))
+    return float(np.clip(spread(bend), ShapePolicy.quietest, 1.0))
 
 
 def _straight(moments: _Moments, begins: Bools) -> tuple[Ints, Ints]:
@@ -151,10 +152,10 @@ def _straight(moments: _Moments, begins: Bools) -> tuple[Ints, Ints]:
         first, last = first[many], last[many]
         if not len(first):
             break
-        variance = moments.lines(first, last)[-1] ** 2 + SurfacePolicy.roughness**2
+        variance = moments.lines(first, last)[-1] ** 2 + ShapePolicy.roughness**2
         squares, (middle, of_two) = moments.squares(first, last), _best_split(moments, first, last, WallPolicy.fewest // 2)
-        good = squares < SurfacePolicy.scatter**2 * variance * (last - first - 2)
-        good &= squares - of_two < SurfacePolicy.bend * variance
+        good = squares < ShapePolicy.scatter**2 * variance * (last - first - 2)
+        good &= squares - of_two < ShapePolicy.bend * variance
         found.append(np.stack([first[good], last[good]]))
         first, middle, last = first[~good], middle[~good], last[~good]
         first, last = np.concatenate([first, middle]), np.concatenate([middle, last])
@@ -257,7 +258,7 @@ def find_walls(pieces: Pieces, poses: Floats, some: Bools) -> StraightWalls:
     number, many = lines.number, len(lines.centre)
     seen = np.bincount(unique_rows(np.stack([number, places.keyframe], axis=1))[0][:, 0], minlength=many)
     turned = _across(places.normal, lines.facing[number]) / np.hypot(places.deviation, WallPolicy.uneven)
-    good = (seen >= WallPolicy.views) & (lines.scatter < SurfacePolicy.on)
+    good = (seen >= WallPolicy.views) & (lines.scatter < ShapePolicy.on)
     good &= _rms(number, turned, many) < WallPolicy.turned
     of_piece = np.full(len(some), -1)
     of_piece[places.piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
@@ -310,7 +311,7 @@ def _on_one_line(one: Ints, other: Ints, places: Floats) -> Bools:
     lean = WallPolicy.lean + 2.0 * np.hypot(deviation.take(one), deviation.take(other))
     good = ax * bx + ay * by > np.cos(lean)
     for nx, ny in ((ax, ay), (bx, by)):
-        good &= np.abs(nx * across + ny * along) < SurfacePolicy.on
+        good &= np.abs(nx * across + ny * along) < ShapePolicy.on
     return np.asarray(good)
 
 
@@ -322,7 +323,7 @@ def _halved(number: Ints, places: _Places) -> _Lines:
     """
     c, shape = WallPolicy, (places.at, places.normal, places.deviation)
     lines = _Lines.fitted(number, *shape)
-    bent = (lines.scatter > SurfacePolicy.on) & (_rms(number, lines.along(places.at), len(lines.centre)) > c.reach)
+    bent = (lines.scatter > ShapePolicy.on) & (_rms(number, lines.along(places.at), len(lines.centre)) > c.reach)
     bent &= ~_curved(lines, places)
     for _ in range(c.splits):
         if not bent.any():
@@ -330,7 +331,7 @@ def _halved(number: Ints, places: _Places) -> _Lines:
         beyond = bent[lines.number] & (lines.along(places.at) < 0.0)
         halves, number = np.unique(2 * lines.number + beyond, return_inverse=True)
         lines = _Lines.fitted(number, *shape)
-        bent = bent[halves // 2] & (lines.scatter > SurfacePolicy.on)
+        bent = bent[halves // 2] & (lines.scatter > ShapePolicy.on)
     return lines
 
 
@@ -338,7 +339,7 @@ def _curved(lines: _Lines, places: _Places) -> Bools:
     """Return which sets of places (m,) are not straight in most of the keyframes that see them."""
     seen, own = unique_rows(np.stack([lines.number, places.keyframe], axis=1))
     alone = _Lines.fitted(own, places.at, lines.facing[lines.number], np.ones(len(own)))
-    return np.asarray(np.bincount(seen[:, 0], np.where(alone.scatter > SurfacePolicy.on, 1.0, -1.0)) > 0.0)
+    return np.asarray(np.bincount(seen[:, 0], np.where(alone.scatter > ShapePolicy.on, 1.0, -1.0)) > 0.0)
 
 
 def _rms(number: Ints, values: Floats, many: int) -> Floats:
@@ -355,7 +356,7 @@ def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArr
     """Return the kind of each of the clouds' points (p,), whose frames are (k, 3) in the map: 0 on a wall where rays showed
     it, 1 on a column, -1 on neither."""
     surfaces, kind = found.surfaces, np.full(len(clouds.points), -1, dtype=np.int8)
-    shown, on = _shown_walls(found, sensors), SurfacePolicy.on
+    shown, on = _shown_walls(found, sensors), ShapePolicy.on
     columns = surfaces.rows(surfaces.round)
     near = surroundings(np.column_stack([columns.place, columns.radius]), on)
     for first in range(0, len(kind), _POINTS_AT_ONCE):
@@ -368,7 +369,7 @@ def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArr
 
 def _shown_walls(found: MeasuredSurfaces, sensors: Floats) -> cKDTree:
     """Return the middles of the cells of walls in which rays end."""
-    surfaces, rays, size = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface]), SurfacePolicy.on
+    surfaces, rays, size = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface]), ShapePolicy.on
     way, wall = surfaces.tangent, rays.surface.astype(np.intp)
     along = dots(rays.in_map(sensors)[0] - surfaces.place.take(wall, axis=0), way.take(wall, axis=0))
     wall, cell = unique_rows(np.column_stack([wall, np.floor(along / size).astype(np.intp)]))[0].T
