@@ -118,10 +118,7 @@ def _claim_cells(
     cells: NDArray[np.signedinteger], base: Ints, stride: Ints, number: NDArray[np.signedinteger],
     offsets: list[tuple[int, int]],
 ) -> None:
-    """Write the numbers of points into the cells at offsets from their own, base; later offsets overwrite earlier ones.
-
-    Of points in one cell, the last one counts in every cell.
-    """
+    """Write the numbers of points into the cells at offsets from their own, base; later offsets overwrite earlier ones."""
     cells[base] = number
     last = cells[base] == number
     base, stride, number = base[last], stride[last], number[last]

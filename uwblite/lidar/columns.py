@@ -24,8 +24,6 @@ class ColumnPolicy:
     """m, difference of neighbouring ranges that ends a run of rays, beside two standard deviations of them."""
     fewest: ClassVar[int] = 10
     """Least number of rays of a run that shows a curvature."""
-    apart: ClassVar[float] = 0.12
-    """m between centres, and of radii, up to which two circles may be one column."""
     views: ClassVar[int] = 3
     """Least number of keyframes that see a column."""
     steps: ClassVar[int] = 8
@@ -33,9 +31,7 @@ class ColumnPolicy:
     begin: ClassVar[float] = 0.15
     """Gate of the first half of the steps, m."""
     gate: ClassVar[float] = 4.0
-    """Gate of the other steps, standard deviations of the rays, beside the slack."""
-    slack: ClassVar[float] = 0.02
-    """m."""
+    """Gate of the other steps, standard deviations of the rays, beside what surfaces are uneven."""
     incidence: ClassVar[float] = 0.4
     """Least cosine between a ray and the normal; others hit the edge of a column, where readings are unreliable."""
     share: ClassVar[float] = 0.6
@@ -108,8 +104,9 @@ def _short_runs(rays: ScanPoints) -> tuple[ScanPoints, Ints, Floats]:
 def join_circles(found: Circles, poses: Floats) -> Floats:
     """Return the columns (n, 3), x, y, radius in the map, that circles of several keyframes at poses (k, 3) show."""
     c, at = ColumnPolicy, se2.transform(poses[found.keyframe], found.centre)
-    one, other = cKDTree(at).query_pairs(c.apart, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
-    alike = np.abs(found.radius[one] - found.radius[other]) < c.apart
+    apart = 2.0 * ShapePolicy.on
+    one, other = cKDTree(at).query_pairs(apart, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.intp)
+    alike = np.abs(found.radius[one] - found.radius[other]) < apart
     number = connected(one[alike], other[alike], len(at))
     views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.intp))
     weight = np.bincount(number, found.rays).astype(np.float64)
@@ -184,7 +181,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     c, (at, direction) = ColumnPolicy, rays.in_map(poses)
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
-    good = (incidence < -c.incidence) & (np.abs(shift) < c.gate * rays.sigma + c.slack)
+    good = (incidence < -c.incidence) & (np.abs(shift) < c.gate * rays.sigma + ShapePolicy.uneven)
     return replace(rays, surface=nearest + first).rows(good)
 
 
@@ -197,7 +194,7 @@ def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
     for turn in range(c.steps):
         centre, radius = columns[:, :2].take(own, axis=0), columns[:, 2].take(own)
         shift, normal, incidence = to_circle(at - centre, direction, radius)
-        gate = c.begin if 2 * turn < c.steps else c.gate * sigma + c.slack
+        gate = c.begin if 2 * turn < c.steps else c.gate * sigma + ShapePolicy.uneven
         near = (incidence < -c.incidence) & (np.abs(shift) < gate)
         robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
         rows = np.flatnonzero(robust)

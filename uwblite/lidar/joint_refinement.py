@@ -244,10 +244,7 @@ def measured_again(
 
 
 def _surfaces_moved(factors: PairFactors, change: Floats) -> float:
-    """Return how far changes (e, 3) of relative poses move matched points off their lines, root mean square, m.
-
-    In directions that the scans do not measure, poses may creep from round to round; that does not change the matches.
-    """
+    """Return how far changes (e, 3) of relative poses move matched points off their lines, root mean square, m."""
     change = np.column_stack([change[:, :2], se2.wrap_angle(change[:, 2])])
     squared = np.einsum("ei,eij,ej->", change, factors.hessian, change, optimize=True)
     return float(np.sqrt(max(squared, 0.0) / max(factors.weight.sum(), 1.0)))

@@ -173,11 +173,7 @@ def _laser_shift(log: SensorLog, scans: LaserScans, first: Ints, second: Ints) -
 
 
 def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -> tuple[Floats, Floats]:
-    """Return the turn (p,) between scans by the shift of beams that matches best, rad, and how clear it is (0..1).
-
-    The first scan is seen from where the laser moved (p, 2), so that only the turn is left; the mean absolute
-    difference of clipped ranges is taken over all turns.
-    """
+    """Return the turn (p,) between scans by the shift of beams that matches best, rad, and how clear it is (0..1)."""
     c = TurningPolicy
     every, reach = max(1, scans.ranges.shape[1] // c.beams), min(scans.range_max, c.reach)
     angles = scans.angles[::every]

@@ -22,7 +22,7 @@ from ..arrays import Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
-from .visibility import free_space, in_free_space, nearest_by_bearing
+from .visibility import free_ranges, in_free_space, nearest_by_bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +81,7 @@ class ObjectLikelihood:
     @classmethod
     def of(cls, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
         """Return that of a raster's clouds, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
-        nearest = nearest_by_bearing(raster.clouds)
-        free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
+        free = free_ranges(nearest_by_bearing(raster.clouds))
         return cls(raster, sigma, matched_by_chance(raster, pairs, poses), free, *objects(raster.clouds, ObjectPolicy.gap))
 
     @property

@@ -21,7 +21,7 @@ from ..odometry.slips import FalseMotions
 from . import correlative_matching
 from .correlative_matching import CorrelativeConfig
 from .object_likelihood import ObjectLikelihood
-from .scan_matching import CloudPairs, PairFactors, PairPolicy, limited, measured_part, nondegenerate_step
+from .scan_matching import SINGULAR, CloudPairs, PairFactors, PairPolicy, limited, measured_part, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +69,8 @@ class Prior(Table):
 
     @classmethod
     def about(cls, mean: Floats, sound: Floats, slip: Floats, loss: Floats) -> "Prior":
-        """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3).
-
-        Parameters
-        ----------
-        slip, loss : (e, 3) standard deviations of what is not counted while wheels slip or messages are lost, m, m, rad.
-        """
+        """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3), and standard deviations (e, 3) of what
+        they do not count while they slip, or messages are lost, m, m, rad."""
         return cls(*(Gaussian(mean, sound + more[:, :, None] ** 2 * np.eye(3)) for more in (np.zeros_like(slip), slip, loss)))
 
 
@@ -110,8 +106,8 @@ class Placed(Table):
     def log_prior(self, prior: Gaussian) -> Floats:
         """Return the log of a prior's density (e,), summed over the poses that the matches leave open."""
         off = _difference(self.pose, prior.mean)
-        volume = np.linalg.slogdet(np.eye(3) + prior.covariance @ self.information)[1]
-        return np.asarray(-0.5 * (np.einsum("ei,ei->e", off, _solved(prior.covariance, off)) + volume))
+        squared = np.einsum("ei,ei->e", off, _solved(prior.covariance, off))
+        return np.asarray(-0.5 * (squared + _volume(prior, self.information)))
 
     def evidence(self, prior: Gaussian) -> Floats:
         """Return the log marginal likelihood (e,) of the sources under a prior, by Laplace."""
@@ -124,18 +120,14 @@ class Placed(Table):
         return concatenated([self, others]).rows(which)
 
     def measured(self, variance: float) -> tuple[Floats, Floats]:
-        """Return what the matches alone measure, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
+        """Return what the matches alone, with a variance, m^2, measure: T_i_j (e, 3), and the roots (e, 3, 3) of information.
 
         A direction whose own optimum lies beyond what holds for linear surfaces was not measured: the prior placed it.
-
-        Parameters
-        ----------
-        variance : of a match, m^2.
         """
         step, root = nondegenerate_step(self.factors)
         along = np.einsum("eij,ej->ei", root, step)
         root = np.where((np.abs(along) <= RegistrationConfig.linear * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
-        z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=1e-9), root, step)
+        z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=SINGULAR), root, step)
         z[:, 2] = se2.wrap_angle(z[:, 2])
         return z, np.asarray(root @ se2.rotation(z[:, 2]) / np.sqrt(variance))
 
@@ -178,12 +170,7 @@ class Placement:
         return self.candidates.rows(which), evidence[which]
 
     def log_odds(self, more: Floats | float = 0.0) -> Floats:
-        """Return the log of the evidence (e,) for a slip by that against it; 0 where the clouds say nothing.
-
-        Parameters
-        ----------
-        more : (e,) what adds to the evidence of a slip over each.
-        """
+        """Return the log of the evidence (e,), with more (e,), for a slip by that against it; 0 where clouds say nothing."""
         sound, slipped = (self.likeliest(part)[1] for part in (self.prior.sound, self.prior.slipped))
         odds = of_fallible(self.bound, RegistrationConfig.useless)
         odds[self.searched] = odds_by_views(sound[None], (slipped + more)[None])[self.searched]
@@ -202,12 +189,8 @@ class Placement:
         return motions
 
     def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
-        """Return the likelier place (e) of each pair, sound or slipped, with its covariance (e, 3, 3) and probability (e,).
-
-        Parameters
-        ----------
-        slips : probability of a slip beforehand.
-        """
+        """Return the likelier place (e) of each pair, sound or slipped with a probability beforehand, its covariance (e, 3, 3)
+        and probability (e,)."""
         useless = RegistrationConfig.useless
         (sound, usual), (slipped, wide) = (self.likeliest(part) for part in (self.prior.sound, self.prior.slipped))
         of_sound, of_slip = np.log1p(-slips) + usual, np.log(slips) + wide
@@ -223,12 +206,7 @@ class Placement:
 
 
 def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: Floats) -> Placement:
-    """Place the sources of pairs (e,) in their targets.
-
-    Parameters
-    ----------
-    other : (e, 3) further poses to start from.
-    """
+    """Place the sources of pairs (e,) in their targets, from the prior's mean and other poses (e, 3)."""
     c = RegistrationConfig
     sound = descend(objects, pairs, prior.sound.mean, prior.sound)
     bound = np.where(sound.factors.asked > 0, _most_odds(sound, prior), 0.0)
@@ -243,12 +221,8 @@ def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: 
 
 
 def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, expected: FalseMotions) -> Placement:
-    """Return a placement with what their neighbours show of the wheels' false motions in the prior of slips, and places there.
-
-    Parameters
-    ----------
-    pairs : see register. found : of these. expected : see FalseMotions.by_neighbours.
-    """
+    """Return a placement of pairs with what neighbours tell of false motions, see FalseMotions.by_neighbours, in the prior of
+    slips, and places there."""
     rows, slipped = found.searched, found.prior.slipped
     sigma = np.sqrt(np.einsum("eii->ei", slipped.covariance[rows]))
     spread = np.linalg.inv(expected.matrix[rows])
@@ -288,7 +262,7 @@ def _most_odds(placed: Placed, prior: Prior) -> Floats:
     """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
     off = _difference(placed.pose, prior.sound.mean)
     lost = placed.most - placed.likelihood + 0.5 * np.einsum("ei,ei->e", off, _solved(prior.sound.covariance, off))
-    here, there = (np.linalg.slogdet(np.eye(3) + p.covariance @ placed.information)[1] for p in (prior.sound, prior.slipped))
+    here, there = (_volume(part, placed.information) for part in (prior.sound, prior.slipped))
     return np.asarray(lost + 0.5 * (here - there))
 
 
@@ -313,20 +287,14 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:
-    """Return the log odds (e,) by evidence that is the other way round with a probability.
-
-    Where people crowd about the robot, one pair of clouds can favour a false place by any factor: the model of the surfaces is
-    wrong there, and only several pairs in a row tell.
-    """
+    """Return the log odds (e,) by evidence that is the other way round with a probability, as where people crowd about."""
     favoured = expit(log_odds)
     return np.asarray(logit((1.0 - wrong) * favoured + wrong * (1.0 - favoured)))
 
 
 def odds_by_views(here: Floats, there: Floats) -> Floats:
-    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views.
-
-    A view may show nothing of either, and favour the false one.
-    """
+    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views, each
+    of which may show nothing of either, and favour the false one."""
     none = np.log(RegistrationConfig.useless)
     each = np.logaddexp(there, none) - np.logaddexp(here, none)
     # They see the same surfaces: together they say no more of these than the one that sees most.
@@ -338,6 +306,11 @@ def _difference(pose: Floats, mean: Floats) -> Floats:
     off = pose - mean
     off[:, 2] = se2.wrap_angle(off[:, 2])
     return off
+
+
+def _volume(prior: Gaussian, information: Floats) -> Floats:
+    """Return the log (e,) of a prior's volume by that with further information (e, 3, 3)."""
+    return np.asarray(np.linalg.slogdet(np.eye(information.shape[-1]) + prior.covariance @ information)[1])
 
 
 def _solved(matrix: Floats, vector: Floats) -> Floats:

@@ -58,7 +58,9 @@ _AT_ONCE = 1 << 14
 _PAIRS_AT_ONCE = 1 << 12
 """Pairs whose points are listed at once; a bound on the memory."""
 _TINY = float(np.finfo(np.float32).tiny)
-_FLOOR = 1e-9 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+SINGULAR = 1e-9
+"""Share of the largest information below which a direction has none."""
+_FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 """N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
 and y, whatever the frame."""
 
@@ -257,10 +259,8 @@ def _inverse(lower: Floats) -> Floats:
 
 
 def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added.
-
-    A direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m.
-    """
+    """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added: a
+    direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m."""
     basis, inverse, values = _relative_eigen(information, spurious)
     kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _TINY), 0.0)
     share = (basis * kept[..., None, :]) @ inverse
@@ -282,8 +282,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
 
     Parameters
     ----------
-    T_i_j : (e, 3) poses about which the factors were made.
-    variance : (e,) m^2, variance of one match.
+    T_i_j : (e, 3) poses about which the factors were made. variance : (e,) m^2, of one match.
 
     Returns
     -------

@@ -87,12 +87,7 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
 
 
 def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScans, mounting: SensorMounting) -> CloudPairs:
-    """Return pairs with the points that the first scan looks at, not from much farther than it sees; all where few are left.
-
-    Parameters
-    ----------
-    motion : (e, 3) T_first_second.
-    """
+    """Return pairs with the points that the first scan looks at, not from much farther than it sees; all where few are left."""
     points, T_laser_base = built.points.astype(np.float64), se2.inverse(mounting.T_base_laser)
     away = np.split(np.hypot(*se2.transform(T_laser_base, points).T), built.offsets[1:-1])
     reach = np.array([np.quantile(own, ScanStepPolicy.well_seen) if len(own) else 0.0 for own in away])

@@ -1,9 +1,8 @@
 """Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
 Neighbouring clouds are aligned from the odometry's guess, all at once; that shows the calibration and the noise of the wheels.
-Each step is registered with the possibility that the wheels slipped, and where few points match, that a message of the odometry
-was lost. A slip lasts: the evidence of all steps together decides (see slips). A lost message shows in clouds before it, too.
-Where the wheels slipped, their edges get the uncertainty of that, and the step is the one that the clouds show.
+Each step is registered with the possibility that the wheels slipped or a message of the odometry was lost. A slip lasts: the
+evidence of all steps together decides (see slips).
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +32,7 @@ from .registration import (
     search,
     with_neighbours,
 )
-from .scan_matching import CloudPairs, PairPolicy, align_pairs, match, measured, pairs_of
+from .scan_matching import SINGULAR, CloudPairs, PairPolicy, align_pairs, match, measured, pairs_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +96,7 @@ class Steps:
 
 
 def match_plainly(raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> Steps:
-    """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3).
-
-    Parameters
-    ----------
-    gate : reach of the raster, m.
-    """
+    """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3), within a gate, m."""
     aligned = align_pairs(raster, pairs_of(raster.clouds, i, i + 1), guess, gate, min(PairPolicy.gate, gate))
     return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= PairPolicy.fewest)
 
@@ -140,7 +134,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     found = with_neighbours(objects, pairs, found, expected)
     # Where neighbours share few points, or a slip is possible, clouds some steps before say where they lie.
     doubtful = steps.enough & (~good | (chain.probability > RegistrationConfig.doubtful))
-    rest = np.clip(logit(np.clip(chain.probability, 1e-9, 1.0 - 1e-9)) - log_odds, -np.inf, 0.0)
+    rest = np.clip(logit(np.clip(chain.probability, SINGULAR, 1.0 - SINGULAR)) - log_odds, -np.inf, 0.0)
     found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
     log_odds[doubtful] = choice.log_odds
     slips = posterior(log_odds + by_ranges, wheels.duration).probability
@@ -165,12 +159,12 @@ def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph)
     """Return over which steps (e,) of the odometry measured edges contradict it, in the directions that these measure."""
     own = np.searchsorted(wheels.i, edges.i)
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
-    covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    covariance = np.linalg.pinv(information, rcond=SINGULAR, hermitian=True)
     onto, turn = covariance @ information, se2.rotation(edges.T_i_j[:, 2])
     off = np.einsum("eij,ej->ei", onto, se2.between(edges.T_i_j, wheels.corrected(graph)[own]))
     by_wheels = np.swapaxes(turn, 1, 2) @ covariance_of(wheels, graph)[own] @ turn
     joint = onto @ by_wheels @ np.swapaxes(onto, 1, 2) + covariance
-    squared = np.einsum("ei,eij,ej->e", off, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), off)
+    squared = np.einsum("ei,eij,ej->e", off, np.linalg.pinv(joint, rcond=SINGULAR, hermitian=True), off)
     # Single steps also hold the errors that telescope, which the wheels' noise leaves out.
     usual = max(float(np.median(squared)) / TrackingConfig.median, 1.0) if len(squared) else 1.0
     contradicted = np.zeros(len(wheels), dtype=bool)
@@ -203,15 +197,7 @@ class _Choice:
 def _decided(
     objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, near: Floats, rows: Ints, slips: Floats
 ) -> tuple[Placement, _Choice]:
-    """Return candidates, with those of doubtful steps (r,) completed, and the likeliest of all steps (e,).
-
-    One pair of clouds does not tell. The best of many places fits some surface by chance, and then in all pairs: so each pair
-    must outweigh the prior by itself, and counts as far as one can be trusted.
-
-    Parameters
-    ----------
-    near : (e, 3) where plain matching ended. slips : (e,) log odds of slips without the clouds of a step.
-    """
+    """Return candidates, with those of doubtful steps (r,) completed, and the likeliest of all steps (e,)."""
     parts = found.prior.sound, found.prior.slipped, found.prior.lost
     found = found.followed_by(rows, descend(objects, pairs.rows(rows), near[rows], parts[-1].rows(rows)))
     chain, choice, log_odds = found.sound.pose.copy(), np.arange(len(near)), np.zeros(len(rows))
@@ -238,12 +224,7 @@ def _decided(
 
 
 def _seen(objects: ObjectLikelihood, pairs: CloudPairs, chain: Floats, tied: Bools, row: int, poses: Floats) -> Floats:
-    """Return the log likelihood (v, n) of the cloud at the end of a step, which is one of poses (n, 3), in those before it.
-
-    Parameters
-    ----------
-    chain, tied : (e, 3), (e,) the steps, and whether the place of each is known.
-    """
+    """Return the log likelihood (v, n) of the cloud at the end of a step, which is one of poses (n, 3), in those before it."""
     at, placed = [], poses
     for back in range(min(TrackingConfig.views, row + 1)):
         if pairs.i[row - back] != pairs.i[row] - back or (back and not tied[row - back]):
@@ -259,7 +240,7 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
     """Return the error (e,) that the odometry may cause in points of the next cloud, 3 sigma, m."""
     sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
     reach = np.hypot(clouds.points[:, 0], clouds.points[:, 1])
-    arm = float(np.quantile(reach, 0.75)) if len(reach) else 0.0
+    arm = float(np.quantile(reach, PairPolicy.good_share)) if len(reach) else 0.0
     return 3.0 * (sigma[:, 0] + sigma[:, 2] * arm)
 
 

@@ -38,6 +38,8 @@ class ShapePolicy:
     """Largest rms distance of rays from their surface, relative to their noise."""
     on: ClassVar[float] = 0.06
     """Distance from a surface up to which a place is on it, m."""
+    uneven: ClassVar[float] = 0.02
+    """Standard deviation of surfaces beside the noise of rays, m and rad: by the poses, and because walls are not straight."""
     quietest: ClassVar[float] = 0.1
     """Least noise of rays, as a share of that by data sheets."""
     around: ClassVar[float] = 0.3

@@ -1,9 +1,8 @@
 """Visibility between clouds: free space of one, and surfaces of others that stand in it.
 
-Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud contradicts a
-hypothetical pose where it lies well in front of this surface; a point behind the surface was hidden and gives no information.
-If the relative pose of two clouds is right, hardly any surface of the one stands in the other's free space; people, glass and
-doors cause a few per cent. If it is wrong, half of the surfaces do.
+Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud well in front
+of it contradicts their relative pose; one behind it was hidden. If the pose is right, people, glass and doors cause a few per
+cent of such points; if it is wrong, half of the surfaces do.
 """
 
 from collections.abc import Sequence
@@ -53,21 +52,24 @@ class FreeSpace:
     """(v, b) m, distance up to which each of b equal parts of the circle was free, from -pi on; 0 where nothing is known."""
 
 
-def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
-    """Make the free space of v places.
-
-    Parameters
-    ----------
-    poses : (v, 3) T_cloud_base of each; m, m, rad.
-    nearest : (v, b) m, distance of the nearest surface in each part of the circle, from -pi on; inf = none was seen, so that
-        nothing is known: dark and oblique walls return nothing. A bearing is free only as far as its neighbours on either
-        side, so that a ray that grazes a wall or an edge does not contradict it.
-    """
+def free_ranges(nearest: Floats) -> Floats:
+    """Return the ranges of FreeSpace (v, b) by those to the nearest surface, see free_space."""
     reach = np.where(np.isfinite(nearest), nearest, 0.0)
     free = reach.copy()
     free[:, 1:] = np.minimum(free[:, 1:], reach[:, :-1])
     free[:, :-1] = np.minimum(free[:, :-1], reach[:, 1:])
-    return FreeSpace(poses, free)
+    return free
+
+
+def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
+    """Make the free space of v places; a bearing is free only as far as its neighbours, because rays graze walls and edges.
+
+    Parameters
+    ----------
+    poses : (v, 3) T_cloud_base of each; m, m, rad.
+    nearest : (v, b) m, distance of the nearest surface in each part of the circle, from -pi on; inf = nothing is known.
+    """
+    return FreeSpace(poses, free_ranges(nearest))
 
 
 def nearest_by_bearing(clouds: Clouds) -> Floats:
@@ -115,10 +117,7 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float = VisibilityPolic
 
 
 def contradiction(free: FreeSpace, points: Floats, margin: float = VisibilityPolicy.margin) -> tuple[float, float]:
-    """Return the share of points (m, 2) in view that lie in observed free space, and the share that was in view, 0..1.
-
-    The first is 0 where none was in view; see seen_beyond.
-    """
+    """Return the share of points (m, 2) in view that lie in observed free space, and the share that was in view, 0..1."""
     if len(points) == 0 or len(free.poses) == 0:
         return 0.0, 0.0
     through, in_view = seen_beyond(free, points, margin)
@@ -142,10 +141,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
 
 
 def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
-    """Return sub-maps without dynamic points: those in the free space of most of their own keyframes with a view of them.
-
-    People who walk beside the robot leave trails in a sub-map that no other sub-map shows.
-    """
+    """Return sub-maps without dynamic points: those in the free space of most of their own keyframes with a view of them."""
     counts = [seen_beyond(own, submaps.clouds.cloud(k)[0]) for k, own in enumerate(free)]
     kept = [2 * through <= in_view for through, in_view in counts]
     return replace(submaps, clouds=submaps.clouds.only(np.concatenate([np.zeros(0, dtype=bool), *kept])))
@@ -167,13 +163,11 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
 def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
     """Return the share of a sub-map in the next one's free space, which only people, glass and drift can cause.
 
+    One pair in ten of sub-maps driven one after the other exceeds it, 0..1; 0 where there is no such pair.
+
     Parameters
     ----------
     free : see observed_free_space. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
-
-    Returns
-    -------
-    The share that one pair in ten of sub-maps driven one after the other exceeds, 0..1; 0 where there is no such pair.
     """
     reference = submaps.reference
     pairs = np.flatnonzero(np.diff(recording[reference]) == 0)
@@ -187,17 +181,12 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
 
 
 def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
-    """Return the share of points of one visit that stand in the free space of another visit to the same place.
+    """Return the share, 0..1, of points of one visit that stand in the free space of another visit to the same place, of those
+    that it could see, and the number of different keyframes on the smaller side of the comparisons, earlier or later.
 
     Parameters
     ----------
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. recording : (k,) recording.
-
-    Returns
-    -------
-    share : of the points that the other visit could see, 0..1.
-    visits : different keyframes on the smaller side of the comparisons, earlier or later. One keyframe that is compared with
-        many contributes one person in its view to all comparisons.
     """
     i, j = _revisits(poses, path, recording)
     free = free_around(clouds)

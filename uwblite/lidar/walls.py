@@ -44,9 +44,6 @@ class WallPolicy:
     stem or a corner does, turns with the view."""
     views: ClassVar[int] = 4
     """Least number of keyframes that see a wall."""
-    uneven: ClassVar[float] = 0.02
-    """Standard deviation of pieces about the wall beside the noise of rays, m and rad: by the poses, and because walls are not
-    straight."""
 
 
 _TINY = 1e-9
@@ -228,7 +225,7 @@ class _Lines:
     @classmethod
     def fitted(cls, number: Ints, at: Floats, normal: Floats, deviation: Floats) -> "_Lines":
         """Return those that fit best where places are and, by their deviations, how they are turned."""
-        many, off = int(number.max(initial=-1)) + 1, WallPolicy.uneven
+        many, off = int(number.max(initial=-1)) + 1, ShapePolicy.uneven
         weight = 1.0 / (deviation**2 + off**2)
 
         def mean(values: Floats, weight: Floats) -> Floats:
@@ -257,7 +254,7 @@ def find_walls(pieces: Pieces, poses: Floats, some: Bools) -> StraightWalls:
     lines = _halved(np.unique(_joined(places, len(some)), return_inverse=True)[1], places)
     number, many = lines.number, len(lines.centre)
     seen = np.bincount(unique_rows(np.stack([number, places.keyframe], axis=1))[0][:, 0], minlength=many)
-    turned = _across(places.normal, lines.facing[number]) / np.hypot(places.deviation, WallPolicy.uneven)
+    turned = _across(places.normal, lines.facing[number]) / np.hypot(places.deviation, ShapePolicy.uneven)
     good = (seen >= WallPolicy.views) & (lines.scatter < ShapePolicy.on)
     good &= _rms(number, turned, many) < WallPolicy.turned
     of_piece = np.full(len(some), -1)

@@ -7,8 +7,8 @@ resulting relative poses, so that later stages start from there; the rays are us
 
 The weight of a ray is learnt from its residuals (lidar/ray_equations.py). Where rays are nearly independent, pairs add nothing
 on walls, and their points there get hardly any weight; where walls bend, all rays of one place get the weight of a few, and
-pairs keep their weight. On columns they get hardly any: lines through points of a column lie inside it, to the side from which it is
-seen.
+pairs keep their weight. On columns they get hardly any: lines through points of a column lie inside it, to the side from which
+it is seen.
 """
 
 from collections.abc import Callable, Iterator
