@@ -1,7 +1,4 @@
-"""A raster for every cloud in which each cell names the nearest point.
-
-Looking up a million points is a handful of array operations and no tree.
-"""
+"""A raster for every cloud in which each cell names the nearest point: a look-up of a million points needs no tree."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,11 +22,7 @@ NOBODY = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudRasters:
-    """A raster for every cloud: which of its points is nearest to each cell around it.
-
-    Most of the box around a cloud is far from any of its points. Columns of cells are cut into runs, and only runs that name a
-    point are kept.
-    """
+    """Rasters: columns of cells are cut into runs, and only runs that name a point are kept; most cells are far from any."""
 
     clouds: Clouds
     cell: float
@@ -67,12 +60,8 @@ class ScanClouds:
 
 
 def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
-    """Build the rasters: each point with a normal writes its number into the cells within reach, nearest cells last.
-
-    Parameters
-    ----------
-    cell, reach : cell size and distance up to which a point is a neighbour, m.
-    """
+    """Build rasters with cells of a size, m: each point with a normal writes its number into those within reach, m, the nearest
+    last."""
     low, high = _boxes(clouds)
     filled = np.isfinite(low[:, :1])
     margin = reach + cell
@@ -165,10 +154,8 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.s
 
 
 def surface_field(raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
-    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell (x, y) of cloud 0's raster.
-
-    d is the distance from the cell's centre to the point that the raster names; 0 where it names none.
-    """
+    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell (x, y) of cloud 0's raster, at
+    the distance d from its point; 0 where it names none."""
     clouds, nearest = raster.clouds, raster.cells(0).astype(np.intp)
     cells = np.argwhere(nearest >= 0)
     own = nearest[tuple(cells.T)]

@@ -1,7 +1,6 @@
 """Lidar clouds of all keyframes as one array: averaged in small cells, with normals that face the laser.
 
-One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes. Single precision,
-a few micrometres at the reach of a lidar, and coordinates in one piece each: hours of clouds fit into memory.
+Single precision is a few micrometres at the reach of a lidar; hours of clouds fit into memory.
 """
 
 from collections.abc import Sequence
@@ -98,12 +97,8 @@ class Clouds:
 
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
-    """Average rays in cells, drop lone points, estimate normals and order each cloud by bearing.
-
-    Parameters
-    ----------
-    rays : points of all keyframes of a block, numbered from 0. keyframes : k, number of keyframes.
-    """
+    """Average rays of k keyframes, numbered from 0, in cells, drop lone points, estimate normals and order each cloud by
+    bearing."""
     rays = filled(rays)
     cell = cell_number(rays.keyframe, rays.points, config.voxel)
     one, mean = mean_by_key(cell, np.concatenate([rays.points, rays.origins], axis=1))
@@ -184,9 +179,8 @@ def make_cloud(
 class GapPolicy:
     """Surfaces between the beams of a coarse lidar: points on the chord of two beams that hit one straight surface.
 
-    With beams a degree apart, the hits on a wall are 0.1 m apart at 6 m already, and much farther at grazing incidence: too few
-    for a line, and too far apart for a nearest point. Where three neighbouring beams hit one line, this line is taken as the
-    surface between them as well; elsewhere the space between two beams is unknown.
+    With beams a degree apart, hits on a wall are 0.1 m apart at 6 m already, too far for a line. Where three neighbouring beams
+    hit one line, it is taken as the surface between them; elsewhere the space between two beams is unknown.
     """
 
     spacing: ClassVar[float] = 0.1
@@ -197,8 +191,7 @@ class GapPolicy:
     widest: ClassVar[float] = 0.6
     """Wider gaps are not filled, m: they may contain niches and doors."""
     reach: ClassVar[float] = 15.0
-    """Gaps farther away are not filled, m: the memory of the tables of nearest points grows with the square of a cloud's
-    extent."""
+    """Gaps farther away are not filled, m: the memory of rasters grows with the square of a cloud's extent."""
     noise: ClassVar[float] = 0.04
     """Largest distance of the next hit from the line through two others, m."""
     bend: ClassVar[float] = 0.08

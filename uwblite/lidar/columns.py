@@ -61,10 +61,7 @@ class Circles(Table):
 
 
 def fitted_circles(rays: ScanPoints) -> Circles:
-    """Fit a circle to each run of neighbouring rays, and keep those that are curved towards the laser, as a column is.
-
-    Least squares of the algebraic distance (I. Kasa 1976): a little too small where little of the circle is seen.
-    """
+    """Fit a circle (I. Kasa 1976) to each run of neighbouring rays, and keep those curved towards the laser, as a column is."""
     rays, number, reach = _short_runs(rays)
     many, c = int(number.max(initial=-1)) + 1, ColumnPolicy
     count = np.maximum(np.bincount(number, minlength=many), 1)

@@ -69,17 +69,7 @@ class SearchResult:
 def search(
     target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig | None = None
 ) -> SearchResult:
-    """Score every pose of a grid around a guess and return the best few.
-
-    Parameters
-    ----------
-    target, source : one cloud each, in its own frame.
-    T_target_source : (3,) centre of the grid; m, m, rad.
-
-    Returns
-    -------
-    SearchResult; without candidates where nothing fits at all.
-    """
+    """Score every pose of a grid around a guess (3,) of one cloud in another, and return the best few; none where none fits."""
     config = config or CorrelativeConfig()
     scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
     turn, row, column = found = _peaks(scores, config).T
@@ -91,14 +81,7 @@ def search(
 def score_grid(
     target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig
 ) -> tuple[Singles, Floats, Ints, Ints]:
-    """Score every pose of the grid.
-
-    Returns
-    -------
-    scores : (h, r, c) by heading, shift along y, shift along x.
-    headings : (h,) rad.
-    shift_x, shift_y : (c,), (r,) cells from the guess.
-    """
+    """Return the scores (h, r, c) of a grid by heading, y and x, headings (h,), rad, and shifts in x (c,) and y (r,), cells."""
     steps = np.array([config.resolution, config.resolution, config.angle_step])
     wide, tall, turns = np.ceil(np.array(window) / steps - _ROUNDING).astype(np.intp).tolist()
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step

@@ -110,9 +110,7 @@ class RefinementResult:
 def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
     """Choose the pairs (i < j) of clouds to be matched: following keyframes, and the best views from other times.
 
-    Parameters
-    ----------
-    poses : (k, 3). path : (k,) travelled distance, m. recording : (k,) recording of each keyframe.
+    Each keyframe has its pose (k, 3), its place on the travelled path (k,), m, and its recording (k,).
     """
     i, j = np.concatenate([np.zeros((2, 0), dtype=np.intp), *(_following(len(clouds), n) for n in config.neighbours)], axis=1)
     near = (recording[i] == recording[j]) & (path[j] - path[i] < config.farthest)
@@ -157,13 +155,8 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
 
 
 def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> ScanEdges:
-    """Return pairs of clouds (e,), (e,) as scan edges that nothing has measured yet.
-
-    Parameters
-    ----------
-    graph : in which they are. twist : (k, 3) velocity of the base at each keyframe.
-    delay : of the lidar's clock, s, with which the clouds were made.
-    """
+    """Return pairs of clouds (e,), (e,) as scan edges that nothing has measured yet, by the velocity of the base (k, 3) at each
+    keyframe, and the delay of the lidar's clock, s, with which the clouds were made."""
     # Lines seen obliquely are tilted a little, so the cloud that gives the points seems shifted towards its laser: half a
     # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
@@ -253,9 +246,8 @@ def _surfaces_moved(factors: PairFactors, change: Floats) -> float:
 def with_fewer_pairs(graph: Graph, most: int = 12_000) -> Graph:
     """Return the graph with at most so many scan edges between clouds of different times, each for several similar ones.
 
-    The uncertainty of thousands of poses tied together everywhere would need a factor of hundreds of millions of
-    entries. Every m-th pair, weighing as m, and a chain of single steps carry as much information, a little less at every
-    pose: standard deviations come out up to a third too large.
+    The uncertainty of thousands of poses tied together everywhere would need a factor of hundreds of millions of entries. With
+    every m-th pair, weighing as m, and a chain of single steps, standard deviations come out up to a third too large.
     """
     return replace(graph, edges=tuple(_every_nth(e, most) if isinstance(e, ScanEdges) else e for e in graph.edges))
 

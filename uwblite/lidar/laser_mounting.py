@@ -22,8 +22,7 @@ class TurningPolicy:
     pairs: ClassVar[int] = 1000
     """Scan pairs matched at most."""
     least_pairs: ClassVar[int] = 20
-    """Fewer pairs give no result, and half as many clear ones: where a laser sees only a post or two, single pairs fit upright
-    and upside down."""
+    """Fewer pairs give no result, nor half as many clear ones: single pairs of a post or two fit upright and upside down."""
     least_beams: ClassVar[int] = 30
     beams: ClassVar[int] = 180
     """Beams of a scan that are compared, or up to twice as many."""
@@ -90,12 +89,7 @@ class Turning:
 
 
 def compare(log: SensorLog, pairs: int = TurningPolicy.pairs) -> Turning | None:
-    """Compare the turns that laser and wheels see; None where scans, turns in place or scans that show turns are too few.
-
-    Parameters
-    ----------
-    pairs : scan pairs to match at most.
-    """
+    """Compare the turns that laser and wheels see between so many pairs of scans at most; None where these are too few."""
     c, scans = TurningPolicy, log.scans
     assert scans is not None
     if scans.ranges.shape[1] < c.least_beams or len(scans.stamps) < c.least_pairs:

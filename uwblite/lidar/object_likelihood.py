@@ -90,10 +90,8 @@ class ObjectLikelihood:
         return self.raster.clouds
 
     def learnt(self, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
-        """Return the likelihood with the probability that an object moves as pairs where matching ended, at poses (e, 3), show.
-
-        An empty hall has few things that move and a museum many: what contradicts the place of a cloud counts accordingly.
-        """
+        """Return the likelihood with the probability that an object moves as pairs where matching ended, at poses (e, 3), show:
+        an empty hall has few things that move and a museum many."""
         moved = stood = 0.0
         for _, judged in self._judged(pairs, poses, PairPolicy.gate):
             moved += float(np.sum(judged.static < ObjectPolicy.unlikely))
@@ -160,12 +158,7 @@ class ObjectLikelihood:
 
 
 def matched_by_chance(raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> Floats:
-    """Return the share (k,) of points of sources that match each target cloud where they do not belong: aside.
-
-    Parameters
-    ----------
-    mean : (e, 3) about where these belong, T_i_j.
-    """
+    """Return the share (k,) of points of sources that match each target aside of where they about belong, T_i_j (e, 3)."""
     beforehand, points = ObjectPolicy.chance
     sides = ObjectPolicy.gap * np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
     matched = np.full(len(pairs), beforehand)

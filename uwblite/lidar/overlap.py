@@ -50,11 +50,7 @@ def directional_overlap(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, g
     """Return the least share (e,) over all directions of clouds i and j (e,) that matches when laid at poses (e, 3).
 
     With A = sum n n^T over the points looked up and M the same sum over those that match, the share that matches in a
-    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u.
-
-    Parameters
-    ----------
-    gate : farthest match, m.
+    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u. No match is beyond the gate, m.
     """
     asked, matched = _both_ways(
         raster, i, j, T_i_j, gate, lambda found, *_: (found.row >= 0).astype(float), lambda found, *_: found.good.astype(float)
@@ -69,9 +65,8 @@ def net_overlap(
 ) -> Floats:
     """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), counted both ways.
 
-    Two stretches of a recording that overlap share only a part of their surfaces: the share of all points that match shows how
-    long they overlap, not whether the place is right. Points that the other cloud cannot have seen do not count; each point
-    with a match counts for the place, each in view without a match counts against it.
+    Of two stretches of a recording, the share of all points that match shows how long they overlap, not whether the place is
+    right. Each point with a match counts for the place, each in view without a match against it, and others do not count.
 
     Parameters
     ----------

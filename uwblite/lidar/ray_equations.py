@@ -142,12 +142,8 @@ class RaySums:
 
 
 def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> RaySums:
-    """Return the normal equations of rays, robustly weighted, in standard deviations of the noise that was learnt.
-
-    Parameters
-    ----------
-    sensors, poses : see linearized. kernel : width of the Geman-McClure kernel, standard deviations.
-    """
+    """Return the normal equations of rays, robustly weighted by a Geman-McClure kernel of a width, in standard deviations of
+    the noise that was learnt; for the parameters see linearized."""
     k, s, end = len(poses), len(found.surfaces.facing), _SURFACE.stop
     of_poses, of_surfaces = np.zeros((k, end + 1, end + 1)), np.zeros((s, end + 1, end + 1))
     across, where = [np.zeros((0, end + 1, end + 1))], [np.zeros((2, 0), dtype=np.intp)]
@@ -185,13 +181,8 @@ def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floa
 
 
 def learnt_noise(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> RayNoise:
-    """Learn the noise of rays from their residuals.
-
-    Parameters
-    ----------
-    residual : (m,) in standard deviations by data sheets. place : (m,) number of the place of each ray on its surface.
-    surface : (m,). curved : (s,) whether a surface is a column.
-    """
+    """Learn the noise of rays from their residuals (m,), in standard deviations by data sheets, the place and the surface (m,)
+    of each, and which surfaces (s,) are columns."""
     c = RayPolicy
     ratio = max(spread(residual), ShapePolicy.quietest) if len(residual) >= c.fewest else 1.0
     clipped = np.where(np.abs(residual) < c.clip * ratio, residual / ratio, 0.0)

@@ -47,7 +47,6 @@ def scan_steps(
 
     Parameters
     ----------
-    scans : with the mounting of their laser.
     first, second : (e,) scan numbers, so near in time that the two see the same. guess : (e, 3).
     searches : at most so many of the pairs that match worst are searched for around the guess, which takes long.
 
@@ -76,8 +75,7 @@ def scan_steps(
 def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the mean square distance (e,), m^2, at which pairs of scans match at given motions T_first_second (e, 3).
 
-    Points without a match count as one at the gate, unless the first scan could not see there: along a bare corridor, where
-    readings end at the lidar's reach, those of two scans would otherwise match best if the robot stood.
+    Points without a match count as one at the gate, unless the first scan could not see there, as along a bare corridor.
     """
     raster, pairs = _pairs(scans, mounting, first, second)
     pairs = _in_sight(raster.clouds, pairs, motion, scans, mounting)
@@ -101,11 +99,7 @@ def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScan
 
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
-    """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1.
-
-    Along a corridor most rays of a scan match the next one best at zero motion: only the few surfaces that face
-    along the corridor show the motion.
-    """
+    """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1."""
     raster, pairs = _pairs(scans, mounting, first, second)
     return directional_overlap(raster, pairs.i, pairs.j, motion, PairPolicy.gate)
 

@@ -64,12 +64,8 @@ class Submaps:
 
 
 def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
-    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording.
-
-    Returns
-    -------
-    first (s,) and one past the last keyframe (s,) of each piece.
-    """
+    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording, and
+    return the first (s,) and one past the last keyframe (s,) of each."""
     piece = np.floor((path - path[0]) / epsilon).astype(np.intp) if epsilon > 0 else np.arange(len(path))
     change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(recording) != 0)])
     first = np.flatnonzero(change)
@@ -77,12 +73,7 @@ def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
 
 
 def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig) -> Submaps:
-    """Merge the clouds of each piece of the trajectory and filter them: voxel, statistical, radius.
-
-    Parameters
-    ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. recording : (k,).
-    """
+    """Merge the clouds of each piece of the trajectory, with poses (k, 3) T_map_base, and filter them; see cut."""
     first, last = cut(path, recording, config.epsilon)
     return of_pieces(clouds, poses, first, last, references(path, recording, config.epsilon), config)
 
@@ -94,12 +85,8 @@ def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
 
 
 def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:
-    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,), and filter them.
-
-    Parameters
-    ----------
-    reference : (s,) keyframes in whose frames the points stand.
-    """
+    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,) in the frames of reference
+    keyframes (s,), and filter them: voxel, statistical, radius."""
     parts = [
         _built(clouds, poses, first[some], last[some], reference[some], config)
         for some in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE))

@@ -96,12 +96,8 @@ def _bins(x: Floats, y: Floats, many: int) -> Ints:
 def in_free_space(
     free: Floats, which: Ints, x: Floats, y: Floats, margin: float = VisibilityPolicy.margin
 ) -> tuple[Bools, Bools]:
-    """Return which points x, y (e, n), m, stand in free space, and which were in view: in it, or up to a margin behind it.
-
-    Parameters
-    ----------
-    free : (k, b) m, see FreeSpace.ranges. which : (e,) row of it. margin : how far inside a point must stand, m.
-    """
+    """Return which points x, y (e, n), m, stand by more than a margin, m, in the free space of a row (e,) of ranges (k, b), see
+    FreeSpace, and which were in view: in it, or up to the margin behind it."""
     distance, parts = np.sqrt(x * x + y * y), free.shape[1]
     until = free.take(_bins(x, y, parts) + parts * which[:, None])
     return distance < until - margin, (until > 0.0) & (distance < until + margin)
@@ -126,12 +122,7 @@ def contradiction(free: FreeSpace, points: Floats, margin: float = VisibilityPol
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
-    """Return the observed free space of each sub-map, from some of its keyframes.
-
-    Parameters
-    ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base of the keyframes.
-    """
+    """Return the observed free space of each sub-map, from some of its keyframes with clouds and poses (k, 3) T_map_base."""
     nearest = nearest_by_bearing(clouds)
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
@@ -148,13 +139,8 @@ def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
 
 
 def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
-    """Return the larger share of either cloud's points that would stand in observed free space of the other, 0..1.
-
-    Parameters
-    ----------
-    free_a, free_b : see observed_free_space. points_a (n, 2), points_b (m, 2), m : each in its own frame.
-    T_a_b : (3,) pose of b in a.
-    """
+    """Return the larger share of points (n, 2), (m, 2), m, of either cloud, each in its own frame, that would stand in observed
+    free space of the other, 0..1."""
     one, _ = contradiction(free_a, se2.transform(T_a_b, points_b))
     other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a))
     return max(one, other)
