@@ -31,7 +31,7 @@ class CandidatePolicy:
     """Which pairs are worth a match."""
 
     sigmas: ClassVar[float] = 3.0
-    """Standard deviations of a guess within which the true place is looked for."""
+    """Standard deviations within which the truth is looked for."""
     shared: ClassVar[float] = 0.25
     """Least share of its surface that the smaller of two sub-maps should have in common with the other."""
     cells: ClassVar[int] = 5
