@@ -105,7 +105,7 @@ def propose(
     possible = np.where(doubtful, near & (worth > 0.0), expected > rules.shared)
     possible &= (np.minimum(size[a], size[b]) > rules.cells) & (spread > beyond) & (spread <= config.search_limit)
     possible &= ~_among(np.stack([a, b, doubtful]), tried)
-    kept = _best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
+    kept = best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
     return Candidates(a[kept], b[kept], guess[kept], covariance[kept], spread[kept], constrained)
 
 
@@ -140,7 +140,7 @@ def _spread(covariance: Floats) -> Floats:
     return CandidatePolicy.sigmas * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
 
 
-def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
+def best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
     """Return rows such that every sub-map keeps its `limit` best partners; rows with worth <= 0 never."""
     kept: set[int] = set()
     for one in (a, b):
