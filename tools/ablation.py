@@ -104,7 +104,6 @@ INGREDIENTS: dict[str, LeftOut] = {
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "corners": LeftOut(("clouds.linearity=0.85",)),
     "deskewing": LeftOut(log=flat),
-    "broken stretches": _stage("broken_stretches.replace_broken_stretches"),
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),
@@ -134,9 +133,9 @@ INGREDIENTS: dict[str, LeftOut] = {
     **{
         f"repair: {name.partition('.')[2].replace('_', ' ')}": _repair(name)
         for name in (
-            "stuck_sensors.without_repeated_scans", "stuck_sensors.without_lidar_marks", "screen.without_own_body",
-            "stuck_sensors.without_marks", "stuck_sensors.without_repeated_ranges", "screen.without_shared_names",
-            "directions.heading_with_the_path", "directions.laser_upright", "screen.with_late_scans_placed",
+            "repeats.without_repeated_scans", "repeats.without_lidar_marks", "repeats.without_own_body",
+            "repeats.without_marks", "repeats.without_repeated_ranges", "range_motion.without_shared_names",
+            "directions.heading_with_the_path", "directions.laser_upright", "clocks.with_late_scans_placed",
             "screen.heading_from_gyro",
         )
     },

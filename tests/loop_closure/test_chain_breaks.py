@@ -142,13 +142,13 @@ def test_what_scan_edges_fix_is_told_step_by_step(seed):
     size = len(i)
     wide = rng.random((size, 3)) < 0.2
     root = np.eye(3) / (np.array(TiePolicy.clear) * np.where(wide, 1.01, 0.99))[:, None, :]
-    off = np.where(rng.random(size) < 0.2, 1.05, 0.95) * TiePolicy.agrees
+    off = np.where(rng.random(size) < 0.2, 1.05, 0.95) * LoopClosureConfig.agrees
     T = se2.between(truth[i], truth[j])
     T[:, 0] += off / root[:, 0, 0]
     none = np.zeros((size, 3))
     edges = ScanEdges(i, j, T, root, none, none, scan_indices(Calibration()))
     graph = Graph(truth, edges=(wheels, edges))
-    agrees = np.abs(edges.residuals(graph)).max(axis=1) < TiePolicy.agrees
+    agrees = np.abs(edges.residuals(graph)).max(axis=1) < LoopClosureConfig.agrees
     fixing = agrees & ~wide.any(axis=1)
     fixed = np.zeros(KEYFRAMES, dtype=bool)
     for a, b in zip(np.minimum(i, j)[fixing], np.maximum(i, j)[fixing], strict=True):

@@ -28,8 +28,8 @@ _SPARSE = 0.1
 """Share of the cells of a window up to which they are added one by one, in as much time for each as ten in a row take."""
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
-_MANY = 1 << 16
-"""Scans whose hits 16 bits do not hold."""
+_MANY = np.iinfo(np.uint16).max
+"""Scans whose hits 16 bits just hold."""
 
 
 class RayCounter:
@@ -42,11 +42,11 @@ class RayCounter:
     most : scans at most; of fewer than 65,536, hits are of 16 bits.
     """
 
-    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY) -> None:
+    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY + 1) -> None:
         self.geometry = geometry
         self._weak = round(clear_weight * WEIGHT_UNIT)
         shape = (geometry.rows, geometry.cols)
-        self.hits: Counts = np.zeros(shape, np.uint16) if most < _MANY else np.zeros(shape, np.int32)
+        self.hits: Counts = np.zeros(shape, np.uint16) if most <= _MANY else np.zeros(shape, np.int32)
         self.misses: Counts = np.zeros(shape, dtype=np.int32)
         self._scratch = np.zeros(0, dtype=np.uint8)
 
@@ -188,7 +188,8 @@ def mark_rays(
     """
     steps = np.maximum(np.abs(d_row), np.abs(d_col))
     # Sorting numbers of 16 bits takes a quarter of the time.
-    order = np.argsort(-steps.astype(np.int16) if len(steps) and steps.max() < 2**15 else -steps, kind="stable")
+    short = steps.max(initial=0) <= np.iinfo(np.int16).max
+    order = np.argsort(-steps.astype(np.int16) if short else -steps, kind="stable")
     if walls is not None:
         order = order[~walls[start[order]]]
     shorter_by = -steps[order]

@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..assessment.repairs import check_recording
+from ..assessment.facts import check_recording
 from ..errors import Cancelled, DataError
 from ..findings import DOUBT, WARNING, Finding, doubt, of_severity, warning
 from ..screening.screen import screen
@@ -130,7 +130,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     return Localization(
         log.odometry.stamps[rows][there], poses[there], covariances[there], localized, overlap,
         of_severity(findings, WARNING), of_severity(findings, DOUBT),
-    )  # fmt: skip
+    )
 
 
 def _both(log: SensorLog, known: KnownMap, rows: Ints, progress: Progress | None) -> tuple[Pass, Pass]:

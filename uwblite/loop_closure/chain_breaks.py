@@ -13,6 +13,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, connected
 from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from .closures import LoopClosureConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +28,6 @@ class TiePolicy:
     """Keyframes of a part of the map; fewer belong to the part before."""
     clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
     """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""
-    agrees: ClassVar[float] = 4.0
-    """Standard deviations within which a scan edge agrees with the map."""
     jump: ClassVar[float] = 0.5
     torn: ClassVar[float] = 10.0
     """m, and standard deviations, from which an error of one step of the odometry is more than noise."""
@@ -86,7 +85,7 @@ def steps_fixed(graph: Graph) -> Bools:
 
 def _fixing(edges: ScanEdges, graph: Graph) -> Bools:
     """Return which scan edges (e,) agree with the map and fix a pose in all directions."""
-    agrees = np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < TiePolicy.agrees
+    agrees = np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < LoopClosureConfig.agrees
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
     # With the limits as units, an eigenvalue is above 1 where its direction has a sigma below the limit.
     least = np.linalg.eigvalsh(information * np.outer(TiePolicy.clear, TiePolicy.clear))[:, 0]

@@ -32,8 +32,8 @@ _SINGULAR = 1e-9
 """Share of the largest eigenvalue of an information up to which another one is none."""
 _ROUGH = 1e-4
 """Relative decrease of chi2 that ends a search with one scale of the kernel."""
-_LAST, _TIGHTER = 4.0, 3.0
-"""Last scale of that kernel, standard deviations, and the ratio of each to the next; the latter is that of what remains."""
+_TIGHTER = 3.0
+"""Ratio of each scale of that kernel to the next, and the scale of that of what remains, standard deviations."""
 _SLID = 3
 """Most searches for shifted stretches: without the closures that moved one, another may show."""
 
@@ -78,7 +78,7 @@ def _judge(
     distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=_SINGULAR, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
     share, rms = result.share, result.rms
-    most = config.consistency if candidates.constrained else np.inf
+    most = config.agrees**2 if candidates.constrained else np.inf
     verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
         least = config.overlap_after_search if searched[k] else config.overlap
@@ -131,13 +131,13 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     quick = replace(solver, relative_decrease=_ROUGH)
     worst = float(np.linalg.norm(closures.edges.residuals(graph), axis=1).max())
     # The first scale contains every closure: one that ends a long drift would else be rejected before it has any weight.
-    steps = int(np.ceil(np.log(max(worst / _LAST, 1.0)) / np.log(_TIGHTER)))
-    scales = [_LAST * _TIGHTER**k for k in range(steps, -1, -1)]
+    steps = int(np.ceil(np.log(max(worst / config.agrees, 1.0)) / np.log(_TIGHTER)))
+    scales = [config.agrees * _TIGHTER**k for k in range(steps, -1, -1)]
     solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
-    kept = squared < config.consistency
+    kept = squared < config.agrees**2
     reasons = [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared]
     left = closures.without(kept, "contradicts-closures", reasons)
     return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", _TIGHTER)))

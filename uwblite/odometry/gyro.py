@@ -144,8 +144,8 @@ def _changes(gyro: Gyro, odometry: Odometry, span: float) -> tuple[Floats, Float
 
 _SECONDS = 60.0
 """s; length of the time that is compared."""
-_LEAST, _EVERY = 15.0, 5.0
-"""s from which the gyro is tested, and between two tests: three windows of the comparison."""
+_LEAST = 15.0
+"""s from which the gyro is tested, as often as a window is long."""
 
 
 class GyroTurns:
@@ -179,7 +179,7 @@ class GyroTurns:
             # A robot without gyro; only the last pose is needed until there is one.
             self._wheels, self._pose = self._wheels[-1:], pose
             return pose
-        if stamp - self._judged >= _EVERY:
+        if stamp - self._judged >= WINDOW:
             self._judge(stamp)
         heading, last = self._at(stamp), self._heading
         self._heading = heading

@@ -79,8 +79,8 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see, or much worse than
-        the wheels do, do not count.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count, nor
+        those that it measures much worse than the wheels do, where these differ by much more.
     """
     if len(steps) < _ENOUGH:
         return wheels
@@ -94,12 +94,14 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(off.shape[1])
     for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH):
-        factor[k] = np.clip(_growing(off[well[:, k], k], own[well[:, k]]), _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
+        by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
+        factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
 
-_MUCH_WORSE = 6.0
-"""Ratio of a measured step's standard deviation to that of the wheels, from which on their difference shows its errors."""
+_MUCH_WORSE, _ALIKE = 6.0, 2.0
+"""Ratio of a measured step's standard deviation to that of the wheels, from which on their difference may show its errors; it
+does where the noise by all steps is so many times that by the better ones."""
 
 
 def _growing(off: Floats, step: Ints) -> float:
@@ -121,7 +123,7 @@ def _growing(off: Floats, step: Ints) -> float:
 
 
 _SUMS = (2, 4, 8)
-"""Numbers of following steps whose differences are summed: up to two metres."""
+"""Numbers of following steps whose differences are summed: up to two metres, over which errors of the floor are alike."""
 
 
 def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> OdometryEdges:
@@ -136,14 +138,14 @@ def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> Odometry
     wheels : edges between neighbouring poses, in the order of the poses.
     certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by measurements other than the wheels.
     """
-    if len(wheels) < _PATCH:
+    if len(wheels) < _SUMS[-1]:
         return wheels
     frame, covariance = se2.rotation(graph.poses[:, 2]), np.linalg.inv(certainty + _UNKNOWN * np.eye(certainty.shape[1]))
     of_pose = np.einsum("nia,nij,nja->na", frame, covariance, frame)
     root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
     ends, roots = (np.pad(np.cumsum(v, axis=0), ((1, 0), (0, 0))) for v in (wheels.residuals(graph), root))
     variances = np.full((2, root.shape[1]), np.nan)
-    for variance, n in zip(variances, (1, _PATCH), strict=True):
+    for variance, n in zip(variances, (1, _SUMS[-1]), strict=True):
         # Windows that cross the boundary of two recordings are excluded.
         first = np.flatnonzero(wheels.j[n - 1 :] - wheels.i[: len(wheels) - n + 1] == n)
         summed, mean = (ends[first + n] - ends[first]) / np.sqrt(n), (roots[first + n] - roots[first]) / n
@@ -156,8 +158,6 @@ def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> Odometry
     return replace(wheels, sqrt_information=wheels.sqrt_information / np.where(np.isnan(factor), 1.0, factor))
 
 
-_PATCH = 10
-"""Steps over which errors of the floor are correlated: 3 m."""
 _UNKNOWN = 1e-3
 """Information of a pose that nothing measures, 1/m^2 and 1/rad^2."""
 
@@ -277,7 +277,7 @@ def _neighbours(wheels: OdometryEdges, steps: ScanEdges) -> tuple[Ints, Floats]:
 
 def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     """Return the scale of turning steps (s,) in the order of time; turn : (s,) increasing number of each one's turn."""
-    weight, direction, centre = np.hypot(lidar, wheels), np.arctan2(lidar, wheels), 0.25 * np.pi
+    weight, direction, centre = np.hypot(lidar, wheels), np.arctan2(lidar, wheels), np.arctan(1.0)
     for _ in range(2):
         # Left and right turns give one direction, known up to half a turn.
         direction = centre + se2.wrap_angle(2.0 * (direction - centre)) / 2.0

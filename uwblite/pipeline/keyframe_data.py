@@ -1,9 +1,10 @@
 """What is made of a recording at its keyframes: clouds, and again, where keyframes are moved in time or added, all edges.
 
 The lidar's clock is known only once scans have been matched, and so is where the odometry needs more keyframes. Poses are
-then interpolated on the trajectory; clouds are made again only where scans or times have changed.
+then interpolated on the trajectory.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +18,13 @@ from ..graph.work import POINTS, Work
 from ..lidar import cloud_rasters, clouds
 from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.clouds import Clouds
-from ..odometry.attached import attach_ranges, choose_scans, scan_points
+from ..odometry.attached import ScanPoints, attach_ranges, choose_scans, scan_points
 from ..odometry.wheels import drift_time
 from .estimate import Estimate
 from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings
 
-_AT_ONCE = 32
+_AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
 _LEAST_REACH = 0.2
 """m; least reach of the rasters."""
@@ -35,20 +36,8 @@ _LEAST_SHARE = 1e-6
 
 def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
     """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
-    parts = [part for r in recordings.each for part in _blocks(r, np.arange(len(r.frames)), config, delay)]
-    built = clouds.joined(parts)
+    built = clouds.joined([part for recording in recordings.each for part in _clouds_of(recording, config, delay)])
     return _with_raster(replace(built, work=work), config, delay, len(built.points))
-
-
-def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
-    """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over."""
-    pairs = list(zip(before.each, after.each, strict=True))
-    former = np.concatenate([_former(a, b, config, old.delay) for a, b in pairs])
-    changed = [np.flatnonzero(former[b.rows] < 0) for b in after.each]
-    parts = [p for r, which in zip(after.each, changed, strict=True) for p in _blocks(r, which, config, old.delay)]
-    place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
-    both = clouds.joined([old.clouds, *parts]).chosen(place)
-    return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(p.points) for p in parts))
 
 
 def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
@@ -63,39 +52,30 @@ def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -
     return ScanClouds(built, raster, delay)
 
 
-def _blocks(recording: Recording, which: Ints, config: MappingConfig, delay: float) -> list[Clouds]:
-    """Return the clouds of some keyframes (w,) of a recording, a block at a time; empty ones without lidar."""
+def _clouds_of(recording: Recording, config: MappingConfig, delay: float) -> Iterator[Clouds]:
+    """Yield the clouds of the keyframes of a recording, some at a time; empty ones without lidar."""
+    if not recording.has_scans:
+        none, offsets = np.zeros(0, dtype=np.intp), np.zeros(len(recording.frames) + 1, dtype=np.intp)
+        yield Clouds(offsets, np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))
+    for some, rays in rays_of(recording, config, delay):
+        yield clouds.build(replace(rays, keyframe=rays.keyframe - some.start), some.stop - some.start, config.clouds)
+
+
+def rays_of(
+    recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None
+) -> Iterator[tuple[slice, ScanPoints]]:
+    """Yield some keyframes of a recording at a time, and the rays of those wanted (k,), None = of all."""
     log, frames = recording.log.with_later_scans(delay), recording.frames
     if log.scans is None:
-        none = np.zeros(0, dtype=np.intp)
-        return [Clouds(np.zeros(len(which) + 1, dtype=np.intp), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
+        return
     owner, chosen = choose_scans(log.scans, frames, config.keyframes)
-    blocks = []
-    for first in range(0, len(which), _AT_ONCE):
-        block = which[first : first + _AT_ONCE]
-        own = np.flatnonzero(np.isin(owner, block))
-        rays = scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
-        blocks.append(clouds.build(replace(rays, keyframe=np.searchsorted(block, rays.keyframe)), len(block), config.clouds))
-    return blocks
-
-
-def _former(before: Recording, after: Recording, config: MappingConfig, delay: float) -> Ints:
-    """Return the former keyframe (k,) with the same time and scans as each new one; -1 = there is none."""
-    stamps, old = after.frames.stamps, before.frames.stamps
-    at = np.minimum(np.searchsorted(old, stamps), len(old) - 1)
-    same = old[at] == stamps
-    log = after.log.with_later_scans(delay)
-    if log.scans is not None:
-        owners, counts = [], []
-        for frames in (before.frames, after.frames):
-            owner, chosen = choose_scans(log.scans, frames, config.keyframes)
-            owners.append(np.full(len(log.scans.stamps), -1))
-            owners[-1][chosen] = owner
-            counts.append(np.bincount(owner, minlength=len(frames)))
-        then, now = owners
-        moved = (now >= 0) & (then != at[now])
-        same &= (np.bincount(now[moved], minlength=len(stamps)) == 0) & (counts[0][at] == counts[1])
-    return np.where(same, before.first + at, -1)
+    if wanted is not None:
+        owner, chosen = owner[wanted[owner]], chosen[wanted[owner]]
+    for first in range(0, len(frames), _AT_ONCE):
+        some = slice(first, min(first + _AT_ONCE, len(frames)))
+        own = (owner >= some.start) & (owner < some.stop)
+        if wanted is None or own.any():
+            yield some, scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
 
 
 def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) -> Estimate:

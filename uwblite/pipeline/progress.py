@@ -59,7 +59,7 @@ class Stages:
             raise Cancelled(f"stopped by the caller during {stage}")
 
     def note(self, kind: str, **figures: object) -> None:
-        """Add a fact, of which the rule of its kind (assessment/decisions.py) makes a finding."""
+        """Add a fact, of which the rule of its kind (assessment/facts.py) makes a finding."""
         self.facts.append(Fact(kind, figures))
 
     def end(self, stage: str, **figures: object) -> None:

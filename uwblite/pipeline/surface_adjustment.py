@@ -46,17 +46,16 @@ from ..lidar.surface_rays import (
     surfaces_of,
 )
 from ..lidar.walls import Pieces, find_walls, straight_pieces
-from ..odometry.attached import ScanPoints, choose_scans, scan_points
+from ..odometry.attached import ScanPoints
 from ..odometry.wheels import noise_at
 from .estimate import Estimate, Task
+from .keyframe_data import rays_of
 
 
 @dataclass(frozen=True, slots=True)
 class SurfacePolicy:
     """Adjustment of poses and surfaces."""
 
-    at_once: ClassVar[int] = 128
-    """Keyframes whose rays are in memory at once."""
     on_rim: ClassVar[float] = 0.06
     """Distance from a column's rim up to which the middle of a straight piece is on it, m."""
     ahead: ClassVar[float] = 2.0
@@ -117,16 +116,9 @@ def _around(columns: Floats, poses: Floats, none: SurfaceRays, scans: ScanClouds
 
 def _rays(scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
     """Yield the rays of the wanted keyframes (k,), some keyframes at a time."""
-    for recording in (each for each in task.recordings.each if each.has_scans):
-        log, own = recording.log.with_later_scans(scans.delay), wanted[recording.rows]
-        assert log.scans is not None
-        owner, chosen = choose_scans(log.scans, recording.frames, task.config.keyframes)
-        for first in range(0, len(recording.frames), SurfacePolicy.at_once):
-            last = first + SurfacePolicy.at_once
-            if own[first:last].any():
-                some = (owner >= first) & (owner < last) & own[owner]
-                rays = scan_points(log, recording.frames, owner[some], chosen[some], task.config.clouds.range_max)
-                yield replace(rays, keyframe=rays.keyframe + recording.first)
+    for recording in task.recordings.each:
+        for _, rays in rays_of(recording, task.config, scans.delay, wanted[recording.rows]):
+            yield replace(rays, keyframe=rays.keyframe + recording.first)
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
