@@ -130,7 +130,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     return Localization(
         log.odometry.stamps[rows][there], poses[there], covariances[there], localized, overlap,
         of_severity(findings, WARNING), of_severity(findings, DOUBT),
-    )  # fmt: skip
+    )
 
 
 def _both(log: SensorLog, known: KnownMap, rows: Ints, progress: Progress | None) -> tuple[Pass, Pass]:

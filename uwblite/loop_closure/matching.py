@@ -93,7 +93,7 @@ def fit(
             submaps.spacing, None if free is None else [free[k] for k in used.tolist()], config, search_config,
         )
         for rows, used, target, source in batches(candidates.target, candidates.source)
-    )  # fmt: skip
+    )
     done, parts = 0, []
     for part, spent in in_order(_fit, tasks, executor):
         parts.append(part)
@@ -170,7 +170,7 @@ def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
     return replace(
         config, resolution=2.0 * config.resolution, spread=2.0 * config.spread,
         angle_step=config.angle_step / MatchingPolicy.finer, candidates=MatchingPolicy.many_places,
-    )  # fmt: skip
+    )
 
 
 def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tuple[Ints, Floats]:

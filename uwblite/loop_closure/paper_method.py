@@ -43,8 +43,8 @@ def find(
     guess = se2.between(graph.poses[i], graph.poses[j])
     results: list[Registration] = []
     tasks = (
-        _Batch(submaps.clouds.chosen(used), *own, guess[rows], icp) for rows, used, *own in batches(target, source)
-    )  # fmt: skip
+        _Batch(submaps.clouds.chosen(used), a, b, guess[rows], icp) for rows, used, a, b in batches(target, source)
+    )
     for part in in_order(_align, tasks, executor):
         results += part
         if progress is not None:

@@ -188,8 +188,8 @@ class _Incremental:
     def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
         """Return the part without some anchors if it fits then, and remove these; otherwise return it unchanged."""
         fresh = self.joined & self.ranged & (self.joined_at >= now - IncrementalPolicy.window)
-        for accused in (lambda: fresh, lambda: self._outlying(low, now)):
-            these = accused()
+        for accused in (None, self._outlying):
+            these = fresh if accused is None else accused(low, now)
             if these.any() and (other := self._solve(low, now, without=these)).fits:
                 self.joined &= ~these
                 self.joined_at[these] = len(self.guess)

@@ -37,7 +37,7 @@ class PathPolicy:
     """Largest offset of the clock, s; all up to it are equally probable, and compared in steps of a second.
 
     One of a second is no fault but calibrated with the map."""
-    noise: ClassVar[Floats] = 0.1 * 2.0 ** np.arange(3)
+    noise: ClassVar[Floats] = np.array([0.1, 0.2, 0.4])
     """Scales of the errors of ranges, m, that of a path by wheels over a stretch included; each row has its best."""
     apart: ClassVar[float] = 0.5
     """Way between two readings of an anchor that count, m: the errors of ranges last for so long."""

@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -83,7 +84,8 @@ class App(Page):
         kind = _TYPES.get(file.suffix)
         if not is_of_result(name) or kind is None or not file.is_file() or file.is_symlink():
             return None
-        return Response(kind, file.read_bytes(), **({"policy": REPORT_POLICY} if kind == HTML else {}))
+        answer = Response(kind, file.read_bytes())
+        return replace(answer, policy=REPORT_POLICY) if kind == HTML else answer
 
     def _state(self) -> dict[str, Any]:
         self._collect()
