@@ -7,6 +7,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..config import documented
+from ..grid.occupancy_grid import GridConfig
 from ..odometry.attached import beam_origins
 from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting
@@ -14,15 +15,13 @@ from .walls import Rays
 
 _FARTHEST = 1000.0
 """m; a longer reading is invalid, whatever reach the device states."""
-_CLEAR = 3.0
-"""m; up to here a ray without a reading shows that there is no wall, as grid.max_clear_distance."""
 TRACK_RAYS = 180
 """Rays of a scan that are matched."""
 LEAD = 5.0
 """s; a stamp farther ahead of the odometry is not used before others confirm it: a single one is a fault of the clock.
 One as far behind is not explained by delay."""
-_CONFIRMED = 4
-"""Different stamps, all so far ahead, after which the odometry was silent for so long."""
+CONFIRMED = 4
+"""Different stamps, all so far ahead, after which the odometry was silent for so long, or its clock was set."""
 
 
 @documented
@@ -48,13 +47,11 @@ class Scanner:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A range, as it waits for the odometry."""
+    """A range, as it waits for the odometry: index of the anchor in the map, and of the robot's tag."""
 
     anchor: int
-    """Its index in the map."""
     metres: float
     tag: int
-    """Which of the robot's tags measured it, from 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +91,7 @@ class Waiting:
         """Return until when sensors have measured, s, where the odometry's last stamp is now; -inf = not beyond it."""
         ahead = {until for until, _ in self._entries if until > now}
         near = [until for until in ahead if until <= now + LEAD]
-        return max(near) if near else min(ahead) if len(ahead) >= _CONFIRMED else -np.inf
+        return max(near) if near else min(ahead) if len(ahead) >= CONFIRMED else -np.inf
 
     def refuse(self, now: float) -> None:
         """Leave out measurements that are too far ahead of an odometry that has just been measured."""
@@ -119,17 +116,16 @@ def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
     mounting : of the laser, with the map's correction.
     """
     stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
-    count = len(readings)
+    last = max(len(readings) - 1, 0)
     hit = (readings >= scanner.range_min) & (readings <= min(scanner.range_max, _FARTHEST))
     empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
     ray = np.flatnonzero(hit | empty)
     ray = ray[:: max(1, -(-len(ray) // TRACK_RAYS))]
-    ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
-    first = se2.between(odometer.pose, ends[:1])
-    sweep = se2.between(ends[:1], ends[1:])
-    laser = beam_origins(first, sweep, np.zeros(len(ray), np.intp), ray / max(count - 1, 1), mounting)
+    ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * last]))
+    first, sweep = se2.between(odometer.pose, ends[:1]), se2.between(ends[:1], ends[1:])
+    laser = beam_origins(first, sweep, np.zeros(len(ray), np.intp), ray / max(last, 1), mounting)
     sign = -1.0 if mounting.laser_flipped else 1.0
     bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
-    reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))
-    ends_of = laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1)
-    return Rays(ends_of, laser[:, :2], hit[ray])
+    # A ray without a reading shows that there is no wall so far.
+    reach = np.where(hit[ray], readings[ray], min(GridConfig().max_clear_distance, scanner.range_max))
+    return Rays(laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1), laser[:, :2], hit[ray])
