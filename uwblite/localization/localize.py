@@ -180,9 +180,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
     report : called with the events that are done and their number.
     """
     sign, s = -1.0 if backwards else 1.0, log.scans
-    scanner = None
-    if s is not None:
-        scanner = Scanner(s.angle_min, s.angle_increment, sign * s.time_increment, s.range_min, s.range_max)
+    scanner = None if s is None else Scanner.of(s, sign)
     localizer = Localizer(replace(known, laser_delay=sign * known.laser_delay), log.mounting, scanner)
     poses, covariances = np.full((len(log.odometry.stamps), 3), np.nan), np.full((len(log.odometry.stamps), 3, 3), np.nan)
     times, kinds, numbers = _events(log, known, sign)

@@ -20,7 +20,6 @@ from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from .known_map import KnownMap
 from .pose_estimator import LocalizerState, PoseEstimator
-from .range_model import RangeFacts
 from .sensing import CONFIRMED, LEAD, Range, Scan, Scanner, Waiting, scan_rays
 
 _PATIENCE = 0.5
@@ -48,7 +47,9 @@ class Localizer:
     """
 
     def __init__(self, known: KnownMap, mounting: SensorMounting | None = None, scanner: Scanner | None = None) -> None:
-        self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
+        self.mounting, self.scanner = mounting or SensorMounting(), scanner
+        heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
+        self.known = known = replace(known, anchors=replace(known.anchors, rise=known.anchors.rise + np.square(heights)))
         self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
         self._odometer, self._turns, self._waiting = Odometer(), GyroTurns(), Waiting()
         self._estimator = PoseEstimator(known, self._odometer)
@@ -64,8 +65,6 @@ class Localizer:
         self._clock_shift = 0.0
         """s, added to the odometry's stamps so that time goes on where its clock was set back."""
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
-        heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
-        self._square = np.square(heights) + known.anchors.rise
         self._rays = 0
         """Of a scan; 0 = none has come."""
         self.strangers: dict[str, int] = {}
@@ -230,7 +229,8 @@ class Localizer:
             if isinstance(entry, Scan):
                 self._estimator.use_scan(scan_rays(self._odometer, self._laser, entry))
             else:
-                self._use_range(entry, until, poses[until])
+                tag = self.mounting.tags[entry.tag, :2]
+                self._estimator.use_range(entry.anchor, entry.metres, tag, until, poses[until])
         self._estimator.search_or_check(free=free)
 
     def _bridge_silence(self) -> None:
@@ -240,13 +240,6 @@ class Localizer:
         if gap > self._patience:
             self._odometer.add(latest, self._odometer.pose.copy())
             self._estimator.wander(UNSEEN_SPEED * min(gap, LEAD))
-
-    def _use_range(self, entry: Range, stamp: float, then: Floats) -> None:
-        anchors, tags, k = self.known.anchors, self.mounting.tags, entry.anchor
-        metres, errors = entry.metres - float(anchors.bias[k]), anchors.errors[k] if anchors.errors else None
-        square, sigma = float(self._square[k]), float(anchors.sigma[k])
-        fact = RangeFacts(k, anchors.positions[k], metres, square, sigma, anchors.scale, errors)
-        self._estimator.use_range(fact, tags[entry.tag, :2], stamp, then)
 
 
 def _numbers(**values: float) -> list[float]:

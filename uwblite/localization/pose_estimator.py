@@ -19,7 +19,7 @@ from . import hypotheses, verdict
 from .comparison import LOOK_BACK, Comparison, PlaceSearch
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
-from .range_model import MOMENTS, RangeFacts, bias_effect, range_moments, repeated
+from .range_model import MOMENTS, bias_effect, range_moments, repeated
 from .running_fit import FIT_LOST, FIT_SOUND, SUPPORT, full_agreement
 from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
@@ -75,11 +75,9 @@ class LocalizerState:
 
 
 class PoseEstimator:
-    """Find and track a robot.
+    """Find and track a robot in a known map.
 
-    Parameters
-    ----------
-    known : the map. odometer : the odometry of the last seconds, which the caller updates: its last pose is the present one.
+    The caller updates the odometer, the odometry of the last seconds: its last pose is the present one.
     """
 
     def __init__(self, known: KnownMap, odometer: Odometer) -> None:
@@ -102,6 +100,7 @@ class PoseEstimator:
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
+        self._noise = anchors.noise
         self._range_way = np.full(len(anchors.ids), -np.inf)
         """(a,) m, odometer at the last range to each anchor."""
         self._search_stamp = -np.inf
@@ -119,28 +118,26 @@ class PoseEstimator:
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
-        """Increase the uncertainty of the pose by a standard deviation, m and rad, of unmeasured motion.
-
-        Measurements before and after it cannot be combined.
-        """
+        """Add unmeasured motion, a standard deviation in m and rad; measurements before and after it cannot be combined."""
         self._bank = self._moved(np.zeros(3), sigma)
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
-    def use_range(self, fact: RangeFacts, tag: Floats, stamp: float, then: Floats) -> None:
+    def use_range(self, anchor: int, metres: float, tag: Floats, stamp: float, then: Floats) -> None:
         """Take a range of the tag at a place (2,) of the base, m, at a time, s, at which the odometry had a pose (3,)."""
-        self._window.add_range(WindowRange(fact, then, tag, self._way, stamp))
+        self._window.add_range(WindowRange(anchor, metres, then, tag, self._way, stamp))
         if not len(self._bank):
             return
+        anchors, (white, length) = self.known.anchors, self._noise[anchor]
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
-        driven = self._way - self._range_way[fact.anchor]
-        share = 1.0 / float(repeated((fact.white / fact.sigma) ** 2, fact.length, driven))
-        self._range_way[fact.anchor] = self._way
-        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm, share)
+        driven = self._way - self._range_way[anchor]
+        share = 1.0 / float(repeated((white / anchors.sigma[anchor]) ** 2, length, driven))
+        self._range_way[anchor] = self._way
+        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, anchors, anchor, metres, arm, share)
         self.work += 8 * bank.covariance.size
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
-        self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
+        self._running.add_range(anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
 
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
@@ -173,11 +170,9 @@ class PoseEstimator:
         self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), odometer.stamp)
 
     def search_or_check(self, *, free: bool) -> None:
-        """Look whether the pose still holds; do some units of a search that is under way, or begin one where it is time for it.
+        """Look whether the pose still holds; do some units of a search, or begin one where it is time for it.
 
-        Parameters
-        ----------
-        free : no scan was used in this step: there is time to search, and to compare units. Every scan brings a free step.
+        Free: no scan was used in this step, and there is time to search and to compare units. Every scan brings a free step.
         """
         if self.tracks and (why := self._doubted(free)):
             self._lose(why, self._running.agreed())
@@ -251,14 +246,13 @@ class PoseEstimator:
     def _doubted(self, free: bool) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
-        A pose that ranges support is rejected only where another place explains the later measurements better. Where there is
-        time, free, the map's unit is compared with that of the sensors by the last metres.
+        A pose that ranges support is rejected only where another place explains the later measurements better.
         """
         odom, way = self._odometer.pose, self._way
         if free and way - self._unit_way >= _UNIT_WAY:
             self._unit_way, self._compared = way, self._compared + 1
             rays, ago = self._window.seen(odom, way, LOOK_BACK)
-            ranges, looks = self._window.ranges_since(odom, way), len(np.unique(ago))
+            ranges, looks = self._window.ranges_since(self.known.anchors, odom, way), len(np.unique(ago))
             if why := verdict.other_unit(self.known.walls, self._bank.poses[0], rays, looks, ranges, False):
                 self._compared = 0
                 return why

@@ -128,17 +128,12 @@ def units(count: int, each: int) -> Iterator[slice]:
 
 
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
-    """Search the map.
+    """Search the map; return poses that explain the measurements about as well as the best one, the best first.
 
     Parameters
     ----------
     rays : of the last metres, in the present frame of the base. ranges : of the window.
     bounds : corners (2,) of the area in which the robot may be, m.
-
-    Returns
-    -------
-    Poses that explain the measurements about as well as the best one, at most MOST_PLACES, the best first; refined by ranges
-    where no scan measures more.
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
     anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
@@ -197,7 +192,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
 
 
 def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
-    """Return the best of poses (n, 3) by their scores (n,), in whose order they are, and by the ranges together.
+    """Return the best of poses (n, 3) by scores (n,), in whose order they are, and by the ranges together.
 
     Ranges distinguish places along a wall, which scans do not.
     """
@@ -268,8 +263,7 @@ def _allowed(centres: Floats, size: float, ranges: Ranges) -> Generator[int, Non
     """Return in which squares (n,) of a size, m, the robot may be by its ranges alone, for any heading.
 
     The tag was within |t| of its present place: a range disagrees if it is off by more than that, half the diagonal and four
-    sigmas. NLOS makes ranges long: a place too near an anchor counts as half a disagreement. The best places and those with
-    little more are kept.
+    sigmas. NLOS makes ranges long: a place too near an anchor counts as half a disagreement.
     """
     if not len(ranges) or not len(centres):
         return np.ones(len(centres), bool)

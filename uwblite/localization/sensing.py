@@ -10,7 +10,7 @@ from ..config import documented
 from ..grid.occupancy_grid import GridConfig
 from ..odometry.attached import beam_origins
 from ..odometry.odometer import Odometer
-from ..sensor_log import SensorMounting
+from ..sensor_log import LaserScans, SensorMounting
 from .walls import Rays
 
 _FARTHEST = 1000.0
@@ -38,6 +38,12 @@ class Scanner:
     range_min: float = 0.02
     range_max: float = 30.0
     """m."""
+
+    @classmethod
+    def of(cls, scans: LaserScans, sign: float = 1.0) -> "Scanner":
+        """Return that of some scans, which are played backwards with a negative sign."""
+        sweep = sign * scans.time_increment
+        return cls(scans.angle_min, scans.angle_increment, sweep, scans.range_min, scans.range_max)
 
     @property
     def usable(self) -> bool:
@@ -109,12 +115,7 @@ class Waiting:
 
 
 def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
-    """Return thinned rays in the present frame of the base, each moved by the odometry at its own time.
-
-    Parameters
-    ----------
-    mounting : of the laser, with the map's correction.
-    """
+    """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
     stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
     last = max(len(readings) - 1, 0)
     hit = (readings >= scanner.range_min) & (readings <= min(scanner.range_max, _FARTHEST))

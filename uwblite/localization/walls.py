@@ -168,7 +168,7 @@ class Walls:
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
         a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
-        return there, to the power of a half: what is dark to one ray is dark to its neighbours.
+        return, to the power of a half: what is dark to one ray is dark to its neighbours.
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
         on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
