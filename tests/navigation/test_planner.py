@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OCCUPIED, OccupancyGrid
-from uwblite.navigation import regions, steps
+from uwblite.navigation import steps
 from uwblite.navigation.planner import NoPathError, make_planner
 from uwblite.navigation.steps import STEPS
 
@@ -97,8 +97,7 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     grid.log_odds[20:30, 20:26] = 0.0
     whole = make_planner(grid, RADIUS, unknown="price")
     monkeypatch.setattr(steps, "_AT_ONCE", 2500)
-    for module in (steps, regions):
-        monkeypatch.setattr(module, "BLOCK", block)
+    monkeypatch.setattr(steps, "BLOCK", block)
     parts = make_planner(grid, RADIUS, unknown="price")
     assert parts.steps.regions is not None
     nodes = whole.steps.nodes()

@@ -72,8 +72,7 @@ class ClearanceMap:
     def passable(self, rows: slice = slice(None)) -> Bools:
         """Return in which cells' centres (rows, cols) the robot may stand.
 
-        Straight steps to a neighbour then keep the radius too: along an axis no square is nearer to a point between two
-        centres than to one of them. So do diagonal ones where all four cells around their middle are passable.
+        Straight steps to a neighbour then keep the radius too, and diagonal ones where all four cells around are passable.
         """
         return np.asarray(self.half[rows] >= self.least)
 
@@ -89,25 +88,19 @@ class ClearanceMap:
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the same bounds (n,), m^2, and the costs of a metre (n,), at points (n, 2), m."""
-        squared, between, nearest = self._interpolated(points)
+        squared, between = self._interpolated(points)
         costs = self._nearness(self._unit * between)
-        return squared, costs if self.refused else np.where(self.dear.ravel()[nearest], UNKNOWN_PRICE, 1.0) * costs
+        if not self.refused:
+            row, col = (np.clip(n, 0, most - 1) for n, most in zip(self.geometry.cell_of(points), self.dear.shape, strict=True))
+            costs *= np.where(self.dear[row, col], UNKNOWN_PRICE, 1.0)
+        return squared, costs
 
-    def _interpolated(self, points: Floats) -> tuple[Floats, Floats, Ints]:
-        """Return `bounds` (n,), `half` (n,) interpolated between the centres around, and the nearest cell (n,)."""
-        grid, flat = self.geometry, self.half.ravel()
-        place = (points.T - grid.origin[:, None]) / grid.resolution - 0.5
-        low = np.floor(place)
-        u, v = place - low
-        col, row = low.astype(np.intp)
-        inside = (row >= 0) & (row < grid.rows - 1) & (col >= 0) & (col < grid.cols - 1)
-        first = np.where(inside, row * grid.cols + col, 0)
-        above = first + np.where(inside, grid.cols, 0)
-        lower = (1.0 - u) * flat[first] + u * flat[first + inside]
-        upper = (1.0 - u) * flat[above] + u * flat[above + inside]
-        between = np.where(inside, (1.0 - v) * lower + v * upper, 0.0)
-        squared = self._unit * np.maximum(between - 4.0 * (u * (1.0 - u) + v * (1.0 - v)), 0.0)
-        return squared, between, np.where(v > 0.5, above, first) + (inside & (u > 0.5))
+    def _interpolated(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return `bounds` (n,) and `half` (n,) interpolated between the centres around, 0 outside of all."""
+        place = (points.T - self.geometry.origin[:, None]) / self.geometry.resolution - 0.5
+        between = ndimage.map_coordinates(self.half, place[::-1], np.float64, order=1)
+        u, v = place - np.floor(place)
+        return self._unit * np.maximum(between - 4.0 * (u * (1.0 - u) + v * (1.0 - v)), 0.0), between
 
     def is_obstacle(self, points: Floats) -> Bools:
         """Return which points (n, 2), m, lie in an obstacle, or outside the map."""
@@ -116,12 +109,9 @@ class ClearanceMap:
         return ~inside | self.obstacles[np.where(inside, row, 0), np.where(inside, col, 0)]
 
     def keeps(self, points: Floats, bound: Floats, needed: Floats, owner: Ints) -> Bools:
-        """Return which owners' points all keep a squared distance.
+        """Return which owners' points (n, 2), m, all keep a squared distance (n,), m^2, of which `bound` is known.
 
-        Parameters
-        ----------
-        points : (n, 2) m. bound : (n,) `bounds` of them, m^2. needed : (n,) m^2.
-        owner : (n,) whose point each is, 0 ... in order; every owner has one.
+        The owners are numbered 0 ... in order; every one has a point.
         """
         grid, kept = self.geometry, np.ones(int(owner.max(initial=-1)) + 1, dtype=np.bool_)
         needed = needed * (1.0 - _ROUNDING)
@@ -138,10 +128,7 @@ class ClearanceMap:
         return kept
 
     def distances(self, points: Floats) -> Floats:
-        """Return the distances (n,) of points (n, 2) from the nearest obstacle, m, up to the radius; beyond, lower bounds.
-
-        Distances that cost nothing count as the radius and COMFORT.
-        """
+        """Return the distances (n,) of points (n, 2) from the nearest obstacle, m, up to the radius; beyond, lower bounds."""
         squared = self.bounds(points)
         near = np.flatnonzero(squared < self.radius**2)
         squared[near] = np.minimum(self._exact(points[near]), self.radius**2)
@@ -168,11 +155,10 @@ class ClearanceMap:
 
 
 def clearance_map(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse") -> ClearanceMap:
-    """Measure a map for a round robot.
+    """Measure a map for a round robot with a radius, m.
 
     Parameters
     ----------
-    radius : of the robot, m.
     unknown : 'refuse' makes unknown cells obstacles, 'price' makes them dear.
     """
     states, geometry = grid.states(), grid.geometry

@@ -14,13 +14,7 @@ from .steps import StepSearch, step_search
 
 
 class NoPathError(DataError):
-    """There is no way to a goal.
-
-    Parameters
-    ----------
-    text : what is in the way.
-    nearest : (2,) the reachable place nearest to the goal, m, map frame; None where the start itself is the trouble.
-    """
+    """There is no way to a goal; nearest is the reachable place (2,) nearest to it, m, None where the start is the trouble."""
 
     def __init__(self, text: str, nearest: Floats | None = None) -> None:
         super().__init__(text)
@@ -92,8 +86,8 @@ class Planner:
         """Return the corners (k, 2) of the way from a place to the first node, which keeps no clearance, and that node.
 
         Where the way keeps it, only the place itself is returned. A robot that stands nearer to an obstacle than its radius,
-        by the map, may leave straight for the nearest place where it may stand, but not through an obstacle. One that stands
-        in unknown space, into which it drove by itself, leaves it by the cheapest way that keeps clear of known obstacles.
+        by the map, may leave straight for the nearest place where it may stand, but not through an obstacle; one in unknown
+        space by the cheapest way that keeps clear of known obstacles.
         """
         if (node := self._beside(start)) >= 0:
             return start[None], node

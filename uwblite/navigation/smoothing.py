@@ -46,12 +46,7 @@ class Lines(NamedTuple):
 
 
 def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
-    """Look up clearance and cost along straight lines.
-
-    Parameters
-    ----------
-    begin, end : (n, 2) m, map frame.
-    """
+    """Look up clearance and cost along straight lines between places (n, 2) and (n, 2), m, map frame."""
     lengths = np.hypot(*(end - begin).T)
     roomy = _roomy(clearance, begin, end, lengths)
     found = Lines(lengths.copy(), roomy.copy(), roomy, np.zeros(len(lengths), dtype=np.bool_))
@@ -106,12 +101,7 @@ def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats,
 
 
 def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
-    """Return the corners (k, 2) of a cheaper line with the same ends, m.
-
-    Parameters
-    ----------
-    line : (n, 2) corners, m, map frame; its pieces are clear.
-    """
+    """Return the corners (k, 2) of a cheaper line with the same ends as a line (n, 2) of clear pieces, m."""
     cost = np.inf
     for _ in range(_MOST_ROUNDS):
         line, now = _shortened(clearance, _straightened(line))
@@ -202,10 +192,7 @@ def _straightened(line: Floats) -> Floats:
 def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
     """Divide a line (n, 2) at about the step near its corners, and ever more coarsely between them.
 
-    Returns
-    -------
-    places : (k, 2) m.
-    piece : (k - 1,) number of the line's piece on which the way to the next place lies.
+    Return the places (k, 2), m, and the line's piece (k - 1,) on which the way to the next place lies.
     """
     piece, number, cuts = _cuts(line, step)
     away = np.minimum(number, cuts - number)
@@ -215,18 +202,14 @@ def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
 
 
 def sampled(line: Floats, step: float, heading: float | None = None) -> tuple[Floats, Floats]:
-    """Return poses along a line, and how far from its start they are.
+    """Return poses (k, 3) along a line, and how far (k,) from its start they are, m.
 
     Parameters
     ----------
-    line : (n, 2) corners, m.
-    step : largest distance between poses, m; all corners are among them.
-    heading : of the first pose, rad; None = along the line.
-
-    Returns
-    -------
-    poses : (k, 3) with the heading of the piece that begins there, at the end of the one that ends; m, m, rad.
-    distances : (k,) m.
+    line : (n, 2) corners, m; all are among the poses.
+    step : largest distance between poses, m.
+    heading : of the first pose, rad; None = along the line. Others are those of the piece that begins there, at the end of the
+        one that ends.
     """
     points = _divided(line, step)
     ways = np.diff(points, axis=0)
