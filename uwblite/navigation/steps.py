@@ -267,27 +267,28 @@ def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
     """
     grid = clearance.geometry
     label, count = np.zeros((grid.rows, grid.cols), dtype=np.int32), 0
+    row, col = (n.ravel().astype(np.float64) for n in np.indices((STRIP, grid.cols)))
     sums: list[Floats] = []
     pairs: list[tuple[Ints, Ints]] = []
     for start in range(0, grid.rows, STRIP):
         rows = slice(start, min(start + STRIP, grid.rows))
         part, more = _parted(clearance.passable(rows))
-        part[part > 0] += count
-        label[rows] = part
-        inner = part.ravel() - count
-        keep = inner > 0
-        row, col = np.divmod(np.flatnonzero(keep), grid.cols)
-        values = (None, col, row + start, clearance.cell_cost(rows).ravel()[keep])
-        sums.append(np.stack([np.bincount(inner[keep] - 1, v, more) for v in values]))
+        inner = part.ravel()
+        values = (None, col[: len(inner)], row[: len(inner)] + start, clearance.cell_cost(rows).ravel())
+        sums.append(np.stack([np.bincount(inner, v, more + 1)[1:] for v in values]))
+        label[rows] = np.where(part > 0, part + count, 0)
         count += more
         above = np.arange(max(start, BLOCK), rows.stop, BLOCK)
-        pairs += _touching(label[above - 1], label[above]), _touching(part.T[BLOCK - 1 : -1 : BLOCK], part.T[BLOCK::BLOCK])
+        pairs += (
+            _touching(label[above - 1], label[above]),
+            _touching(label[rows].T[BLOCK - 1 : -1 : BLOCK], label[rows].T[BLOCK::BLOCK]),
+        )
         corner = np.arange(BLOCK, grid.cols, BLOCK)
         four = [[label[above + dr][:, corner + dc] for dc in (-1, 0)] for dr in (-1, 0)]
         whole = np.all(four, axis=(0, 1))
         pairs += [_touching(four[0][k] * whole, four[1][1 - k]) for k in (0, 1)]
-    size, col, row, cost = np.concatenate(sums, axis=1)
-    centres = np.concatenate([grid.centre_of(row / size, col / size), clearance.tight])
+    size, across, along, cost = np.concatenate(sums, axis=1)
+    centres = np.concatenate([grid.centre_of(along / size, across / size), clearance.tight])
     a, b = (end - 1 for end in np.divmod(np.unique(np.concatenate([p * (count + 1) + q for p, q in pairs])), count + 1))
     costs = 0.5 * np.hypot(*(centres[a] - centres[b]).T) * (cost[a] / size[a] + cost[b] / size[b])
     joined = joins.tocoo()
