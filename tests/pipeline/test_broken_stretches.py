@@ -17,15 +17,14 @@ from uwblite.graph.calibration import scan_indices
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.object_likelihood import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline import scan_clouds
-from uwblite.pipeline.broken_steps import broken_steps
+from uwblite.pipeline import keyframe_data
+from uwblite.pipeline.broken_steps import broken_steps, range_evidence
 from uwblite.pipeline.broken_stretches import _likelihood, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
-from uwblite.pipeline.radio_tracks import range_evidence
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog, SensorMounting
@@ -69,7 +68,7 @@ def walked_once(shift, moved):
     graph = replace(estimate.graph, poses=true, anchors=ANCHORS.copy())
     yes = np.ones(4, dtype=bool)
     estimate = replace(estimate, graph=graph, bootstrap=BootstrapResult(graph, yes, ((),) * 4, ~yes))
-    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, 0.0, task.stages.work))
+    estimate = replace(estimate, scans=keyframe_data.make(task.recordings, task.config, 0.0, task.stages.work))
     return refine_jointly(estimate, task), task, true
 
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.planted import box, odometry, recording, scans, wander
 
 from uwblite.graph.work import Work
-from uwblite.pipeline import scan_clouds
+from uwblite.pipeline import keyframe_data
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import denser, gather
 
@@ -26,15 +26,15 @@ def test_clouds_taken_over_are_those_made_again(steps):
     last = before.each[2]
     after = denser(before, np.array([*steps, last.first + np.argmax(last.frames.duration)]), 4)
     assert len(after.stamps) > len(before.stamps)
-    old = scan_clouds.make(before, CONFIG, 0.02, Work())
-    mixed = scan_clouds.remake(old, before, after, CONFIG)
-    fresh = scan_clouds.make(after, CONFIG, 0.02, Work())
+    old = keyframe_data.make(before, CONFIG, 0.02, Work())
+    mixed = keyframe_data.remake(old, before, after, CONFIG)
+    fresh = keyframe_data.make(after, CONFIG, 0.02, Work())
     for name in ("offsets", "points", "normals", "owner", "normal_variance"):
         np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(fresh.clouds, name))
     for k in range(len(fresh.clouds)):
         np.testing.assert_array_equal(mixed.raster.cells(k), fresh.raster.cells(k))
     assert mixed.delay == fresh.delay == 0.02
     # Steps that were cut and their neighbours alone are made again.
-    former = np.concatenate([scan_clouds._former(*pair, CONFIG, 0.02) for pair in zip(before.each, after.each, strict=True)])
+    former = np.concatenate([keyframe_data._former(*pair, CONFIG, 0.02) for pair in zip(before.each, after.each, strict=True)])
     assert 0 < np.sum(former < 0) < len(former) / 2
     np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])

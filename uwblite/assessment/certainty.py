@@ -6,7 +6,7 @@ import numpy as np
 
 from ..findings import Finding, doubt
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.line_sides import LinePolicy, sides
+from ..pipeline.range_alternatives import RangePolicy, sides
 from ..problem.alternatives import apart
 
 
@@ -55,7 +55,7 @@ def check_other_side(estimate: Estimate, task: Task) -> Iterator[Finding]:
     further = graph.with_estimates_of(other) if other is not None and known else None
     for there in sides(graph, estimate.placed, task.config.solver, further):
         off = apart(there.graph, graph)
-        if there.open and off > LinePolicy.elsewhere:
+        if there.open and off > RangePolicy.elsewhere:
             text = (
                 f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
                 f"{off:.1f} m (rms) away (odds {np.exp(there.log_odds):.2g}): place an anchor off that line, or give the "

@@ -15,8 +15,8 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
+from ..loop_closure.chain_breaks import untied_breaks
 from ..loop_closure.closures import LoopClosureConfig
-from ..loop_closure.loose_links import untied_breaks
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import LEAST_POINTS, blocked

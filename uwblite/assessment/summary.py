@@ -59,7 +59,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     shape = shape_error(graph.poses[covariance.chosen], covariance.among)
     plausibility.judge(plausibility.ResultView(task, estimate, anchors, calibrated, listed, table, grid, shape))
     anchors = _distrusted(anchors, stages.doubts)
-    stages.end("summary", passes=round(stages.passes, 3))
+    stages.end("summary", passes=stages.passes)
     stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
         stamps=np.concatenate(stamps),

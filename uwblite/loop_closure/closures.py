@@ -23,8 +23,6 @@ class LoopClosureConfig:
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4
     """Most rounds of searching and solving; ends early when a round finds nothing new."""
-    enough: ClassVar[float] = 5.0
-    """Closures per sub-map, on average, after which no further round is made."""
     direct: ClassVar[float] = 0.5
     """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
     reach: float = setting(6.0, advanced=True)

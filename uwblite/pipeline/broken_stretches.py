@@ -1,10 +1,8 @@
 """Never worse than its parts: where ranges and odometry deny a step of the lidar's path, the map without that step competes.
 
-A step of the path that scan matching has broken tears the map, and ranges along it look like anchors that were moved together.
-Both explanations are scored on one set of measurements, with associations made anew for either: the evidence of all ranges with
-the anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on
-the surfaces and in the free space of the other. The problem with the step left to wheels and radio is solved from the estimate,
-and replaces it only where it is the more probable one: ranges that are wrong together do not outweigh what both sides saw.
+Both are scored on one set of measurements, with associations made anew for either: the evidence of all ranges with the
+anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on the
+surfaces and in the free space of the other. Ranges that are wrong together do not outweigh what both sides saw.
 """
 
 from dataclasses import replace
@@ -21,10 +19,9 @@ from ..odometry.slips import log_densities, with_slips
 from ..problem.solution import rough
 from . import lidar_stages, surface_adjustment
 from .anchor_places import decide_places
-from .broken_steps import BreakPolicy, BrokenStep, broken_steps
+from .broken_steps import BreakPolicy, BrokenStep, broken_steps, range_evidence
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise
-from .radio_tracks import range_evidence
 
 _SUDDEN = 5.0
 """Standard deviations that a step of faultless wheels hardly ever exceeds."""
@@ -46,7 +43,7 @@ def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
         stretch = _stretch(estimate, task, step.begin)
         other = _released(estimate, task, step, stretch)
         gain = _gain(other, estimate, wheels, task, step) + float(np.log(BreakPolicy.broken))
-        task.stages.end("broken stretch", begin=round(float(task.recordings.stamps[stretch[0]]), 2), gain=round(gain, 1))
+        task.stages.end("broken stretch", begin=float(task.recordings.stamps[stretch[0]]), gain=gain)
         if gain <= 0.0:
             break
         found.append(_fact(estimate, other, step, stretch, task))
@@ -92,7 +89,6 @@ def _stretch(estimate: Estimate, task: Task, begin: int) -> tuple[int, int]:
 
 
 def _displaced(estimate: Estimate, step: BrokenStep) -> Bools:
-    """Return which keyframes (k,) lie on the far side of a broken step."""
     number = np.arange(len(estimate.graph.poses))
     return (number >= step.begin) & (number < step.end)
 
@@ -122,12 +118,7 @@ def _kept(edges: ScanEdges, far: Bools, first: int, last: int) -> Bools:
 
 
 def _gain(other: Estimate, estimate: Estimate, wheels: OdometryEdges, task: Task, step: BrokenStep) -> float:
-    """Return by how much the log likelihood of all measurements is greater along another path, all associations made anew.
-
-    Parameters
-    ----------
-    wheels : the odometry with the noise that it is judged by.
-    """
+    """Return by how much the log likelihood of all measurements is greater along another path, by the noise of some wheels."""
     assert estimate.joint is not None
     assert other.joint is not None
     far = _displaced(estimate, step)
@@ -151,7 +142,6 @@ def _likelihood(estimate: Estimate) -> ObjectLikelihood:
 
 
 def _fact(estimate: Estimate, other: Estimate, step: BrokenStep, stretch: tuple[int, int], task: Task) -> Fact:
-    """Return what the user is told of a stretch that was replaced."""
     stamps, start = task.recordings.stamps, float(step.recording.log.odometry.stamps[0])
     begin, end = (float(stamps[k]) for k in stretch)
     before, after = (se2.between(*e.graph.poses[list(stretch)]) for e in (estimate, other))

@@ -8,7 +8,7 @@ likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 A wheel's radius is a setting and can be wrong by any factor: of two hypotheses about the wheels' unit the likelier one is
 taken, without contradiction that all units are right. The scale and the biases of radios can be wrong by little or much: of
 several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the widest where a scale is clearly
-off. Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
+off. Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/range_alternatives.py).
 """
 
 from collections.abc import Sequence

@@ -53,9 +53,9 @@ SHORTEST_RANGE, LONGEST_RANGE = 0.02, 200.0
 """m; no radio of this kind reaches farther, and one that reports zero has missed its partner."""
 
 
-def plausible(ranges: Floats) -> Bools:
+def plausible(ranges: Floats, longest: float = LONGEST_RANGE) -> Bools:
     """Return which readings (m,) of a radio, m, can be distances."""
-    return (ranges > SHORTEST_RANGE) & (ranges < LONGEST_RANGE)
+    return (ranges > SHORTEST_RANGE) & (ranges < longest)
 
 
 @documented
