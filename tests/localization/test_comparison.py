@@ -31,7 +31,7 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
             metres = float(np.hypot(*(pose[:2] - place)))
             window.ranges.append(WindowRange(a, metres, pose, np.zeros(2), 0.2 * k, 0.1 * k))
     places, driven = PlaceSearch(known), np.array([1.0, 0.3, 0.4])
-    nobody = hypotheses.started(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(4))
+    nobody = hypotheses.none(4)
     places.begin(window, path[-1], 4.0)
     now = se2.compose(path[-1], driven)
     found = None

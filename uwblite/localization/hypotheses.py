@@ -39,6 +39,8 @@ WIDTHS = np.geomspace(0.3, 0.1, MATCHES)
 """m; kernel width of each."""
 SAME = (0.5, 0.3)
 """m and rad; hypotheses that are closer are one."""
+PER_MOVE, PER_UPDATE = 4, 8
+"""Operations on elements of a covariance in a step of the odometry, for each unknown, and in a correction by a range."""
 _UNUSED = 1e-3
 """Weight up to which a range moves nothing."""
 
@@ -78,6 +80,12 @@ class Hypotheses(Table):
     def pose_covariances(self) -> Floats:
         """(h, 3, 3) m, m, rad; map frame."""
         return self.covariance[:, POSE, POSE]
+
+
+def none(anchors: int) -> Hypotheses:
+    """Return no hypothesis."""
+    n = FIRST_ANCHOR + 2 * anchors
+    return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
 def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA) -> Hypotheses:

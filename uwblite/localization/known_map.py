@@ -19,6 +19,8 @@ _DRAWN = np.diag(np.square((0.014, 0.014, 0.003)))
 0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
 _UNSTATED = np.diag(np.square((0.015, 0.015, 0.004)))
 """m^2, rad^2; shape of a map of a room or two that does not say how far it is bent."""
+_UNBENT = np.zeros((0, 2)), np.zeros((0, *_DRAWN.shape))
+"""Shape of a map that does not say it."""
 _SIGMA, _LEAST_SIGMA = 0.1, 0.05
 """m; spread of ranges to an anchor for which the map does not contain it, and the least one in another recording."""
 
@@ -34,7 +36,7 @@ class KnownMap:
     """(3,) pose by which the laser's place on the base differs from what recordings say; m, m, rad."""
     laser_delay: float = 0.0
     """s; a scan stamped t was taken at t + laser_delay by the odometry's clock."""
-    shape: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 3, 3)))
+    shape: tuple[Floats, Floats] = _UNBENT
     """Places (p, 2), m, and by how much the map is bent there, covariances (p, 3, 3), m and rad."""
 
     def covariance_at(self, places: Floats) -> Floats:
@@ -69,7 +71,7 @@ def from_result(result: StoredResult) -> KnownMap:
 
 def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
     """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
-    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
+    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(len(_DRAWN)))
 
 
 def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:
@@ -113,8 +115,8 @@ def _shape(report: dict[str, Any]) -> tuple[Floats, Floats]:
     """Return places (p, 2) and covariances (p, 3, 3) of a report's entry `shape`; none where it has none that is sound."""
     try:
         poses, covariances = (np.array(report["shape"][name], dtype=np.float64) for name in ("poses", "covariances"))
-        places, covariances = poses.reshape(-1, 3)[:, :2], covariances.reshape(len(poses), 3, 3)
+        places, covariances = poses.reshape(len(poses), -1)[:, :2], covariances.reshape(len(poses), *_DRAWN.shape)
     except (KeyError, TypeError, ValueError):
-        return np.zeros((0, 2)), np.zeros((0, 3, 3))
+        return _UNBENT
     sound = np.isfinite(places).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     return places[sound], covariances[sound]

@@ -37,8 +37,8 @@ _AGREES = 3.0
 """Standard deviations up to which a range agrees."""
 _LIMITS = {"lidar": 0.03, "radio": 0.05}
 """Relative errors of distances: data sheets of lidars allow 1 to 3 %; for radios, the delay by walls is added."""
-_SURE = 4.0
-"""Standard deviations from which a scale error is certain."""
+SURE = 4.0
+"""Standard deviations from which an error is certain."""
 _KNOWN = 0.7
 """Standard deviation of the map's unit, as a share of that limit, from which another one would have been noticed; a start also
 needs the unit itself to be within the limit."""
@@ -176,7 +176,7 @@ class Scale:
     @property
     def off(self) -> bool:
         """Whether map and sensor are in different units for certain."""
-        return abs(self.error) > max(self.limit, _SURE * self.sigma) and self.gain > 0.5 * _SURE**2
+        return abs(self.error) > max(self.limit, SURE * self.sigma) and self.gain > 0.5 * SURE**2
 
 
 def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges: Ranges, start: bool) -> str:

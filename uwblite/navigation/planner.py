@@ -77,7 +77,10 @@ class Planner:
         way, first = self._entrance(start)
         nodes = self.steps.path(first, last) if (last := self._beside(goal)) >= 0 else None
         if nodes is None:
-            raise self._no_path(goal, first)
+            nearest = self.steps.places(np.array([self.steps.nearest(first, goal)]))[0]
+            size = f"a radius of {self.clearance.radius:g} m in cells of {self.clearance.geometry.resolution:g} m"
+            text = f"no path to {_place(goal)} with {size}; the nearest reachable point is {_place(nearest)}"
+            raise NoPathError(text, nearest)
         places = self.steps.places(nodes)
         line = smoothed(self.clearance, np.concatenate([way[-1:], places[len(way) > 1 :], goal[None]]))
         return np.concatenate([way, line[1:]])[1:]
@@ -118,12 +121,6 @@ class Planner:
         nodes, places = self.steps.around(place, 1.5 * self.clearance.geometry.resolution)
         clear = along_lines(self.clearance, np.broadcast_to(place, places.shape), places).clear
         return int(nodes[clear][np.argmin(np.hypot(*(places[clear] - place).T))]) if clear.any() else -1
-
-    def _no_path(self, goal: Floats, first: int) -> NoPathError:
-        nearest = self.steps.nearest_reachable(first, goal)
-        size = f"a radius of {self.clearance.radius:g} m in cells of {self.clearance.geometry.resolution:g} m"
-        text = f"no path to {_place(goal)} with {size}; the nearest reachable point is {_place(nearest)}"
-        return NoPathError(text, nearest)
 
 
 def make_planner(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse") -> Planner:

@@ -11,6 +11,7 @@ A node is the flat index of a cell, or, from the number of all cells on, a tight
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,22 +20,18 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ..arrays import Bools, Floats, Ints
-from .clearance import ClearanceMap
+from .clearance import AT_ONCE, STRIP, ClearanceMap
 from .smoothing import along_lines, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
-_AT_ONCE = 300_000
-"""Nodes of a search."""
 _STRETCH = 16
 """Regions; a straight way through open space that is as long needs no search: its ends lie half a block beside the cheapest
 path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is smoothed."""
 _NEAR_TIGHT = 1.3
 """Cells from a tight place to the nodes that it is joined to: the centre of the next cell but half a cell."""
 BLOCK = 16
-"""Cells along the edge of a block."""
-STRIP = 64
-"""Rows that are looked at together; a multiple of BLOCK."""
+"""Cells along the edge of a block; STRIP is a multiple of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +112,7 @@ class StepSearch:
             yield np.flatnonzero(np.append(False, reached[:count])[label]) + start * grid.cols
         yield np.flatnonzero(reached[count:]) + grid.cells
 
-    def nearest_reachable(self, first: int, goal: Floats) -> Floats:
-        """Return the place (2,) that can be reached and is nearest to a goal (2,), m."""
-        return np.asarray(self.places(np.array([self._nearest(first, goal)]))[0])
-
-    def _nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
+    def nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
         """Return the node that can be reached, is allowed (n,), and is nearest to a place (2,), m; -1 = there is none."""
         best, away = -1, np.inf
         for part in self.reachable(first):
@@ -135,7 +128,7 @@ class StepSearch:
         It ends where it comes to an allowed cell; None = there is none.
         """
         good = np.concatenate([allowed.ravel(), np.zeros(len(self.clearance.tight), dtype=np.bool_)])
-        last = self._nearest(first, self.places(np.array([first]))[0], good)
+        last = self.nearest(first, self.places(np.array([first]))[0], good)
         path = None if last < 0 else self.path(first, last)
         return None if path is None else path[: 1 + int(np.argmax(good[path]))]
 
@@ -201,7 +194,7 @@ class StepSearch:
         """Part a chain (k,) at some of its stops (s,): beside open ways, and where a piece is too large."""
         assert self.regions is not None
         beside = np.add.reduceat(self.regions.sizes[(part := self.regions.graph[chain]).indices], part.indptr[:-1])
-        cut = open_[1:] | open_[:-1] | (np.diff(np.cumsum(beside)[stops[1:]] // _AT_ONCE) > 0)
+        cut = open_[1:] | open_[:-1] | (np.diff(np.cumsum(beside)[stops[1:]] // AT_ONCE) > 0)
         return list(pairwise([0, *(np.flatnonzero(cut) + 1).tolist(), len(open_)]))
 
     def _roomiest(self, region: int) -> int:
@@ -223,7 +216,7 @@ class StepSearch:
 def step_search(clearance: ClearanceMap) -> StepSearch:
     """Prepare searches over a map's cells."""
     joins = _joins(clearance)
-    large = int(np.count_nonzero(clearance.passable())) > _AT_ONCE
+    large = int(np.count_nonzero(clearance.passable())) > AT_ONCE
     return StepSearch(clearance, joins, regions_of(clearance, joins) if large else None)
 
 
@@ -237,8 +230,9 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
     names = at[:, 1] * (2 * grid.cols + 1) + at[:, 0]
     order = np.argsort(names)
     one, other, ends = [], [], []
-    for dy in range(-3, 4):
-        for dx in range(-3, 4):
+    steps = range(-ceil(2.0 * _NEAR_TIGHT), ceil(2.0 * _NEAR_TIGHT) + 1)
+    for dy in steps:
+        for dx in steps:
             if not 0.0 < 0.5 * np.hypot(dx, dy) <= _NEAR_TIGHT:
                 continue
             x, y = at[:, 0] + dx, at[:, 1] + dy
@@ -259,12 +253,7 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
 
 
 def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
-    """Return the regions of a map.
-
-    Parameters
-    ----------
-    joins : (tight places, cells and tight places) costs of the steps from tight places.
-    """
+    """Return the regions of a map, with the costs of the steps from tight places to cells and tight places."""
     grid = clearance.geometry
     label, count = np.zeros((grid.rows, grid.cols), dtype=np.int32), 0
     row, col = (n.ravel().astype(np.float64) for n in np.indices((STRIP, grid.cols)))
