@@ -45,7 +45,7 @@ def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], so
         if scale != scales[-1] and _worst(graph, dict.fromkeys(chosen, scale)) <= 1.0:
             continue
         kernel = Kernel("geman-mcclure", scale)
-        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))
         graph = optimizer.optimize(replace(graph, edges=edges), solver)[0]
     return graph
 
@@ -80,7 +80,7 @@ def optimize_gnc(
     weights (e,) themselves, 0 = outlier, 1 = inlier.
     """
     check(graph)
-    edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+    edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))
     plain = replace(graph, edges=edges)
     linearized = linearize(plain)
     normal = NormalEquations(plain, linearized)
@@ -133,10 +133,7 @@ def _worst(graph: Graph, thresholds: Mapping[int, float]) -> float:
 
 def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tuple[Graph, list[Linearization]]:
     """Return the present estimates with the plain graph's edges weighted, and their linearisation."""
-    edges = tuple(
-        replace(e, weights=weights[k] * e.own_weights) if k in weights else e  # type: ignore[type-var]
-        for k, e in enumerate(plain.edges)
-    )
+    edges = tuple(replace(e, weights=weights[k] * e.own_weights) if k in weights else e for k, e in enumerate(plain.edges))
     graph = replace(current, edges=edges)
     return graph, linearize(graph)
 
@@ -163,11 +160,11 @@ def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
     def parts() -> Iterator[Edges]:
         for e, loop in zip(graph.edges, closing(graph), strict=True):
             if loop is None:
-                yield replace(e, kernel=kernel)  # type: ignore[type-var]
+                yield replace(e, kernel=kernel)
                 continue
             for chosen, used in ((~loop, e.kernel), (loop, kernel)):
                 if chosen.any():
-                    yield replace(e.rows(chosen), kernel=used)  # type: ignore[type-var]
+                    yield replace(e.rows(chosen), kernel=used)
 
     return replace(graph, edges=tuple(parts()))
 

@@ -17,9 +17,9 @@ from scipy import sparse
 from ..arrays import WIDE, Floats, Ints
 from .elimination import choose_ordering
 from .factorization import Blocks, Factor, IterativeLayout, Layout, SparseLayout, counted, make_layout
-from .graph import Graph, Linearization, kernel_weights, linearize
+from .graph import WIDTHS, Graph, Linearization, kernel_weights, linearize
 from .schwarz_cg import chains, cut
-from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
+from .unknowns import Unknowns, free_unknowns, linked_poses
 from .work import PRODUCTS
 
 _AT_ONCE = 1 << 15

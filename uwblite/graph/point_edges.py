@@ -9,8 +9,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import EdgeTable, Graph, Linearization, whiten
-from .robust import SQUARED, Kernel
+from .graph import Edges, Graph, Linearization, whiten
 
 _LEAST = 1e-6
 """Least distance, m: for smaller ones the direction is not defined."""
@@ -18,7 +17,7 @@ _LEAST = 1e-6
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class AnchorDistanceEdges(EdgeTable):
+class AnchorDistanceEdges(Edges):
     """Distance between two anchors: e = |a_i - a_j| - d."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "anchors", "j": "anchors"}
@@ -31,8 +30,6 @@ class AnchorDistanceEdges(EdgeTable):
     """(e,) m."""
     sigma: Floats
     """(e,) m."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both anchors."""
@@ -45,7 +42,7 @@ class AnchorDistanceEdges(EdgeTable):
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class PointDistanceEdges(EdgeTable):
+class PointDistanceEdges(Edges):
     """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.
 
     The points are landmarks as seen from the two poses: their distance in the map has to be the measured one.
@@ -66,8 +63,6 @@ class PointDistanceEdges(EdgeTable):
     """(e,) m."""
     sigma: Floats
     """(e,) m."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def _arms(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return both points as seen from their poses, turned into the map (e, 2), their offset (e, 2) and distance (e,)."""
@@ -92,7 +87,7 @@ class PointDistanceEdges(EdgeTable):
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkEdges(EdgeTable):
+class LandmarkEdges(Edges):
     """Position of a landmark, which is stored as an anchor, in the frame of a pose: e = X^-1 a - z."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"pose": "poses", "anchor": "anchors"}
@@ -106,8 +101,6 @@ class LandmarkEdges(EdgeTable):
     """(e, 2) measured position in the frame of the pose, m."""
     sqrt_information: Floats
     """(e, 2, 2) L with information = L^T L."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose and landmark."""

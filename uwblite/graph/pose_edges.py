@@ -13,8 +13,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import Block, EdgeTable, Graph, Linearization, whiten
-from .robust import SQUARED, Kernel
+from .graph import Block, Edges, Graph, Linearization, whiten
 
 # An edge between poses has the error e = Z^-1 (Xi^-1 Xj); with m = tj - ti - R(theta_i) z its plane part is
 # R(theta_i + theta_z)^T m. All its whitened derivatives are combinations of three columns, those by x, y and theta of
@@ -56,7 +55,7 @@ def _by_pose(*columns: Floats) -> Floats:
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class RelativePoseEdges(EdgeTable):
+class RelativePoseEdges(Edges):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses"}
@@ -70,8 +69,6 @@ class RelativePoseEdges(EdgeTable):
     """(e, 3) measured pose."""
     sqrt_information: Floats
     """(e, 3, 3) L with information = L^T L in the chart e = Z^-1 (Xi^-1 Xj); may be singular."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""
@@ -84,7 +81,7 @@ class RelativePoseEdges(EdgeTable):
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryEdges(EdgeTable):
+class OdometryEdges(Edges):
     """Motion from pose i to pose j by odometry, corrected by its calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
@@ -116,8 +113,6 @@ class OdometryEdges(EdgeTable):
     calibration: Ints
     """(e, 8) indices of s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad), w (rad) in the calibration block; -1 = not an
     unknown (taken as 0)."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
     slips: Floats | None = None
     """(e,) probability that the wheels slip over each step, by what is no scan; not yet in the information. None = none."""
 
@@ -210,7 +205,7 @@ _LEAST_SCALE = 0.1
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanEdges(EdgeTable):
+class ScanEdges(Edges):
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
 
     Clouds are in the base frame by the nominal mounting and the clock with which they were made. The true frame of cloud
@@ -242,8 +237,6 @@ class ScanEdges(EdgeTable):
     """(4,) indices of C's x, y, theta and of the delay, s, in the calibration block; -1 = not an unknown (taken as 0)."""
     made_with: float = 0.0
     """Delay with which the clouds were made, s."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""

@@ -10,8 +10,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import Block, EdgeTable, Graph, Linearization
-from .robust import SQUARED, Kernel
+from .graph import Block, Edges, Graph, Linearization
 
 _LEAST_SQUARE = 1e-4
 """m^2; a range shorter than the anchor's height keeps a horizontal distance of a centimetre."""
@@ -19,7 +18,7 @@ _LEAST_SQUARE = 1e-4
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeEdges(EdgeTable):
+class RangeEdges(Edges):
     """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).
 
     The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
@@ -55,8 +54,6 @@ class RangeEdges(EdgeTable):
     calibration: Ints
     """(e, 6) indices of scale, bias (m), q (m^2, unknown squared height), tag x, tag y (m, corrections) and delay (s);
     -1 = not an unknown (taken as 0)."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
     late: Floats = field(default_factory=lambda: np.zeros(0))

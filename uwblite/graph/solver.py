@@ -299,6 +299,8 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
 
 _AS_PREDICTED = 0.9
 """Share of the predicted decrease from which on the other way of moving has little to gain."""
+
+
 def cheaper_move(
     graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools, enough: float
 ) -> tuple[Graph, list[Linearization], float]:

@@ -9,9 +9,6 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .graph import Graph, Linearization
 
-WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
-"""Blocks of unknowns, and the scalars of one unknown."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:

@@ -153,7 +153,7 @@ def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> S
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
     none, names = np.broadcast_to(0.0, (len(i), 3, 3)), scan_indices(graph.calibration)
-    return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
+    return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, kernel=Kernel("cauchy", 5.0))
 
 
 def refine(

@@ -56,7 +56,7 @@ def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: 
         drift_time(keyframes),
         sqrt_information,
         odometry_indices(calibration, n),
-        config.kernel,
+        kernel=config.kernel,
     )
 
 

@@ -170,7 +170,7 @@ def _anchor_priors(constraints: Constraints, index: dict[str, int], moved: dict[
             place = np.array([index[a.id] for a in anchors], dtype=np.intp)
             value = np.array([a.position for a in anchors])
             root = np.array([np.eye(2) / a.sigma for a in anchors])
-            edges.append(PriorEdges("anchors", place, value, root, kernel))
+            edges.append(PriorEdges("anchors", place, value, root, kernel=kernel))
     return edges
 
 
