@@ -33,10 +33,8 @@ class AnchorDistanceEdges(Edges):
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both anchors."""
-        offset = graph.anchors[self.i] - graph.anchors[self.j]
-        length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
-        by_i = (offset / (length * self.sigma)[:, None])[:, None, :]
-        residuals = ((length - self.distance) / self.sigma)[:, None]
+        residuals, along = _distance_error(self, graph.anchors[self.i] - graph.anchors[self.j])
+        by_i = along[:, None]
         return Linearization(residuals, (("anchors", self.i, by_i), ("anchors", self.j, -by_i)))
 
 
@@ -64,25 +62,25 @@ class PointDistanceEdges(Edges):
     sigma: Floats
     """(e,) m."""
 
-    def _arms(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return both points as seen from their poses, turned into the map (e, 2), their offset (e, 2) and distance (e,)."""
-        one, other = graph.poses[self.i], graph.poses[self.j]
-        arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
-        offset = one[:, :2] + arm_i - other[:, :2] - arm_j
-        return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
-
-    def lengths(self, graph: Graph) -> Floats:
-        """Return the distances (e,), m, at the graph's estimates."""
-        return self._arms(graph)[3]
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""
-        arm_i, arm_j, offset, length = self._arms(graph)
-        along = offset / (length * self.sigma)[:, None]
-        by_i = np.column_stack([along, along[:, 1] * arm_i[:, 0] - along[:, 0] * arm_i[:, 1]])[:, None, :]
-        by_j = np.column_stack([-along, along[:, 0] * arm_j[:, 1] - along[:, 1] * arm_j[:, 0]])[:, None, :]
-        residuals = ((length - self.distance) / self.sigma)[:, None]
+        one, other = graph.poses[self.i], graph.poses[self.j]
+        arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
+        residuals, along = _distance_error(self, one[:, :2] + arm_i - other[:, :2] - arm_j)
+        by_i = np.column_stack([along, along[:, 1] * arm_i[:, 0] - along[:, 0] * arm_i[:, 1]])[:, None]
+        by_j = np.column_stack([-along, along[:, 0] * arm_j[:, 1] - along[:, 1] * arm_j[:, 0]])[:, None]
         return Linearization(residuals, (("poses", self.i, by_i), ("poses", self.j, by_j)))
+
+
+def _distance_error(edges: AnchorDistanceEdges | PointDistanceEdges, offset: Floats) -> tuple[Floats, Floats]:
+    """Return whitened residuals (e, 1) and their derivatives (e, 2) by the offset (e, 2) of two points."""
+    length = np.maximum(np.hypot(*offset.T), _LEAST)
+    return ((length - edges.distance) / edges.sigma)[:, None], offset / (length * edges.sigma)[:, None]
+
+
+def distances(edges: AnchorDistanceEdges | PointDistanceEdges, graph: Graph) -> Floats:
+    """Return the distances (e,), m, at the graph's estimates."""
+    return edges.residuals(graph)[:, 0] * edges.sigma + edges.distance
 
 
 @documented

@@ -22,7 +22,7 @@ from ..arrays import Bools, Floats, Ints
 from ..constraints import Clock, Constraints, GivenAnchor, GivenLandmark
 from ..errors import ConfigError
 from ..graph.graph import Edges, Graph, PriorEdges
-from ..graph.point_edges import AnchorDistanceEdges, PointDistanceEdges
+from ..graph.point_edges import AnchorDistanceEdges, PointDistanceEdges, distances
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import optimize
@@ -317,7 +317,7 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
 
 def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
     """Return the distances in the map, ready for a report; note those that differ from the measured ones."""
-    lengths = tied.edges.lengths(graph)
+    lengths = distances(tied.edges, graph)
     figures: list[dict[str, object]] = []
     for number, given in enumerate(task.constraints.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))
