@@ -25,8 +25,6 @@ _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""
 _WIDEST_BORDER = 48
 """Most scalars in a border; more of them stay in the sparse matrix."""
-_LONGEST_LINK = 16
-"""Longest reach of an edge in a chain, poses."""
 _MANY, _TIED = 500, 4
 """From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
 are connected, in the rooms of a site or the streets of a town only those nearby."""
@@ -275,7 +273,7 @@ class Ordering:
     """Multiplications of a factorisation, where they are many enough to be counted; more than there are, where they are few."""
 
 
-def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
@@ -283,13 +281,10 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
     width : (n,) scalars of each node.
     subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
-    last : poses that come after the others, in the sparse form.
     """
     if poses < 2:
         return Ordering(np.arange(poses), False, False)
     among = pairs.take(np.flatnonzero(np.maximum(pairs[:, 0], pairs[:, 1]) < poses), axis=0)
-    if last is not None:
-        return Ordering(_before(among, poses, last), False, False)
     pattern = adjacency(among, poses)
     if subtrees:
         return Ordering(contiguous(among, minimum_degree(pattern))[0], False, False)
@@ -314,22 +309,3 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
         return Ordering(np.arange(poses), False, False, iterative=True)
     return Ordering(order, bordered, False, work=multiplications)
-
-
-def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
-    """Return the order in which some poses come last and the others fill little.
-
-    The remainder of a chain is a chain: it is halved repeatedly by blocks as long as its edges reach, so that each
-    elimination connects few of the last poses. (Minimum degree runs along the chain and connects all of them.)
-    """
-    late = np.zeros(poses, dtype=bool)
-    late[last[last >= 0]] = True
-    reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
-    if reach > _LONGEST_LINK:
-        order = minimum_degree(adjacency(pairs, poses))
-    else:
-        block = np.arange(poses) // reach + 1
-        order = np.lexsort((np.arange(poses), block & -block))
-    order = np.concatenate([order[~late[order]], order[late[order]]])
-    walk = contiguous(pairs, order)[0]
-    return np.concatenate([walk[~late[walk]], order[late[order]]])

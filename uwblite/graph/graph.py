@@ -23,7 +23,7 @@ from .work import Work
 
 WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
 """Blocks of unknowns, and the scalars of one unknown."""
-POSE: Shape = (WIDTHS["poses"],)
+POSE: tuple[int, ...] = (WIDTHS["poses"],)
 """Shape of a pose; POSE * 2 is that of its information."""
 Block = tuple[str, Ints, Floats]
 """(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
@@ -177,7 +177,7 @@ class Graph:
     """To which the operations on this graph, and on all that are made from it, are added; see graph/work.py."""
 
     def __post_init__(self) -> None:
-        rows = {"poses": ("n", *POSE), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)}
+        rows: dict[str, Shape] = {"poses": ("n", *POSE), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)}
         settle(self, "Graph", rows)
         require_type(self.calibration, "Graph.calibration", Calibration)
         values = self.calibration.values

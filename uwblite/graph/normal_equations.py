@@ -47,16 +47,13 @@ class _Places:
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(
-        self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False, last: Ints | None = None
-    ) -> None:
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
         """Number the unknowns and find the place of every product.
 
         Parameters
         ----------
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
         subtrees : order for the selected inverse, not for speed.
-        last : poses to be eliminated after all others.
         """
         self.spent = graph.work
         """Counts what is done with these equations."""
@@ -74,8 +71,7 @@ class NormalEquations:
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
-        late = None if last is None else node["poses"][last]
-        ordering = choose_ordering(pairs, counts[0], width, subtrees, late)
+        ordering = choose_ordering(pairs, counts[0], width, subtrees)
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
@@ -262,9 +258,7 @@ def _same(one: list[_Block], other: list[_Block]) -> bool:
     )
 
 
-def filled(
-    graph: Graph, subtrees: bool = False, last: Ints | None = None, like: NormalEquations | None = None
-) -> NormalEquations:
+def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = None) -> NormalEquations:
     """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations.
 
     Parameters
@@ -272,7 +266,7 @@ def filled(
     like : normal equations of a graph with the same unknowns and edges, if there are any: they are filled again.
     """
     linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees, last) if like is None else like
+    normal = NormalEquations(graph, linearized, subtrees) if like is None else like
     normal.fill(linearized, [kernel_weights(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
     return normal
 

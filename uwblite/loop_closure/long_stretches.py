@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
-from ..graph.joint_covariance import JointCovariance
+from ..graph.marginals import JointCovariance
 from ..lidar import submaps
 from ..lidar.submaps import Submaps
 from .candidates import Candidates, overlap_probability, propose, uncertain
