@@ -35,7 +35,7 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .elimination import PER_COMPLEX, work_of
+from .elimination import work_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
 from .point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges, distances
@@ -233,7 +233,7 @@ def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
     try:
         minimum, summary = optimize(graph, _POLISHED, None, allowed)
         S, D = certificate_matrix(minimum)
-        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * PER_COMPLEX * work_of(S) > allowed:
+        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * work_of(S) > allowed:
             return Certificate(False, 0.0, "its edges tie so many poses to so many others that the matrix would fill up")
         bound = max(summary.chi2 - _gap(S, D, 0.5 * negligible, summary.chi2), 0.0)
     except SolverError as problem:

@@ -18,7 +18,7 @@ from ..arrays import WIDE, Floats, Ints
 from .elimination import choose_ordering
 from .factorization import Blocks, Factor, IterativeLayout, Layout, SparseLayout, counted, make_layout
 from .graph import WIDTHS, Graph, Linearization, kernel_weights, linearize
-from .schwarz_cg import chains, cut
+from .schwarz_cg import cut
 from .unknowns import Unknowns, free_unknowns, linked_poses
 from .work import PRODUCTS
 
@@ -85,12 +85,11 @@ class NormalEquations:
             number = self.unknowns.number["poses"]
             chain = np.flatnonzero(number[:, 0] >= 0)
             linked = (np.diff(chain) == 1) & linked_poses(len(number), linearized)[chain[:-1]]
-            order, linked = chains(pairs[(pairs < counts[0]).all(axis=1)], counts[0], linked)
-            pieces = cut(number[chain[order]], graph.poses[chain[order]], self.unknowns.size, linked)
+            pieces = cut(number[chain], graph.poses[chain], self.unknowns.size, linked)
             self._layout: Layout = IterativeLayout(blocks, pieces)
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
-        self.work = pieces.work(0, 0) if ordering.iterative else ordering.work
+        self.work = pieces.work() if ordering.iterative else ordering.work
         """Multiplications of a factorisation, where they are many enough to be counted."""
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
