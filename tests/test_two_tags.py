@@ -18,8 +18,7 @@ from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import TrilaterationConfig
-from uwblite.sensor_log import SensorLog, SensorMounting, UwbRanges
+from uwblite.sensor_log import LONGEST_RANGE, SensorLog, SensorMounting, UwbRanges
 
 ANCHORS = np.array([[-6.0, -5.0], [6.0, -5.5], [6.5, 5.0], [-5.5, 6.0]])
 FRONT, REAR = (0.35, 0.05), (-0.40, -0.10)
@@ -48,14 +47,14 @@ def test_at_the_truth_every_range_of_either_tag_fits():
     frames = keyframes.select(odometry, KeyframeConfig())
     attached = attach_ranges(ranges, odometry, frames, MOUNTING)
     listed = unknowns(CalibrationConfig(), ranges.anchor_ids, np.ones(4, dtype=bool))
-    edges = range_edges(attached, ranges.anchor_ids, MOUNTING, block(listed), RangeNoiseConfig(1.0), TrilaterationConfig())
+    edges = range_edges(attached, ranges.anchor_ids, MOUNTING, block(listed), RangeNoiseConfig(1.0), LONGEST_RANGE)
     # The anchors in the frame of the odometry, which begins at 0.
     T_odom_map = se2.compose(frames.odometry[0], se2.inverse(truth[0]))
     graph = Graph(frames.odometry, se2.transform(T_odom_map, ANCHORS), calibration=block(listed))
     assert np.abs(edges.residuals(graph)).max() < 2e-3  # interpolation between samples of 0.1 s
     blind = replace(ranges, tag=None)
     attached = attach_ranges(blind, odometry, frames, MOUNTING)
-    wrong = range_edges(attached, ranges.anchor_ids, MOUNTING, block(listed), RangeNoiseConfig(1.0), TrilaterationConfig())
+    wrong = range_edges(attached, ranges.anchor_ids, MOUNTING, block(listed), RangeNoiseConfig(1.0), LONGEST_RANGE)
     assert np.abs(wrong.residuals(graph)).max() > 0.5
 
 
@@ -109,7 +108,7 @@ def test_each_tag_has_its_own_place_delay_and_height(given):
     for name in ids:
         values |= {f"height2:{name}": 0.8**2, f"height2:{name}@tag2": 0.5**2}
     calibration = replace(block(listed), values=np.array([values.get(u.key.label, 0.0) for u in listed]))
-    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(1.0), TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(1.0), LONGEST_RANGE)
     T_odom_map = se2.compose(frames.odometry[0], se2.inverse(truth[0]))
     graph = Graph(frames.odometry, se2.transform(T_odom_map, ANCHORS), calibration=calibration)
     assert np.abs(edges.residuals(graph)).max() < 2e-3

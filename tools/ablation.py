@@ -2,7 +2,7 @@
 """What each ingredient buys: every one left out in turn, over hard simulated worlds and recordings of others.
 
     python tools/ablation.py                                        everything; writes docs/lab/accuracy.md
-    python tools/ablation.py --only lab,intel --of floor,columns --print    a part of it
+    python tools/ablation.py --only lab,intel --of surfaces,columns --print    a part of it
     python tools/ablation.py --seeds 3 --jobs 2 --keep rows.pkl     as many as time allows; the next call goes on
 
 An ingredient is left out by settings, or by a function in place of its own. Errors are the ATE or the mean over relations; a
@@ -33,11 +33,8 @@ from simulation.recording import Settings
 from trials import ROOT, SHARED, judged, made, real_error, spread_out, table, write_section
 
 from uwblite.config import override
-from uwblite.graph.graph import Graph
-from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.io.carmen import read_log
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.floor import Floor, even
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.estimate import Task as Pipeline
 from uwblite.sensor_log import SensorLog
@@ -84,10 +81,6 @@ def _pairs_alone(estimate: Estimate, task: Pipeline) -> Estimate:
     return estimate.solved(task.config.solver)[0]
 
 
-def _even_floor(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[OdometryEdges, Floor]:
-    return wheels, even(wheels)
-
-
 INGREDIENTS: dict[str, LeftOut] = {
     "nothing (the defaults)": LeftOut(),
     "surfaces": LeftOut(patches=(("pipeline.surface_adjustment.adjust_surfaces", _pairs_alone),)),
@@ -101,25 +94,21 @@ INGREDIENTS: dict[str, LeftOut] = {
         ("lidar.walls._halved", lambda number, *places: np.unique(number, return_inverse=True)[1]),
     )),
     "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
-    "floor": LeftOut(patches=(("odometry.floor.learnt", _even_floor),)),
+    "noise of wheels by rays": LeftOut(patches=(("pipeline.surface_adjustment.noise_at", lambda graph, wheels, sure: wheels),)),
     "points between beams": LeftOut(patches=(("lidar.beam_gaps.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),
-    "loose links": LeftOut(patches=(
-        ("pipeline.closure_rounds._with_loose_links_tied", lambda base, estimate, task: (base, estimate.closures, estimate)),
-    )),
-    "long stretches": LeftOut(patches=(("loop_closure.long_stretches.any_uncertain", lambda *given: False),)),
+    "long stretches": LeftOut(patches=(("loop_closure.candidates.any_uncertain", lambda *given: False),)),
     "joint refinement": LeftOut(("refinement.rounds=0",)),
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "corners": LeftOut(("clouds.linearity=0.85",)),
     "deskewing": LeftOut(log=flat),
-    "broken stretches": _stage("broken_stretches.replace_broken_stretches"),
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),
-    "mirror images": _stage("mirror_images.find_mirror_images"),
-    "sides of a line of anchors": _stage("line_sides.choose_side"),
+    "mirror images": _stage("range_alternatives.find_mirror_images"),
+    "sides of a line of anchors": _stage("range_alternatives.choose_side"),
     "priors of ranges selected": _stage("radio_stages.select_range_priors"),
     "tag pattern": _stage("lidar_stages._without_pattern"),
     "marginal likelihood of the radio's priors": LeftOut(
@@ -144,9 +133,9 @@ INGREDIENTS: dict[str, LeftOut] = {
     **{
         f"repair: {name.partition('.')[2].replace('_', ' ')}": _repair(name)
         for name in (
-            "stuck_sensors.without_repeated_scans", "stuck_sensors.without_lidar_marks", "screen.without_own_body",
-            "stuck_sensors.without_marks", "stuck_sensors.without_repeated_ranges", "screen.without_shared_names",
-            "directions.heading_with_the_path", "directions.laser_upright", "screen.with_late_scans_placed",
+            "repeats.without_repeated_scans", "repeats.without_lidar_marks", "repeats.without_own_body",
+            "repeats.without_marks", "repeats.without_repeated_ranges", "range_motion.without_shared_names",
+            "directions.heading_with_the_path", "directions.laser_upright", "clocks.with_late_scans_placed",
             "screen.heading_from_gyro",
         )
     },

@@ -60,7 +60,7 @@ from uwblite.graph.work import Work
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_relations
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pipeline import scan_clouds
+from uwblite.pipeline import keyframe_data
 from uwblite.pipeline.recordings import gather
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
@@ -453,7 +453,7 @@ def registered(args: argparse.Namespace) -> str:
             continue
         recordings = gather([log], config.keyframes)
         inside = (recordings.stamps >= stamps[0]) & (recordings.stamps <= stamps[-1])
-        clouds = scan_clouds.make(recordings, config, 0.0, Work()).clouds.chosen(np.flatnonzero(inside))
+        clouds = keyframe_data.make(recordings, config, 0.0, Work()).clouds.chosen(np.flatnonzero(inside))
         truth = se2.interpolate_trajectory(stamps, poses, recordings.stamps[inside])
         rows.append((name, registration_law.placements(clouds, truth, 1, np.random.default_rng(args.seed), error)))
         print(f"{name}: log score {rows[-1][1].log_score:.3f}", file=sys.stderr, flush=True)

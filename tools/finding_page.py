@@ -17,6 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from uwblite.assessment.causes import EXPLAINS
+from uwblite.assessment.facts import TEXTS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "uwblite"
@@ -62,6 +63,11 @@ class Rule:
 def rules() -> tuple[Rule, ...]:
     """Return the rules of the package, in the order of kinds."""
     found: dict[tuple[str, str], Rule] = {}
+    for kind, row in TEXTS.items():
+        # Of a choice the first text, of a figure an ellipsis.
+        text = re.sub(r"{[^{}:]+:([^{}|]*)\|[^{}]*}", r"\1", row.text)
+        text = re.sub(r"{[^{}]+}", "...", text)
+        found[kind, row.says] = Rule(kind, row.severity, "assessment/facts.py", row.says, text)
     sources = ((path, path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py")))
     for path, text in sources:
         for function in _functions(ast.parse(text)) if MAKES.search(text) else ():
@@ -90,7 +96,8 @@ def _rules_of(function: ast.FunctionDef, room: str) -> Iterator[Rule]:
             continue
         severity = FACTORIES.get(name, "")
         if name == "Finding" and len(call.args) > 1:
-            severity = getattr(call.args[1], "id", "").lower()
+            name = getattr(call.args[1], "id", "").lower()
+            severity, name = name if name in ("doubt", "warning", "note") else "", "Finding"
         text = call.args[2 if name == "Finding" else 1] if len(call.args) > (2 if name == "Finding" else 1) else None
         if isinstance(text, ast.Name):
             before = [value for line, target, value in texts if target == text.id and line <= call.lineno]

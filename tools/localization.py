@@ -33,11 +33,11 @@ from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import FREE, OccupancyGrid
 from uwblite.localization import Localizer, LocalizerState, Scanner
-from uwblite.localization.comparison import INDEPENDENT_RAYS, LOOK_BACK
+from uwblite.localization.comparison import LOOK_BACK
 from uwblite.localization.hypotheses import apart
 from uwblite.localization.known_map import KnownMap
-from uwblite.localization.range_likelihood import expected_errors, range_likelihood
-from uwblite.localization.walls import walls_of
+from uwblite.localization.range_model import expected_errors, range_likelihood
+from uwblite.localization.walls import INDEPENDENT_RAYS, walls_of
 
 WORLDS = ("hall", "lab", "corridor", "warehouse")
 BUILDINGS = "83,91,97"

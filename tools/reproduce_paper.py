@@ -30,7 +30,8 @@ from uwblite.io.png import write_png
 from uwblite.map_result import MapResult
 from uwblite.mapping import build_map
 from uwblite.pipeline.mapping_config import preset
-from uwblite.report.picture import Overlay, PictureAnchor, draw_map
+from uwblite.report.drawn_map import drawn_map
+from uwblite.report.picture import draw_map
 
 PRESETS = ("paper", "default")
 METHODS = {
@@ -119,10 +120,7 @@ def work(task: Task) -> list[tuple[tuple[str, ...], Figures]]:
 
 def draw(result: MapResult, path: str, caption: str) -> None:
     """Draw a map as `uwblite map` does."""
-    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors if a.status != "unplaced"]
-    poses = result.graph.poses[:, :2]
-    ends = np.array([[*poses[c.i], *poses[c.j]] for c in result.closures if c.accepted]).reshape(-1, 4)
-    write_png(path, draw_map(result.grid, result.trajectory, Overlay(anchors, ends), caption=caption, size=560))
+    write_png(path, draw_map(drawn_map(result), caption=caption, size=560))
 
 
 def planned(args: argparse.Namespace, pictures: Path) -> list[Task]:

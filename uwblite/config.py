@@ -10,7 +10,7 @@ Laws: ``from_dict(type(c), to_dict(c))`` and ``from_dict(type(c), parse_toml(to_
 
 import ast
 import dataclasses
-import math
+import operator
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,20 +29,11 @@ RANGE, ADVANCED = "uwblite range", "uwblite advanced"
 """In the metadata of a field: its permitted range, and that it is for experiments."""
 
 
-def setting(
-    default: Any,
-    *,
-    above: float | None = None,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    advanced: bool = False,
-) -> Any:
+def setting(default: Any, *, advanced: bool = False, **limits: float) -> Any:
     """Return a dataclass field with a default and a permitted range: above < value, minimum <= value <= maximum.
 
     An advanced setting is for experiments and presets; lists for users leave it out where it has its default.
     """
-    limits = {"above": above, "minimum": minimum, "maximum": maximum}
-    limits = {k: v for k, v in limits.items() if v is not None}
     return dataclasses.field(default=default, metadata={ADVANCED: advanced, **({RANGE: limits} if limits else {})})
 
 
@@ -82,18 +73,14 @@ def override(config: Settings, assignments: Iterable[str]) -> Settings:
         name, equals, value = text.partition("=")
         if not equals or not name.strip():
             raise ConfigError(f"{text!r} sets nothing: write a setting as table.name=value, such as grid.resolution=0.1")
-        nested: Any = _parse_value(value.strip())
+        try:
+            nested: Any = tomllib.loads(f"value = {value}")["value"]
+        except ValueError:  # not TOML, or a number of thousands of digits
+            nested = value.strip()
         for part in reversed(name.strip().split(".")):
             nested = {part: nested}
         config = merge(config, nested)
     return config
-
-
-def _parse_value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except ValueError:  # not TOML, or a number of thousands of digits
-        return text
 
 
 def parse_toml(text: str, path: str = "") -> dict[str, Any]:
@@ -147,20 +134,18 @@ def _unknown(where: tuple[str, ...], cls: type, root: type) -> str:
     name = ".".join(where)
     if where[-1] in cls.__annotations__:
         return f"{name!r} is no setting any more: it is now a constant of {cls.__name__}, {getattr(cls, where[-1])!r}"
-    return f"unknown setting {name!r}{_did_you_mean(where, cls, root)}"
-
-
-def _did_you_mean(where: tuple[str, ...], cls: type, root: type) -> str:
     known = [name for name, _ in leaves(root)]
     known += sorted({name.rpartition(".")[0] for name in known} - {""})
-    wanted = ".".join(where)
-    ends = [name for name in known if name.rpartition(".")[2] == where[-1]]
-    near = ends or get_close_matches(wanted, known, n=1, cutoff=0.75)
-    if not near:
-        by_end = {name.rpartition(".")[2]: name for name in reversed(known)}
-        near = [by_end[end] for end in get_close_matches(where[-1], by_end, n=1, cutoff=0.7)]
+    by_end = {name.rpartition(".")[2]: name for name in reversed(known)}
+    ends = [by_end[where[-1]]] if where[-1] in by_end else []
+    near = ends or get_close_matches(name, known, n=1, cutoff=_ALIKE)
+    near = near or [by_end[end] for end in get_close_matches(where[-1], by_end, n=1, cutoff=_ALIKE)]
     siblings = ", ".join(".".join((*where[:-1], f.name)) for f in dataclasses.fields(cls))
-    return f"; did you mean {near[0]!r}?" if near else f"; there are {siblings}"
+    return f"unknown setting {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"there are {siblings}")
+
+
+_ALIKE = 0.7
+"""Share of letters by which a name is taken for a misspelt one."""
 
 
 def _convert(value: Any, hint: Any, where: tuple[str, ...]) -> Any:
@@ -177,28 +162,21 @@ def _convert(value: Any, hint: Any, where: tuple[str, ...]) -> Any:
             raise ConfigError(f"{'.'.join(where)} must be one of {', '.join(map(str, args))}, not {_shown(value)}{hint_text}")
         return value
     if origin is tuple:
-        return _convert_tuple(value, args, where)
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{'.'.join(where)} must be a list, not {_shown(value)}")
+        each = (args[0],) * len(value) if args[1:] == (Ellipsis,) else args
+        if len(value) != len(each):
+            raise ConfigError(f"{'.'.join(where)} must have {len(each)} values, not {len(value)}")
+        return tuple(_convert(v, a, where) for v, a in zip(value, each, strict=True))
     if origin is dict:
         if not isinstance(value, Mapping):
             raise ConfigError(f"{'.'.join(where)} must be a table, not {_shown(value)}")
         return {str(k): _convert(v, args[1], (*where, str(k))) for k, v in value.items()}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    if hint is float and type(value) is int:
         value = float(value)
-    if type(value) is not hint:
+    if type(value) is not hint or value != value:
         raise ConfigError(f"{'.'.join(where)} must be {_TYPE_NAMES.get(hint, str(hint))}, not {_shown(value)}")
-    if hint is float and math.isnan(value):
-        raise ConfigError(f"{'.'.join(where)} must be a number, not nan")
     return value
-
-
-def _convert_tuple(value: Any, args: tuple[Any, ...], where: tuple[str, ...]) -> tuple[Any, ...]:
-    if not isinstance(value, list | tuple):
-        raise ConfigError(f"{'.'.join(where)} must be a list, not {_shown(value)}")
-    if len(args) == 2 and args[1] is Ellipsis:
-        args = (args[0],) * len(value)
-    if len(value) != len(args):
-        raise ConfigError(f"{'.'.join(where)} must have {len(args)} values, not {len(value)}")
-    return tuple(_convert(v, a, where) for v, a in zip(value, args, strict=True))
 
 
 def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
@@ -207,20 +185,19 @@ def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
     return field.metadata.get(RANGE, {"minimum": 0.0} if quantity else {})
 
 
+_COMPARED = {"above": (">", operator.gt), "minimum": (">=", operator.ge), "maximum": ("<=", operator.le)}
+
+
 def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]) -> Any:
-    if not limits:
-        return value
     for v in value if isinstance(value, tuple) else (value,):
-        if v is None:
-            continue
-        inside = (
-            v > limits.get("above", -math.inf) or "above" not in limits,
-            v >= limits.get("minimum", -math.inf),
-            v <= limits.get("maximum", math.inf),
-        )
-        if not all(inside):
+        if v is not None and not all(_COMPARED[name][1](v, limit) for name, limit in limits.items()):
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; it must be {range_text(limits)}")
     return value
+
+
+def range_text(limits: Mapping[str, float]) -> str:
+    """Return a permitted range in words, such as '> 0 and <= 1'."""
+    return " and ".join(f"{_COMPARED[name][0]} {limit:g}" for name, limit in limits.items())
 
 
 _SMALLEST, _LARGEST, _MOST_COUNTED = 1e-15, 1e6, 10**9
@@ -239,12 +216,6 @@ def _check_size(value: Any, default: Any, where: tuple[str, ...]) -> None:
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; its size must be {least:g} to {most:g}")
 
 
-def range_text(limits: Mapping[str, float]) -> str:
-    """Return a permitted range in words, such as '> 0 and <= 1'."""
-    signs = {"above": ">", "minimum": ">=", "maximum": "<="}
-    return " and ".join(f"{signs[k]} {v:g}" for k, v in limits.items())
-
-
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
@@ -260,7 +231,7 @@ def differences(config: Any, base: Any) -> list[str]:
 
 
 def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: bool = True) -> str:
-    """Return the settings as TOML, with the meaning of each setting as a comment where asked for.
+    """Return the settings as TOML.
 
     Parameters
     ----------
@@ -339,8 +310,7 @@ def toml_value(value: Any) -> str:
 
 
 def _toml_text(text: str) -> str:
-    escapes = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t", "\b": "\\b", "\f": "\\f"}
-    safe = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08X}") for c in text)
+    safe = (f"\\{c}" if c in '"\\' else c if c.isprintable() else f"\\U{ord(c):08X}" for c in text)
     return '"' + "".join(safe) + '"'
 
 

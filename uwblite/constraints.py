@@ -11,6 +11,9 @@ from .arrays import Bools, Floats, Ints
 from .config import documented, setting
 from .errors import ConfigError
 
+_SURVEYED, _BY_TAPE, _BY_EYE = 0.05, 0.02, 0.1
+"""Usual standard deviations of a surveyed place, a measured distance and a place that was recognised; m, rad of a heading."""
+
 
 @documented
 @dataclass(frozen=True, slots=True)
@@ -21,7 +24,7 @@ class GivenAnchor:
     """As in the recording."""
     position: tuple[float, float] = (0.0, 0.0)
     """m, the user's frame."""
-    sigma: float = setting(0.05, above=0.0)
+    sigma: float = setting(_SURVEYED, above=0.0)
     """Standard deviation of x and of y, m."""
     movable: bool = False
     """From an earlier map: it may have been moved since."""
@@ -36,7 +39,7 @@ class GivenPose:
     """s, on the recording's clock."""
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x, y, theta in the user's frame; m, m, rad."""
-    sigma: tuple[float, float, float] = setting((0.05, 0.05, 0.05), above=0.0)
+    sigma: tuple[float, float, float] = setting((_SURVEYED, _SURVEYED, _SURVEYED), above=0.0)
     """Standard deviations; m, m, rad. A large one (100) leaves this one free."""
     recording: int = setting(1, minimum=1)
     """Which of several recordings the stamp belongs to: 1, 2, ... as they are named to `map`."""
@@ -51,7 +54,7 @@ class GivenDistance:
     """Their ids."""
     distance: float = 0.0
     """m."""
-    sigma: float = setting(0.02, above=0.0)
+    sigma: float = setting(_BY_TAPE, above=0.0)
     """m."""
 
 
@@ -77,7 +80,7 @@ class GivenLandmarkDistance:
     """Their names."""
     distance: float = setting(0.0, above=0.0)
     """m."""
-    sigma: float = setting(0.02, above=0.0)
+    sigma: float = setting(_BY_TAPE, above=0.0)
     """m; of landmarks that are no columns it includes how well their places were read off the map."""
 
 
@@ -90,7 +93,7 @@ class GivenClosure:
     """s, on the recording's clock."""
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Pose of the robot at the second time as seen from the first; m, m, rad."""
-    sigma: tuple[float, float, float] = setting((0.1, 0.1, 0.1), above=0.0)
+    sigma: tuple[float, float, float] = setting((_BY_EYE, _BY_EYE, _BY_EYE), above=0.0)
     """m, m, rad."""
     recordings: tuple[int, int] = setting((1, 1), minimum=1)
     """Which of several recordings the stamps belong to."""

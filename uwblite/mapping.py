@@ -16,18 +16,16 @@ from .assessment import summary
 from .constraints import Constraints
 from .map_result import MapResult
 from .pipeline import (
-    anchor_heights,
     anchor_places,
-    broken_stretches,
     calibration_checks,
     closure_rounds,
     constraint_edges,
     final_stages,
     lidar_stages,
     map_frame,
-    mirror_images,
     neighbour_matching,
     radio_stages,
+    range_alternatives,
     surface_adjustment,
 )
 from .pipeline.estimate import Estimate, Task
@@ -73,7 +71,7 @@ def build_map(
     config = calibration_checks.with_given_mounting_and_clock(calibration_checks.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate, task = _in_sound_units(task, logs)
-    anchor_heights.check_heights(estimate, task)
+    range_alternatives.check_heights(estimate, task)
     for stage in _stages(task):
         estimate = stage(estimate, task)
         task = task.following(estimate)
@@ -113,7 +111,6 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
                 yield lidar_stages.refine_jointly
                 yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
-                yield broken_stretches.replace_broken_stretches
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places
@@ -121,5 +118,5 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield constraint_edges.tie_landmarks
     yield anchor_places.name_new_and_absent_anchors
     yield final_stages.final_optimisation
-    yield mirror_images.find_mirror_images
+    yield range_alternatives.find_mirror_images
     yield map_frame.align_axes

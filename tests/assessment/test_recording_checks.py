@@ -7,7 +7,7 @@ import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
-from uwblite.assessment import repairs
+from uwblite.assessment import facts
 from uwblite.assessment.recording import diagnose
 from uwblite.findings import doubt, warning
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting
@@ -142,7 +142,7 @@ def test_scans_in_millimetres_degrees_or_dark(sound):
     assert_named(replace(sound, scans=far), "doubt", "millimetres")
     assert_named(replace(sound, scans=replace(scans, angle_increment=1.5, angle_min=-120.0)), "doubt", "degrees")
     dark = replace(scans, ranges=np.full_like(scans.ranges, np.inf))
-    assert_named(replace(sound, scans=dark), "warning", "only 0 % of the beams")
+    assert_named(replace(sound, scans=dark), "warning", "only 0% of the beams")
     stuck = replace(scans, ranges=np.full_like(scans.ranges, 1.5))
     assert_named(replace(sound, scans=stuck), "warning", "scans equal the scan before")
 
@@ -210,4 +210,4 @@ def test_the_rhythm_of_a_log_that_a_program_wrote_blames_no_cable():
 
 
 def test_a_stretch_within_a_second_is_a_moment():
-    assert repairs.spans([(39.1, 39.3), (60.0, 64.2)]) == "t = 39 s, t = 60 to 64 s"
+    assert facts.spans([(39.1, 39.3), (60.0, 64.2)]) == "t = 39 s, t = 60 to 64 s"

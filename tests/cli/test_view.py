@@ -45,21 +45,21 @@ def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark)
     (mapped / "map_constraints.toml").unlink(missing_ok=True)
     with Served("view", "map", cwd=mapped) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
         browser.open(served.address)
-        browser.until("document.querySelector('section svg line.closure')")
+        browser.until("document.querySelector('section svg .kept polyline')")
         assert browser.run("document.documentElement.scrollWidth") <= width
         marks = browser.run("['.start', '.end', '.anchor text'].map(k => document.querySelectorAll('section svg ' + k).length)")
         assert marks == [1, 1, 4]
-        rejected = browser.run("document.querySelector('line.closure').dataset.closure")
-        browser.run("document.querySelector('line.closure').dispatchEvent(new MouseEvent('click'))")
+        rejected = browser.run("document.querySelector('.kept polyline').dataset.closure")
+        browser.run("document.querySelector('.kept polyline.hit').dispatchEvent(new MouseEvent('click'))")
         browser.run("document.querySelector('[data-wish=reject]').click()")
-        browser.until("document.querySelector('line.closure.reject')")
-        assert browser.run("document.querySelector('line.closure.reject').dataset.closure") == rejected
+        browser.until("document.querySelector('polyline.reject')")
+        assert browser.run("document.querySelector('polyline.reject').dataset.closure") == rejected
         assert len(parse_constraints((mapped / "map_constraints.toml").read_text()).forbidden) == 1
         assert browser.complaints == []
         if width < 1280:  # what the button does is the same everywhere
             return
         before = browser.run("document.querySelectorAll('section').length")
-        browser.run("document.querySelector('button.map').click()")
+        browser.run("document.querySelector('button.map-again').click()")
         browser.until(f"document.querySelectorAll('section').length > {before}", patience=180)
         browser.until("document.getElementById('say').textContent.length > 0")
         assert browser.complaints == []

@@ -239,10 +239,10 @@ def test_the_page_shows_a_log_that_grows(tmp_path, room_log, width, dark):
         browser.open(served.address)
         browser.until("document.querySelector('#map image')", patience=120)
         browser.until("document.querySelector('#robot path')")
-        before = browser.run("document.querySelector('#robot path').getAttribute('transform')")
+        before = browser.run("document.querySelector('#robot g').getAttribute('transform')")
         with open(log, "ab") as file:
             file.write(b"".join(lines[len(lines) // 2 :]) + b"ODOM half a li")
-        browser.until(f"document.querySelector('#robot path').getAttribute('transform') !== {json.dumps(before)}")
+        browser.until(f"document.querySelector('#robot g').getAttribute('transform') !== {json.dumps(before)}")
         assert browser.run("document.querySelectorAll('#sensors tr').length") == 4
         assert browser.run("document.documentElement.scrollWidth") <= width
         assert browser.complaints == []

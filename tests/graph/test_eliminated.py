@@ -6,7 +6,7 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import Blocks, WithBlocks, entries, factor, rows_of, side_by_side
+from uwblite.graph.eliminated import Blocks, WithBlocks, entries, factor, rows_of
 from uwblite.graph.graph import edge_weights
 from uwblite.graph.marginals import Marginals
 from uwblite.graph.normal_equations import filled
@@ -100,17 +100,6 @@ def test_what_nothing_measures_stays():
     x, _ = factor(normal, nothing).step(normal, nothing)
     assert np.all(np.isfinite(x))
     np.testing.assert_array_equal(x[normal.unknowns.number["anchors"][-1]], 0.0)
-
-
-def test_blocks_side_by_side_are_those_of_one_system():
-    _, normal, blocks, whole, gradient = planted()
-    n = normal.unknowns.size
-    alone = Blocks(sparse.csr_matrix((n, n)), sparse.csr_matrix((4, n)), np.eye(4)[None], np.zeros(n), np.ones((1, 4)))
-    both = side_by_side(blocks, alone)
-    x, s = factor(normal, both).step(normal, both)
-    expected = -np.linalg.solve(whole, gradient)
-    np.testing.assert_allclose(x, expected[:n], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(s, [*expected[n:].reshape(-1, 4), -np.ones(4)], rtol=1e-9, atol=1e-12)
 
 
 def test_blocks_add_up_and_what_is_fixed_is_left_out():

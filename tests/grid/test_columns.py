@@ -66,12 +66,12 @@ def test_three_points_are_enough_for_a_circle():
 
 
 def test_a_circle_scores_by_its_arc_less_what_stands_around_it_and_how_far_its_cells_are_off():
-    """A whole circle of points scores 1; half of a second one, three cells further out, costs 0.7 of its share."""
+    """A whole circle of points scores 1; half of a second one, three cells further out, costs its share."""
     rim, around = circle((0.0, 0.0), 0.25), circle((0.0, 0.0), 0.25 + 3.0 * CELL, 0.0, np.pi)
     for cells, spoilt in ((rim, 0.0), (np.concatenate([rim, around]), 0.5)):
         score, arc = _scores(np.zeros((1, 2)), cells, 0.25, CELL)
         assert arc[0] == 1.0
-        assert score[0] == pytest.approx(1.0 - 0.7 * spoilt, abs=0.7 * 2.5 / 24 if spoilt else 0.02)
+        assert score[0] == pytest.approx(1.0 - spoilt, abs=2.5 / 24 if spoilt else 0.02)
     wide = circle((0.0, 0.0), 0.25 + 0.5 * CELL)
     assert _scores(np.zeros((1, 2)), wide, 0.25, CELL)[0][0] == pytest.approx(0.75, abs=0.02)
 

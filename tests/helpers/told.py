@@ -1,11 +1,11 @@
 """What people are told of the facts of a screening or of the stages."""
 
-from uwblite.assessment import decisions, repairs
+from uwblite.assessment.facts import say
 
 
 def told(facts):
     """Return the finding of each fact."""
-    return list(repairs.say(facts, repairs.RULES | decisions.RULES))
+    return list(say(facts))
 
 
 def warned(stages):

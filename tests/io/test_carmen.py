@@ -282,17 +282,6 @@ def test_scans_of_another_number_of_beams_are_resampled(tmp_path):
     np.testing.assert_allclose(log.scans.ranges[1, 1:-1], wall(181, -90.0)[1:-1], atol=2e-3)
 
 
-def test_an_increment_of_one_beam_too_few_is_reported(tmp_path):
-    def scan(beams, increment):
-        numbers = f"{-np.pi / 2:.6f} {np.pi:.6f} {increment:.9f} 80 0.01 0 {beams} {' '.join(['2.0'] * beams)} 0"
-        return f"ROBOTLASER1 0 {numbers} 0 0 0 0 0 0 0 0 0 0 0 1.0 robot 1.0\n"
-
-    warnings = read(tmp_path, odometry() + scan(180, np.pi / 179)).notes.warnings
-    assert any("180 beams are said to be 1.0056 degrees apart; 1 would be usual" in w for w in warnings)
-    for beams, increment in ((180, np.pi / 180), (181, np.pi / 180), (361, np.pi / 360), (667, 0.006)):
-        assert not read(tmp_path, odometry() + scan(beams, increment)).notes.warnings
-
-
 def test_robot_poses_stand_in_for_missing_odometry(tmp_path):
     lines = [robotlaser(READINGS, k, laser=f"{k + 0.1} 0 0", robot=f"{k} 0 0") for k in range(4)]
     log = read(tmp_path, "".join(lines))

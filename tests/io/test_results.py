@@ -29,7 +29,7 @@ RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"
 @pytest.fixture
 def small_picture(monkeypatch):
     """A picture of six pixels in every result: for tests of how files are exchanged, whatever is in them."""
-    monkeypatch.setattr(results, "picture", lambda result, caption: SMALL_PICTURE)
+    monkeypatch.setattr(results, "draw_map", lambda drawn, caption: SMALL_PICTURE)
 
 
 def test_all_files_of_the_contract_are_written(tmp_path):

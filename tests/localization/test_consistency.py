@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH, SLOW_SIGMA, WHEEL_SIGMA
-from uwblite.localization.range_update import RangeFacts, ranged
+from uwblite.localization.range_model import RangeFacts
 from uwblite.radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
 
 PLACES = np.array(list(ANCHORS.values()))
@@ -49,7 +49,7 @@ def planted(seed, steps=150):
             bearing = np.arctan2(*(place - truth[:2])[::-1]) - truth[2]
             error = pattern_waves(np.array([bearing]))[0] @ pattern + slow[anchor] + bias[anchor]
             value = np.hypot(*(truth[:2] - place)) + error + WHITE * rng.normal()
-            bank = ranged(bank, RangeFacts(anchor, place, value, 0.0, WHITE, 0.0), np.zeros(2))[0]
+            bank = hypotheses.ranged(bank, RangeFacts(anchor, place, value, 0.0, WHITE, 0.0), np.zeros(2))[0]
         if k % 50 == 49:
             off = bank.poses[0] - truth
             off[2] = se2.wrap_angle(off[2])

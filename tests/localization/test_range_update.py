@@ -5,8 +5,8 @@ from helpers.hypotheses import a_bank, numeric
 from scipy.ndimage import map_coordinates
 
 from uwblite import se2
-from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN
-from uwblite.localization.range_update import RangeFacts, ranged, repeated
+from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN, ranged
+from uwblite.localization.range_model import RangeFacts, repeated
 from uwblite.radio.range_errors import RangeErrors
 from uwblite.radio.range_noise import RangeNoise
 

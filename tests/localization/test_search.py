@@ -8,9 +8,9 @@ from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
 from uwblite.localization import search
+from uwblite.localization.range_model import Ranges
 from uwblite.localization.search import FARTHEST, LEVELS, field_of
 from uwblite.localization.walls import Rays, walls_of
-from uwblite.localization.window import Ranges
 
 BOUNDS = (np.array([-1.0, -1.0]), np.array([6.0, 5.0]))
 NO_RANGES = Ranges(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((5, 0)))
@@ -62,7 +62,7 @@ def test_a_node_bounds_every_pose_below_it(room, level):
 def test_the_best_pose_is_that_of_trying_every_one(room):
     pose = (1.0, 2.5, 0.4)
     points = seen_from(pose, 14)
-    headings = np.arange(0.0, 2.0 * np.pi - 0.5 * search._HEADING, search._HEADING)
+    headings = np.linspace(0.0, 2.0 * np.pi, search._HEADINGS, endpoint=False)
     offsets = search._offsets(room, points, headings)
     rows, cols = np.nonzero(room.free)
     best, where = -1.0, None
@@ -84,7 +84,7 @@ def test_the_best_pose_is_that_of_trying_every_one(room):
 def test_a_search_with_more_pauses_finds_the_same(room, monkeypatch):
     points = seen_from((1.0, 2.5, 0.4), 30)
     found = finished(search._by_scans(room, points, 1.0, NO_RANGES))
-    monkeypatch.setattr(search, "_MANY", 0)
+    monkeypatch.setattr(search, "UNIT", 1000)
     again = finished(search._by_scans(room, points, 1.0, NO_RANGES))
     np.testing.assert_array_equal(again.poses, found.poses)
 

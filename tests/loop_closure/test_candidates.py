@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.loop_closure.candidates import Candidates, _among, _best_per_submap, _near, missed, overlap_probability, uncertain
+from uwblite.loop_closure.candidates import (
+    Candidates,
+    _among,
+    _best_per_submap,
+    _near,
+    any_uncertain,
+    missed,
+    overlap_probability,
+)
 from uwblite.loop_closure.closures import LoopClosureConfig
 
 
@@ -68,17 +76,17 @@ def test_the_overlap_of_a_certain_pair_is_certain():
     assert near[1] < 1e-6
 
 
-@pytest.mark.parametrize(("sigma", "found"), [(1.0 / 3.0 + 1e-6, True), (1.0 / 3.0 - 1e-6, False)])
+@pytest.mark.parametrize(("sigma", "found"), [(8.0 / 3.0 + 1e-6, True), (8.0 / 3.0 - 1e-6, False)])
 def test_places_are_uncertain_from_three_sigma_in_the_worst_direction(sigma, found):
-    """Of places alone, not headings, and of pairs alone that may be tried."""
+    """Of places alone, not headings, and of pairs alone that are no neighbours."""
     axes = np.array([[0.6, -0.8], [0.8, 0.6]])
-    covariance = np.diag([0.0, 0.0, 9.0])
+    covariance = np.diag([0.0, 0.0, 90.0])
     covariance[:2, :2] = axes @ np.diag([sigma**2, 1e-4]) @ axes.T
     joint = SimpleNamespace(relative=lambda i, j: np.tile(covariance, (len(i), 1, 1)))
     poses = np.column_stack([[0.0, 1.0, 0.5, 900.0], np.zeros(4), np.zeros(4)])
     graph, recording = SimpleNamespace(poses=poses), np.zeros(4, dtype=np.intp)
-    assert uncertain(graph, joint, np.array([0, 1, 2]), recording, LoopClosureConfig(), 1.0) is found
-    assert uncertain(graph, joint, np.array([0, 3]), recording, LoopClosureConfig(), 1.0) is False
+    assert any_uncertain(graph, joint, np.array([0, 1, 2]), recording, LoopClosureConfig()) is found
+    assert any_uncertain(graph, joint, np.array([0, 1]), recording, LoopClosureConfig()) is False
 
 
 def test_missed_are_pairs_of_the_graph_s_own_guess_that_share_too_little():

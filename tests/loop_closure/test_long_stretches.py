@@ -10,9 +10,17 @@ from uwblite import se2
 from uwblite.graph.marginals import JointCovariance
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, of_pieces
-from uwblite.loop_closure.candidates import Candidates, overlap_probability, propose
+from uwblite.loop_closure.candidates import (
+    Candidates,
+    any_uncertain,
+    cut,
+    first_of,
+    likely,
+    overlap_probability,
+    propose,
+    uncertain_pairs,
+)
 from uwblite.loop_closure.closures import LoopClosureConfig
-from uwblite.loop_closure.long_stretches import any_uncertain, cut, first_of, likely, uncertain_pairs
 from uwblite.loop_closure.verification import find
 
 CONFIG = LoopClosureConfig()
@@ -62,13 +70,13 @@ def test_each_stretch_overlaps_the_next_of_its_recording_by_half():
 
 def test_pairs_that_need_a_search_are_listed_the_likeliest_first(unlike):
     """Without ranges, the window is twice as wide as the covariance says: biases of steps are not in it."""
-    _, pieces, pairs = unlike
+    _, _, pairs = unlike
     assert len(pairs.target)
     assert pairs.long
     assert np.all(pairs.spread > CONFIG.direct)
     assert np.all(np.diff(overlap_probability(pairs.guess, pairs.covariance, 15.0)) <= 0.0)
     for constrained, wider in ((False, 2.0), (True, 1.0)):
-        first = first_of(replace(pairs, constrained=constrained), pieces)
+        first = first_of(replace(pairs, constrained=constrained))
         assert len(first.target) == min(40, len(pairs.target))
         np.testing.assert_allclose(first.spread, wider * pairs.spread[: len(first.target)])
         np.testing.assert_allclose(first.covariance, wider**2 * pairs.covariance[: len(first.target)])

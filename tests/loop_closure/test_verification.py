@@ -134,8 +134,8 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
     ({"net": CONFIG.net_overlap - 0.001, "spread": 20.0}, "few-matches"),
     ({"net": CONFIG.net_overlap + 0.001, "share": 0.2, "spread": 20.0, "long": True}, "accepted"),
-    ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
-    ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
+    ({"off": 0.1 * CONFIG.agrees * 1.01}, "contradicts-graph"),
+    ({"off": 0.1 * CONFIG.agrees * 0.97}, "accepted"),
     ({"off": 5.0, "constrained": False}, "accepted"),
 ])  # fmt: skip
 def test_each_rule_rejects_by_its_own_limit(figures, outcome):

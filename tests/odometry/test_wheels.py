@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
-from helpers.planted import drive, odometry, wander
+from helpers.planted import chain, drive, odometry, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +25,7 @@ from uwblite.odometry.wheels import (
     _neighbours,
     _scale,
     drift_time,
+    noise_at,
     redundancy,
     reestimate_wheel_noise,
     sideways_priors,
@@ -403,3 +404,54 @@ def test_steps_that_scans_measure_as_well_are_found_up_to_the_last():
     row, turned = _neighbours(wheels, steps)
     assert row.tolist() == [1, 2, 3, 4]
     np.testing.assert_allclose(turned, [0.4, -0.2, 0.5, 0.1])
+
+
+ASSUMED = np.array([0.01, 0.01, 0.004])
+SURE = np.diag([1e8, 1e8, 1e10])
+
+
+def driven(steps, noise, way, turn, seed=0):
+    """Return true poses and wheels on them whose steps err by noise (3,), and whose patches by shares of the way and turns."""
+    rng = np.random.default_rng(seed)
+    truth = chain(np.zeros(3), np.column_stack([np.full(steps, 0.3), np.zeros(steps), 0.05 * rng.standard_normal(steps)]))
+    wheels = chained(truth, ASSUMED)
+    patch = np.arange(steps) // 10
+    share, bend = way * rng.standard_normal(patch[-1] + 1)[patch], turn * rng.standard_normal(patch[-1] + 1)[patch]
+    off = rng.standard_normal((steps, 3)) * noise
+    motion = wheels.motion + off + 0.3 * np.column_stack([share, np.zeros(steps), bend])
+    motion[:, :2] = se2.rotate(0.5 * (motion[:, 2] - wheels.motion[:, 2]), motion[:, :2])
+    return truth, replace(wheels, motion=motion, length=np.full(steps, 0.3))
+
+
+def relative_noise(wheels):
+    return (1.0 / np.einsum("eii->ei", wheels.sqrt_information) / ASSUMED)[0]
+
+
+@pytest.mark.parametrize(("noise", "way", "turn"), [((0.4, 0.5, 0.8), 0.02, 0.01), ((1.0, 1.0, 1.0), 0.0, 0.0)])
+def test_noise_of_steps_and_what_patches_of_floor_add_to_it_is_learnt(noise, way, turn):
+    """Sums over ten steps, which begin anywhere on patches of ten, hold two thirds of the variance that whole patches have."""
+    truth, wheels = driven(3000, ASSUMED * noise, way, turn)
+    found = noise_at(Graph(truth), wheels, np.tile(SURE, (len(truth), 1, 1)))
+    patches = 10.0 / 1.5 * (0.3 * np.array([way, 0.0, turn]) / ASSUMED) ** 2
+    np.testing.assert_allclose(relative_noise(found), np.sqrt(np.square(noise) + patches), rtol=0.2)
+
+
+def test_poses_that_err_themselves_are_reckoned_with():
+    """Poses that rays hold to 4 mm, and that follow the wheels as far as the assumed noise lets them."""
+    truth, wheels = driven(4000, ASSUMED * [0.5, 0.3, 1.0], 0.0, 0.0, seed=3)
+    own = np.diag([0.004, 0.004, 0.001]) ** 2
+    held = truth + np.random.default_rng(4).standard_normal(truth.shape) * np.sqrt(np.diag(own))
+    found = noise_at(Graph(held), wheels, np.tile(np.linalg.inv(own), (len(truth), 1, 1)))
+    # Not drawn towards the wheels here, so their residuals are the larger, by 1 + v / s at most: never too small a noise.
+    assert np.all(relative_noise(found) > 0.9 * np.array([0.5, 0.3, 1.0]))
+    assert np.all(relative_noise(found) < 1.5)
+
+
+def test_where_nothing_holds_the_poses_the_noise_stays():
+    truth, wheels = driven(300, ASSUMED * 0.3, 0.0, 0.0)
+    found = noise_at(Graph(truth), wheels, np.zeros((len(truth), 3, 3)))
+    np.testing.assert_array_equal(found.sqrt_information, wheels.sqrt_information)
+    for steps in (5, 20):
+        truth, wheels = driven(steps, ASSUMED, 0.0, 0.0)
+        found = noise_at(Graph(truth), wheels, np.tile(SURE, (len(truth), 1, 1)))
+        np.testing.assert_array_equal(found.sqrt_information, wheels.sqrt_information)

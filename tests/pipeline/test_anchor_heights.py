@@ -16,11 +16,11 @@ from uwblite.constraints import Constraints
 from uwblite.graph.calibration import HEIGHT
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import Optimizer
-from uwblite.pipeline import anchor_heights, radio_stages
-from uwblite.pipeline.anchor_heights import check_heights
+from uwblite.pipeline import radio_stages, range_alternatives
 from uwblite.pipeline.estimate import Estimate, OtherHeights, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.range_alternatives import check_heights
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.sensor_log import SensorLog
@@ -75,7 +75,7 @@ def test_anchors_that_hang_high_are_told_from_wheels_in_another_unit(height, uni
 def test_without_heights_to_find_nothing_is_compared():
     graph = loop()[0]
     estimate = Estimate(graph, graph.edges[0], None, ())
-    assert anchor_heights.choose_heights(estimate, MappingConfig()) is estimate
+    assert range_alternatives.choose_heights(estimate, MappingConfig()) is estimate
 
 
 @cache
@@ -98,8 +98,8 @@ def alone(height: float) -> Estimate:
 ])  # fmt: skip
 def test_recordings_refute_high_anchors_together_each_that_has_other_anchors(heights, ids, refuted):
     """Three low anchors of one round are no proof: the odds of recordings of other anchors are multiplied."""
-    log_odds = [anchor_heights._high_anchors(alone(h), MappingConfig(), Optimizer()).log_odds for h in (0.0, 4.5)]
+    log_odds = [range_alternatives._high_anchors(alone(h), MappingConfig(), Optimizer()).log_odds for h in (0.0, 4.5)]
     assert -15.0 < log_odds[0] < -5.0 < 20.0 < log_odds[1]
     each = [replace(alone(height), anchor_ids=tuple(own)) for height, own in zip(heights, ids, strict=True)]
-    assert anchor_heights._refuted(each, MappingConfig()) is refuted
-    assert not anchor_heights._refuted([replace(own, ranges=None) for own in each], MappingConfig())
+    assert range_alternatives._refuted(each, MappingConfig()) is refuted
+    assert not range_alternatives._refuted([replace(own, ranges=None) for own in each], MappingConfig())

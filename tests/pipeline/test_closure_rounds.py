@@ -9,8 +9,8 @@ from helpers.told import doubted
 from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import ScanClouds, rasterize
 from uwblite.lidar.submaps import SubmapConfig, of_pieces
+from uwblite.loop_closure.candidates import cut
 from uwblite.loop_closure.closures import no_closures
-from uwblite.loop_closure.long_stretches import cut
 from uwblite.pipeline import closure_rounds
 from uwblite.pipeline.closure_rounds import _check_open_loops
 
@@ -37,7 +37,7 @@ def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_w
     graph = graph if far else Graph(truth, edges=(chained(truth, np.full(3, 1e-4)),))
     task = task_of(recordings_of(truth))
     estimate = estimate_of(graph, scans=ScanClouds(clouds, rasterize(clouds, 0.1, 1.0), 0.0))
-    base, found, pieces = closure_rounds._with_long_stretches_tied(graph, no_closures(), estimate, task)
+    base, found, pieces = closure_rounds._with_long_stretches_tied(graph, estimate, task)
     assert base is graph
     assert len(found.edges) == 0
     assert (pieces is not None) == tried

@@ -34,8 +34,8 @@ from uwblite.pipeline.joining import (
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
-from uwblite.sensor_log import SensorMounting
+from uwblite.radio.trilateration import AnchorHypothesis
+from uwblite.sensor_log import LONGEST_RANGE, SensorMounting
 
 STATES = [(False, False), (True, True), (True, False)]
 """Placed, ambiguous."""
@@ -110,7 +110,7 @@ def mapped(seed, tag, ids):
     graph = Graph(frames.odometry, rng.uniform(-6.0, 6.0, (len(ids), 2)), (priors,), replace(calibration, values=values))
     graph = replace(graph, fixed_calibration=rng.random(len(listed)) < 0.5)
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), LONGEST_RANGE)
     bootstrap = BootstrapResult(graph, np.ones(len(ids), dtype=bool), ((),) * len(ids), np.zeros(len(ids), dtype=bool))
     wheel = wheel_edges(frames, OdometryNoiseConfig(), calibration)
     return Estimate(graph, wheel, edges, ids, bootstrap), len(frames)

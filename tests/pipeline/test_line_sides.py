@@ -13,7 +13,7 @@ from uwblite.assessment.certainty import check_other_side
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
-from uwblite.pipeline import line_sides, radio_stages
+from uwblite.pipeline import radio_stages, range_alternatives
 from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
@@ -54,7 +54,7 @@ def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
     # One way is caught where it is put to the other side of the anchors.
     caught = optimize(graph.with_estimates_of(estimate.other_side), task.config.solver)[0]
     assert error(caught.poses, true) > 0.3
-    best = line_sides.sides(caught, estimate.placed, task.config.solver)[0].graph
+    best = range_alternatives.sides(caught, estimate.placed, task.config.solver)[0].graph
     assert best.chi2() < caught.chi2() - 4.0
     assert error(best.poses, true) < 0.1
 
@@ -65,7 +65,7 @@ def test_anchors_stand_on_a_line_but_for_one(beside, line):
     along = np.column_stack([np.arange(4) * 9.0, np.full(4, 2.0)])
     anchors = np.concatenate([along, [[4.0 * k, 2.0 + off] for k, off in enumerate(beside)]]) if beside else along
     path = np.column_stack([np.linspace(0.0, 27.0, 50), 1.8 - 0.02 * np.abs(np.arange(50) - 20), np.zeros(50)])
-    starts = line_sides.mirrored_tails(Graph(path, anchors, ()), np.ones(len(anchors), dtype=bool))
+    starts = range_alternatives.mirrored_tails(Graph(path, anchors, ()), np.ones(len(anchors), dtype=bool))
     assert len(starts) == line
 
 
@@ -73,8 +73,8 @@ def test_anchors_on_both_sides_leave_no_other_side():
     (task, true), estimate = there_and_back(2.4), estimated(2.4)
     graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
     assert error(graph.poses, true) < 0.15
-    assert not line_sides.mirrored_tails(graph, estimate.placed)
-    assert [each.graph for each in line_sides.sides(graph, estimate.placed, task.config.solver)] == [graph]
+    assert not range_alternatives.mirrored_tails(graph, estimate.placed)
+    assert [each.graph for each in range_alternatives.sides(graph, estimate.placed, task.config.solver)] == [graph]
     assert estimate.other_side is None
 
 
@@ -88,4 +88,4 @@ def test_a_map_is_doubted_where_another_side_fits_about_as_well(caught):
         estimate = replace(estimate, graph=optimize(start, task.config.solver)[0])
     found = list(check_other_side(estimate, task))
     assert [finding.kind for finding in found] == ["other-side"] * caught
-    assert all(finding.figures["apart"] > line_sides.LinePolicy.elsewhere for finding in found)
+    assert all(finding.figures["apart"] > range_alternatives.RangePolicy.elsewhere for finding in found)

@@ -13,7 +13,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
-from uwblite.pipeline.mirror_images import _costs, _images, _second_places, find_mirror_images, mirrored_whole
+from uwblite.pipeline.range_alternatives import _costs, _images, _second_places, find_mirror_images, mirrored_whole
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.trilateration import AnchorHypothesis
 

@@ -12,8 +12,7 @@ from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.radio.prior_selection import _common, with_alike_heights
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import TrilaterationConfig
-from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
+from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorMounting, UwbRanges
 
 PLACES = np.array([[3.0, -1.0], [30.0, -1.0], [61.0, 3.0], [61.0, 20.0], [57.0, 41.0], [30.0, 41.0], [3.0, 41.0], [-1.0, 20.0]])
 """Those near corners are seen from two sides."""
@@ -42,7 +41,7 @@ def solved(seed, heights, anchors=slice(None)):
     frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
     listed = unknowns(CalibrationConfig(), ids, np.zeros(len(ids), dtype=bool))
     attached = attach_ranges(radio, wheels, frames, level)
-    edges = range_edges(attached, ids, level, block(listed), RangeNoiseConfig(0.15), TrilaterationConfig())
+    edges = range_edges(attached, ids, level, block(listed), RangeNoiseConfig(0.15), LONGEST_RANGE)
     constant = np.array([u.key.kind not in (HEIGHT, "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, places.copy(), (prior_edges(listed),), block(listed), fixed, fixed_calibration=constant)

@@ -1,7 +1,6 @@
 """Starting values from nothing: planted worlds are recovered from bent odometry and unknown anchors."""
 
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,13 +12,12 @@ from uwblite.graph.graph import Graph
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
-from uwblite.radio import bootstrap
 from uwblite.radio.bootstrap import bootstrap_graph
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
+from uwblite.radio.bootstrap_attempt import BootstrapConfig, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
-from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
+from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorMounting, UwbRanges
 
 SIGMA = 0.05
 WELL = 0.3
@@ -38,7 +36,7 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=fixed)
     mounting = SensorMounting()
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), LONGEST_RANGE)
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
     measured = Measured(wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path)
     found = bootstrap_graph(graph, measured, BootstrapConfig(range_sigma=1.5 * SIGMA), TrilaterationConfig())
@@ -225,62 +223,3 @@ def test_equal_inputs_give_equal_bytes():
     one, other = start(wheels, radio)[0], start(wheels, radio)[0]
     assert one.graph.poses.tobytes() == other.graph.poses.tobytes()
     assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()
-
-
-class Tried(Attempt):
-    """An attempt over 400 m whose misfit is given for 50, 100, 200 m and the end, by its heading error."""
-
-    misfits: ClassVar[dict[float, tuple[float, ...]]] = {}
-    known: ClassVar[dict[float, float]] = {}
-
-    def __init__(self, graph, measured, config, search, without=None):
-        self.first, self.known = (0, 50), type(self).known if without is None else {}
-        self.slipping, self.path, self.config, self.low, self.high = without is not None, np.arange(401.0), config, 0, 0
-        self.heading, self.slips = float(graph.calibration.values[0]), np.zeros(400)
-
-    def began_like(self, other):
-        return {self.heading, other.heading} == {0.4, -0.15}
-
-    def run(self, enough=np.inf, torn=True):
-        self.high = int(min(enough, 400.0)) + 1
-        self.known[self.heading] = self.high - 1
-
-    def _place_the_rest(self):
-        pass
-
-    def misfit(self):
-        return self.misfits.get(self.heading, (9.0,) * 4)[(51, 101, 201, 401).index(self.high)]
-
-    def evidence(self):
-        return -1.0 if self.slipping else 0.0
-
-    def estimate(self):
-        return self.heading
-
-
-@pytest.mark.parametrize(
-    ("misfits", "wins", "known"),
-    [
-        ({0.0: (1.5, 1.5, 1.5, 1.9)}, 0.0, {0.0: 400}),
-        # Nobody begins clearly better than the heading as it is: all others are left where they began.
-        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (4.1,) * 4}, 0.0, {0.0: 400, 1.0: 50}),
-        # One begins better; it wins where it ends clearly better, too.
-        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (3.0, 3.0, 3.0, 7.1)}, 1.0, {1.0: 400, -0.5: 50}),
-        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (3.0, 3.0, 3.0, 7.3)}, 0.0, {1.0: 400}),
-        # The best beginning is left as soon as it disagrees; the next agrees to the end, and nobody else is tried.
-        (
-            {0.0: (9.0,) * 4, -0.3: (0.5, 1.0, 2.1, 0.1), 0.4: (1.0, 1.0, 1.0, 1.9), 1.0: (1.5,) * 4}, 0.4,
-            {-0.3: 200, 0.4: 400, 1.0: 50},
-        ),
-        # One that begins like another goes no farther than that, whatever it would bring.
-        ({0.4: (3.0,) * 4, -0.15: (1.0,) * 4}, 0.4, {0.4: 400, -0.15: 0, 0.15: 50}),
-    ],
-)  # fmt: skip
-def test_a_heading_error_is_given_up_where_it_cannot_win(monkeypatch, misfits, wins, known):
-    monkeypatch.setattr(bootstrap, "Attempt", Tried)
-    monkeypatch.setattr(Tried, "misfits", misfits)
-    monkeypatch.setattr(Tried, "known", {})
-    turns = [u for u in unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)) if u.key.kind == "heading_scale"]
-    graph = Graph(np.zeros((2, 3)), np.zeros((0, 2)), (), block(turns))
-    assert bootstrap_graph(graph, None, BootstrapConfig(), None) == wins
-    assert {heading: Tried.known[heading] for heading in known} == known

@@ -17,8 +17,7 @@ from uwblite.radio import prior_selection
 from uwblite.radio.prior_selection import _mean_under, _units, is_uncalibrated, select_priors, with_calibrated_radio
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import TrilaterationConfig
-from uwblite.sensor_log import Odometry, SensorMounting
+from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorMounting
 
 LEVEL = SensorMounting(anchor_height=0.0)
 CONFIG = CalibrationConfig()
@@ -35,7 +34,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
-    edges = range_edges(attached, ids, LEVEL, block(listed), RangeNoiseConfig(0.05), TrilaterationConfig())
+    edges = range_edges(attached, ids, LEVEL, block(listed), RangeNoiseConfig(0.05), LONGEST_RANGE)
     constant = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, fixed_calibration=constant)
@@ -122,7 +121,7 @@ def driven(seed, scale=1.0, unit=1.0):
     frames, ids = select(wheels, KeyframeConfig(distance=0.05)), radio.anchor_ids
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
-    edges = range_edges(attached, ids, LEVEL, block(listed), RangeNoiseConfig(0.05), TrilaterationConfig())
+    edges = range_edges(attached, ids, LEVEL, block(listed), RangeNoiseConfig(0.05), LONGEST_RANGE)
     steps = wheel_edges(frames, OdometryNoiseConfig(), block(listed))
     constant = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
     graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), fixed_calibration=constant)

@@ -278,7 +278,7 @@ def test_what_is_left_of_the_variance_is_at_least_half_the_least_sigma():
     """Covariances that explain all of it."""
     config = replace(CONFIG, min_sigma=0.1)
     distance = np.array([0.1, 0.4, 0.8])
-    noise = _fit(distance, 0.1**2 * np.exp(-distance), np.full(3, 100.0), 0.1**2, assumed(config), config)
+    noise = _fit(distance, 0.1**2 * np.exp(-distance), np.full(3, 100.0), 0.1**2, config)
     assert noise.white == pytest.approx(0.05)
     # The lengths that are tried are a quarter apart.
     assert noise.slow == pytest.approx(0.1 * np.sqrt(0.95), rel=5e-3)

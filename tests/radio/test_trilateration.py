@@ -13,11 +13,9 @@ from uwblite.radio.trilateration import (
     _raster_search,
     _refine,
     _scored,
-    agreement,
     ambiguous,
     trilaterate,
     trilaterate_each,
-    usable,
 )
 
 CONFIG = TrilaterationConfig()
@@ -178,32 +176,6 @@ def test_equal_neighbours_do_not_crowd_out_the_mirrored_place():
     path = np.column_stack([np.linspace(-8, 8, 160), 0.001 * rng.standard_normal(160)])
     found = trilaterate(path, measured(rng, path, np.array([2.0, 4.0]), 0.02), TrilaterationConfig(raster=120))
     assert sorted(round(float(h.position[1])) for h in found[:2]) == [-4, 4]
-
-
-def test_usable_readings_are_positive_finite_and_not_absurd():
-    config = TrilaterationConfig(max_range=100.0)
-    readings = np.array([0.0, -3.0, 0.01, 0.5, 99.0, 101.0, np.inf, np.nan])
-    assert usable(readings, config).tolist() == [False, False, False, True, True, False, False, False]
-
-
-@pytest.mark.parametrize("false_ranges", [0.0, 0.3])
-@pytest.mark.parametrize("bias", [0.0, 1.2])
-def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(false_ranges, bias):
-    rng = np.random.default_rng(7)
-    path, place = loop_path(rng, metres=30.0), np.array([4.0, -3.0])
-    stated = np.hypot(*(place - path).T) + bias + 0.02 * rng.standard_normal(len(path))
-    wrong = np.arange(len(path)) < false_ranges * len(path)
-    stated = stated + 3.0 * wrong
-    assert agreement(path, stated, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
-    assert agreement(path, stated, np.array([8.0, 2.0])) < 0.6
-
-
-@pytest.mark.parametrize(("apart", "share"), [(0.39, 1.0), (0.41, 0.6)])
-def test_errors_agree_within_four_tenths_of_a_metre(apart, share):
-    """Six of ten ranges have one error, four another; the anchor stands 2 m above the tag."""
-    path, place = loop_path(np.random.default_rng(9), count=10), np.array([4.0, -3.0])
-    error = 0.3 + apart * (np.arange(10) % 5 < 2)
-    assert agreement(path, np.hypot(np.hypot(*(place - path).T), 2.0) + error, place, 2.0) == pytest.approx(share)
 
 
 def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():

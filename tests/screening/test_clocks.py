@@ -213,3 +213,31 @@ def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():
     off[30], off[31] = [0.3, 0.0, 0.0], [-0.1, 0.0, 0.0]
     off[40], off[41] = [0.3, 0.0, 0.1], [-0.29, 0.01, -0.11]
     assert np.flatnonzero(displaced(off)).tolist() == [40]
+
+
+@pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (3, 5, False), (4, 4, False), (7, 30, True)])
+def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spread):
+    """The last of each keeps its stamp; after a pause they are spread over the usual time."""
+    at = 10.0 + np.arange(bursts) * 2.0 + 30.0 * (np.arange(bursts) >= 3)
+    late = np.repeat(at, size)
+    found = clocks._spread(late)
+    assert (found is not None) == spread
+    if found:
+        stamps, usual, between = found
+        assert (usual, between) == (size, 2.0)
+        np.testing.assert_allclose(stamps, (at[:, None] - 2.0 + 2.0 * np.arange(1, size + 1) / size).ravel())
+
+
+def test_bursts_of_both_sensors_are_named_and_single_stamps_stay():
+    late = np.repeat(np.arange(1.0, 11.0), 5)
+    scans = LaserScans(late, np.ones((50, 3), np.float32), 0.0, 0.01, 0.0, 0.05, 30.0)
+    done, facts = clocks.without_bursts(SensorLog(Odometry(late, np.zeros((50, 3))), None, scans))
+    remarks = told(facts)
+    np.testing.assert_allclose(done.odometry.stamps, 0.2 * np.arange(1, 51))
+    np.testing.assert_allclose(done.scans.stamps, 0.2 * np.arange(1, 51))
+    assert [r.text.split(",")[0] for r in remarks] == [
+        "odometry readings come in bursts of about 5 with one stamp", "scans come in bursts of about 5 with one stamp",
+    ]  # fmt: skip
+    assert "every 1.00 s" in remarks[0].text
+    even = SensorLog(Odometry(np.arange(50.0), np.zeros((50, 3))), None, replace(done.scans, stamps=np.arange(50.0)))
+    assert clocks.without_bursts(even) == (even, [])

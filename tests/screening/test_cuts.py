@@ -142,9 +142,9 @@ def test_two_scans_are_of_one_place_where_more_than_half_matches_in_every_direct
 @pytest.mark.parametrize(
     ("scans", "beams", "jump", "asked"),
     [
-        (18, 30, 8, [([8], [9]), ([7], [10])]), (18, 30, 1, [([1], [2]), ([0], [3])]),
-        (18, 30, 15, [([15], [16]), ([14], [17])]),
-        (18, 30, 0, []), (18, 30, 16, []), (17, 30, 8, []), (18, 29, 8, []),
+        (20, 30, 8, [([8], [9]), ([7], [10])]), (20, 30, 1, [([1], [2]), ([0], [3])]),
+        (20, 30, 17, [([17], [18]), ([16], [19])]),
+        (20, 30, 0, []), (20, 30, 18, []), (19, 30, 8, []), (20, 29, 8, []),
     ],
 )  # fmt: skip
 def test_a_cut_is_where_a_scan_and_those_beside_it_are_elsewhere(monkeypatch, scans, beams, jump, asked):

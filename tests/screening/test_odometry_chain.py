@@ -156,12 +156,12 @@ def test_an_odometry_that_jumps_all_the_time_is_of_two_sources(count, wrong, ref
 def test_only_what_repeats_stamp_and_pose_is_a_repeat():
     stamps = np.array([0.0, 0.0, 0.1, 0.1, 0.2, 0.2])
     poses = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0.1], [1, 0, 0.1], [1, 0, 0.1]], dtype=float)
-    done, count = without_repeats(Odometry(stamps, poses))
-    assert count == 2
+    done, facts = without_repeats(Odometry(stamps, poses))
+    assert [fact.figures for fact in facts] == [{"count": 2}]
     np.testing.assert_array_equal(done.stamps, [0.0, 0.1, 0.1, 0.2])
     np.testing.assert_array_equal(done.poses, poses[[0, 2, 3, 4]])
     whole = Odometry(stamps[::2], poses[::2])
-    assert without_repeats(whole) == (whole, 0)
+    assert without_repeats(whole) == (whole, [])
 
 
 @pytest.mark.parametrize(("at", "other"), [(3, 0), (56, 59)])

@@ -7,7 +7,7 @@ import pytest
 from helpers import planted
 
 from uwblite import se2
-from uwblite.screening.range_explanations import RangePolicy, _best_place, _best_stretch, _by_way, _traces, explained_by_ranges
+from uwblite.screening.range_explanations import _best_place, _best_stretch, _by_way, _traces, explained_by_ranges
 from uwblite.sensor_log import Odometry, SensorLog
 
 CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -143,10 +143,10 @@ def test_an_anchor_that_is_moved_is_no_fault_of_the_wheels(seed):
 
 def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
     """Against a search over places: Cauchy errors of ranges from one place, the better path the likelier."""
-    rng, policy = np.random.default_rng(0), RangePolicy(noise=(0.2,))
+    rng = np.random.default_rng(0)
     paths = rng.normal(size=(2, 30, 2)) * 3.0
     values = np.hypot(*(paths[0] - [7.0, -4.0]).T) + 0.05 * rng.standard_normal(30)
-    (likely,) = _best_place(paths, values, np.ones(30), policy)
+    likely = _best_place(paths, values, np.ones(30))[1]
     around = np.stack(np.meshgrid(np.linspace(6.0, 8.0, 81), np.linspace(-5.0, -3.0, 81)), axis=-1).reshape(-1, 1, 2)
     errors = np.hypot(*np.moveaxis(paths[0] - around, -1, 0)) - values
     best = -np.log(np.pi * 0.2 * (1.0 + (errors / 0.2) ** 2)).sum(axis=1)
@@ -156,11 +156,10 @@ def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
 
 def test_the_density_of_changes_by_way_is_a_density():
     """Over all values of the second range it integrates to 1, by the prior of the first."""
-    policy = RangePolicy(noise=(0.1,))
-    trace = _traces(late_by(0.0), policy)[0].between(0.0, 5.0)
+    trace = _traces(late_by(0.0))[0].between(0.0, 5.0)
     trace = replace(trace, ranges=trace.ranges[:2], way=trace.way[:2])
     values, step = np.linspace(-100.0, 110.0, 10501, retstep=True)
-    each = [_by_way(replace(trace, ranges=np.array([5.0, v])), 10.0, policy)[0] for v in values]
+    each = [_by_way(replace(trace, ranges=np.array([5.0, v])), 10.0)[0] for v in values]
     assert np.exp(each).sum() * step * 10.0 == pytest.approx(1.0, abs=0.01)
 
 

@@ -7,10 +7,10 @@ import pytest
 from helpers.told import told
 
 from uwblite.screening import range_motion
+from uwblite.screening.odometry_chain import usual_speed
 from uwblite.screening.range_motion import (
     _agreed,
     _by_anchor,
-    _driven,
     _jumps,
     _noise,
     _together,
@@ -18,7 +18,7 @@ from uwblite.screening.range_motion import (
     excess,
     without_shared_names,
 )
-from uwblite.screening.stuck_sensors import quiet_noise, resolution_of
+from uwblite.screening.repeats import quiet_noise, resolution_of
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
 
@@ -313,7 +313,7 @@ def test_a_robot_drives_as_fast_as_usual_while_its_wheels_stand():
     stamps = log.odometry.stamps
     poses = np.where((stamps < 60.0)[:, None], log.odometry.poses, log.odometry.poses[stamps < 60.0][-1])
     frozen = replace(log, odometry=Odometry(stamps, poses))
-    np.testing.assert_allclose(_driven(frozen), 0.2 * stamps, rtol=1e-6, atol=1e-9)
+    assert usual_speed(frozen.odometry) == pytest.approx(0.2)
 
 
 def test_what_there_is_nothing_to_see_in():

@@ -1,6 +1,7 @@
 """Contradictions within a recording are repaired where they can be, and reported in any case."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from helpers.told import told
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.screening import clocks, stuck_sensors
+from uwblite.screening import clocks, cuts, repeats
 from uwblite.screening import screen as screening
 from uwblite.screening.screen import screen
 from uwblite.se2 import chain as chained
@@ -190,7 +191,7 @@ def test_a_value_that_marks_what_a_radio_could_not_measure_is_left_out(sound, be
 @pytest.mark.parametrize("step", [0.1, 1.0])
 def test_rounded_ranges_mark_nothing(sound, step):
     log = replace(sound, ranges=replace(sound.ranges, ranges=np.round(sound.ranges.ranges / step) * step))
-    assert len(stuck_sensors.without_marks(log)[0].ranges.ranges) == len(log.ranges.ranges)
+    assert len(repeats.without_marks(log)[0].ranges.ranges) == len(log.ranges.ranges)
 
 
 @pytest.mark.parametrize("beyond", [False, True])
@@ -212,7 +213,7 @@ def test_a_value_that_a_lidar_repeats_everywhere_is_no_wall(sound, beyond):
 @pytest.mark.parametrize("step", [0.001, 0.01, 0.05])
 def test_rounded_readings_mark_nothing(sound, step):
     log = replace(sound, scans=replace(sound.scans, ranges=(np.round(sound.scans.ranges / step) * step).astype(np.float32)))
-    assert stuck_sensors.without_lidar_marks(log)[0] is log
+    assert repeats.without_lidar_marks(log)[0] is log
 
 
 def test_a_heading_against_the_path_is_turned_and_the_laser_reports_how(sound):
@@ -399,8 +400,8 @@ def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch, turned)
     radio = UwbRanges(times, np.zeros(200, dtype=int), np.ones(200), np.ones(200), ("A",))
     lidar = LaserScans(times, np.ones((200, 3), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 9.0)
     log = SensorLog(odometry, radio, lidar)
-    monkeypatch.setattr(screening, "_elsewhere", lambda log, a, b: 85.0 < a < 95.0)
-    done, breaks, facts = screening._gaps(log)
+    monkeypatch.setattr(cuts, "_elsewhere_after", lambda log, a, b: 85.0 < a < 95.0)
+    done, breaks, facts = cuts.gaps(log)
     remarks = told(facts)
     # The pose after a stand or a way counts as any other.
     np.testing.assert_allclose(breaks.stamps, [90.0])
@@ -422,12 +423,12 @@ def test_a_silence_of_two_seconds_or_twenty_periods_is_a_gap(silence, period, ga
     times = np.arange(0.05, stamps[-1], 0.1)
     radio = UwbRanges(times, np.zeros(len(times), dtype=int), np.ones(len(times)), np.ones(len(times)), ("A",))
     log = SensorLog(Odometry(stamps, np.column_stack([0.3 * stamps, np.zeros((200, 2))])), radio)
-    done, breaks, facts = screening._gaps(log)
+    done, breaks, facts = cuts.gaps(log)
     remarks = told(facts)
     assert ([r.kind for r in remarks], len(done.ranges.stamps) < len(times)) == (["odometry-gap"] * gap, gap)
     # A log without readings of others in between is thinned, and nothing is left out.
     assert not len(breaks.stamps)
-    assert screening._gaps(replace(log, ranges=None))[2] == []
+    assert cuts.gaps(replace(log, ranges=None))[2] == []
 
 
 def test_steps_of_lost_wheels_are_as_wide_as_the_robot_is_fast():
@@ -451,31 +452,30 @@ def test_a_robot_that_drives_less_than_two_metres_is_a_doubt(path, said):
 
 
 def test_cuts_near_other_breaks_are_those(monkeypatch):
-    """Three seconds before one or behind the next reading; of many four are said."""
+    """Three seconds before one or behind the next reading; of many five are said."""
     stamps = np.arange(100.0, 400.0, 1.0)
     log = SensorLog(Odometry(stamps, np.zeros((300, 3))))
     times = np.array([110.5, 146.9, 147.1, 153.9, 154.1, 200.5, 250.5, 300.5])
-    monkeypatch.setattr(screening.cuts, "found", lambda log, jumps: times)
-    breaks, facts = screening._cuts(log, np.zeros(0), np.array([150.0]))
+    monkeypatch.setattr(cuts, "found", lambda log, jumps: times)
+    breaks, facts = cuts.cuts(log, np.zeros(0), np.array([150.0]))
     (remark,) = told(facts)
     np.testing.assert_array_equal(breaks.stamps, [110.0, 146.0, 154.0, 200.0, 250.0, 300.0])
     np.testing.assert_array_equal(breaks.sigma, [[20.0, 20.0, 3.0]] * 6)
     assert remark.severity == "doubt"
-    assert "at t = 10 s, t = 47 s, t = 54 s, t = 100 s ... the robot" in remark.text
+    assert "at t = 10, 47, 54, 100, 150 ... s the robot" in remark.text
     times = times[:1]
-    assert " ... " not in told(screening._cuts(log, np.zeros(0), np.zeros(0))[1])[0].text
+    assert " ... " not in told(cuts.cuts(log, np.zeros(0), np.zeros(0))[1])[0].text
     times = times[:0]
-    assert screening._cuts(log, np.zeros(0), np.zeros(0))[1] == []
+    assert cuts.cuts(log, np.zeros(0), np.zeros(0))[1] == []
 
 
 def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it(monkeypatch, sound):
     """The times are said since the beginning; each stretch that ranges contradict is a doubt of its own."""
     stands = [(110.0, 120.0), (130.0, 137.5), (150.0, 160.0)]
     monkeypatch.setattr(screening.wheel_motion, "standing", lambda odometry, least: stands)
-    monkeypatch.setattr(screening.wheel_motion, "seen", lambda pairs, a, b: a == 110.0)
     monkeypatch.setattr(screening.wheel_motion, "lost", lambda log, pairs: [])
     monkeypatch.setattr(screening.range_motion, "excess", lambda log, a, b: 0.5 if a < 140.0 else 0.0)
-    for pairs, said in (("pairs", ["30 to 38"]), (None, ["10 to 20", "30 to 38"])):
+    for pairs, said in ((SimpleNamespace(seen=lambda a, b: a == 110.0), ["30 to 38"]), (None, ["10 to 20", "30 to 38"])):
         log, same, breaks, facts = screening._lost_wheels(sound, pairs)
         remarks = told(facts)
         assert (log, same) == (sound, pairs)

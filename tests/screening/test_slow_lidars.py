@@ -79,7 +79,7 @@ def test_scans_before_and_after_a_fast_turn_show_little_in_common_and_are_of_one
     truth = np.array([[x, 0.0, 0.0] for x in before] + [[-0.5, y, 0.5 * np.pi] for y in (0.05, *after)])
     log, turn = seen(truth, CORNER, truth * [0.96, 0.96, 1.05], 3), np.array([len(before) - 1])
     apart, share = cuts._elsewhere(log, turn, turn + 1)
-    assert share[0] < cuts._SAME_PLACE
+    assert share[0] < cuts.CutPolicy.same_place
     assert not apart[0]
 
 

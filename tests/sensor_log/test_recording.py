@@ -7,7 +7,7 @@ import pytest
 from helpers.planted import box, odometry, ranges, recording, scans, wander
 
 from uwblite.errors import DataError
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word, plausible
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +126,8 @@ def test_other_ids_are_refused_wherever_they_come_from(log, name):
 
 def test_blanks_in_an_id_become_underscores():
     assert one_word(" hall  west\t2 ") == "hall_west_2"
+
+
+def test_plausible_ranges_are_positive_finite_and_not_absurd():
+    readings = np.array([0.0, -3.0, 0.01, 0.5, 99.0, 101.0, np.inf, np.nan])
+    assert plausible(readings, 100.0).tolist() == [False, False, False, True, True, False, False, False]

@@ -21,7 +21,7 @@ def closure(first=EPOCH, second=EPOCH + 60.25, recordings=(1, 2), pose=(0.5, -0.
 def test_every_wish_is_read_back_as_it_was_made():
     edits = with_closure(Constraints(), closure(), "reject")
     edits = with_closure(edits, closure(first=EPOCH + 5), "force")
-    edits = with_anchor(edits, 'B"\\#', (3.5, -1e-7), 0.02)
+    edits = with_anchor(edits, 'B"\\#', (3.5, -1e-7))
     text = edits_text(OWN, edits)
     own, back = parse_edits(text)
     assert own.strip() == OWN.strip()

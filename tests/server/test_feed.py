@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from uwblite.server.feed import Feed
+from uwblite.server.live import Feed
 
 
 def test_the_latest_state_and_then_what_is_new():

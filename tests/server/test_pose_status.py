@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization import LocalizerState
-from uwblite.server.pose_status import PoseStatus
+from uwblite.server.live import PoseStatus
 
 KNOWN = LocalizerState(10.0, np.array([1.0, 2.0, 0.5]), np.diag([4e-4, 9e-4, 1e-4]), 0.9, np.zeros(3), False)
 
@@ -21,7 +21,7 @@ def test_a_known_pose_with_its_way():
     assert status.take(replace(KNOWN, stamp=10.1)) is None
     later = status.take(replace(KNOWN, stamp=10.3, pose=np.array([1.5, 2.0, 0.5])))
     assert later["trail"] == [[1.0, 2.0], [1.5, 2.0]]
-    assert np.array(later["covariance"]) == pytest.approx(np.diag([4e-4, 9e-4]))
+    assert later["ellipse"] == pytest.approx([2 * 0.03, 2 * 0.02, 90.0])
     json.dumps(later, allow_nan=False)
 
 
@@ -33,7 +33,7 @@ def test_a_lost_one_reports_why_and_forgets_its_way():
         alternatives=np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 3.0]]), moved_anchors=("91A3",),
     )  # fmt: skip
     shown = status.take(lost)
-    assert shown["pose"] is shown["covariance"] is None
+    assert shown["pose"] is shown["ellipse"] is None
     assert shown["advice"][0] == "the pose is not known: two places fit"
     assert shown["advice"][1].startswith("anchor 91A3 has been moved")
     assert shown["trail"] == []

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from uwblite.errors import ConfigError
-from uwblite.server.remap import remap_command
+from uwblite.server.edits import remap_command
 
 REPORT = {
     "inputs": [{"source": "a.log", "sha256": "aa"}, {"source": "b.log", "sha256": "bb"}],

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from uwblite.server.requests import refusal
+from uwblite.server.web import refusal
 
 TOKEN = "t0ken"
 LOCAL = SimpleNamespace(host="127.0.0.1:8000", names=None)

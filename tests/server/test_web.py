@@ -10,7 +10,7 @@ import pytest
 from helpers.results import small_folder
 
 from uwblite.io.stored_result import read_result
-from uwblite.server.app import app_of
+from uwblite.server.app import App
 from uwblite.server.live import LivePage
 from uwblite.server.web import server_for
 
@@ -18,7 +18,7 @@ from uwblite.server.web import server_for
 @pytest.fixture
 def served(tmp_path):
     small_folder(tmp_path / "map")
-    app = app_of([read_result(tmp_path / "map")], {}, tmp_path / "c.toml", lambda words: None)
+    app = App([read_result(tmp_path / "map")], {}, tmp_path / "c.toml", lambda words: None)
     server = server_for(app)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
     thread.start()

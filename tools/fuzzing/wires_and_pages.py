@@ -15,7 +15,7 @@ from uwblite.cli import main
 from uwblite.drivers.devices import DEVICES, open_device
 from uwblite.errors import UwbliteError
 from uwblite.io.stored_result import read_result
-from uwblite.server.app import App, app_of
+from uwblite.server.app import App
 from uwblite.server.web import server_for
 
 from .device_words import WORDS
@@ -104,7 +104,7 @@ def _page(folder: Path) -> App:
     def no_job(words: Any) -> Any:
         raise AssertionError(f"a job was begun: {words}")
 
-    return app_of([read_result(folder)], {}, folder / "edits.toml", no_job)
+    return App([read_result(folder)], {}, folder / "edits.toml", no_job)
 
 
 def show(path: Path) -> object:

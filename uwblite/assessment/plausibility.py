@@ -19,11 +19,9 @@ from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
 from ..sensor_log.sensors import name_and_number
 from .causes import explained
-from .certainty import check_certainty, check_other_side
-from .decisions import RULES
-from .drift_tests import check_drifts, check_turn_scales
+from .certainty import check_certainty, check_drifts, check_other_side
+from .facts import check_recordings, say
 from .range_agreement import DISAGREE, check_range_agreement, check_wheels_against_lidar
-from .repairs import check_recordings, say
 from .residual_tests import check_range_scatter, check_residuals
 from .untied_parts import check_untied_parts, check_untied_recordings
 
@@ -59,7 +57,7 @@ class ResultView:
 
 
 RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
-    lambda view: say(view.task.stages.facts, RULES),
+    lambda view: say(view.task.stages.facts),
     lambda view: check_repairs(view.task),
     lambda view: check_certainty(view.estimate, view.sigma, view.task),
     lambda view: check_anchors(view.anchors),
@@ -74,7 +72,6 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: check_untied_recordings(view.estimate, view.task),
     lambda view: check_other_side(view.estimate, view.task),
     lambda view: check_handedness(view.estimate, view.task),
-    lambda view: check_turn_scales(view.estimate, view.task),
     lambda view: check_fit(view.task),
     lambda view: check_wheels_against_lidar(view.table, view.anchors, view.task),
 )

@@ -10,7 +10,18 @@ from ..findings import WARNING, WHEELS_AGAINST_LIDAR, Finding, doubt, warning
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 from ..sensor_log.sensors import first_place, name_and_number
-from .repairs import check_recordings, spans
+from .facts import check_recordings, spans
+
+DISAGREE = 0.5
+"""Share of an anchor's ranges that agree with the map, below which it is distrusted."""
+_LEAST_AGREEING = 0.3
+"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
+_ENOUGH, _NEAR = 3, 0.3
+"""Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
+half a metre off is not so near to three distances."""
+_MOST_NEAR, _MANY_NEAR = 0.85, 0.6
+"""Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
+0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -61,12 +72,6 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
         yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
 
 
-DISAGREE = 0.5
-"""Share of an anchor's ranges that agree with the map, below which it is distrusted."""
-_LEAST_AGREEING = 0.3
-"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
-
-
 def _outliers(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
     """Warn of each anchor whose ranges disagree with the map for long, recording by recording."""
     for recording in task.recordings.each:
@@ -113,11 +118,3 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
             text = f"{finding.text}; the ranges agree with the lidar there: check the wheels"
             finding = replace(finding, severity=WARNING, text=text)
         yield finding
-
-
-_ENOUGH, _NEAR = 3, 0.3
-"""Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
-half a metre off is not so near to three distances."""
-_MOST_NEAR, _MANY_NEAR = 0.85, 0.6
-"""Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
-0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""

@@ -48,12 +48,7 @@ exit codes:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code.
-
-    Parameters
-    ----------
-    argv : arguments without the program's name; None = those of this process.
-    """
+    """Run the command line, by default of this process, and return its exit code."""
     _open_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     name = next((word for word in words if not word.startswith("-")), None)

@@ -7,7 +7,6 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +32,6 @@ class Outcome(NamedTuple):
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     name_recordings_once(args)
     tasks = tasks_of(args)
     refuse_foreign(unmarked(Path(args.out), ("batch.csv", "batch.html"), "batch.csv", table_csv([])))
@@ -41,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         os.makedirs(args.out, exist_ok=True)
         rows = _rows(args, tasks)
     if args.json:
-        console.say_json({"out": args.out, "recordings": [asdict(row) for row in rows], "exit_code": _exit_code(rows)})
+        console.say_json({"out": args.out, "recordings": [row.plain() for row in rows], "exit_code": _exit_code(rows)})
     else:
         console.say(f"the table: {os.path.join(args.out, 'batch.html')} and {os.path.join(args.out, 'batch.csv')}")
     return _exit_code(rows)
@@ -182,9 +180,9 @@ def _line(row: BatchRow) -> str:
     text = f"{row.recording}: {row.outcome}"
     if row.outcome == "failed":
         return f"{text}: {row.reason}"
-    size = "" if row.width is None else f", {row.width:.1f} x {row.height:.1f} m"
-    figures = f"{row.anchors} anchors, {row.closures} loop closures"
-    return f"{text}{f' ({row.reason})' if row.reason else ''}{size}, {figures}"
+    size = "" if row.figures["width"] is None else ", {width:.1f} x {height:.1f} m".format_map(row.figures)
+    counts = "{anchors} anchors, {closures} loop closures".format_map(row.figures)
+    return f"{text}{f' ({row.reason})' if row.reason else ''}{size}, {counts}"
 
 
 def _write_table(out: str, rows: dict[int, BatchRow]) -> None:

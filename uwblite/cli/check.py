@@ -16,7 +16,6 @@ from .inputs import recording
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     log = recording(args, args.log)
     began = time.perf_counter()
     repaired = screened(log)
@@ -34,13 +33,7 @@ def run(args: argparse.Namespace) -> int:
 def examined(log: SensorLog, repaired: SensorLog | None, began: float) -> tuple[Diagnosis, float]:
     """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this doubts.
 
-    Parameters
-    ----------
-    repaired : the recording screened, None where a map refuses it. began : time at which that began, s.
-
-    Returns
-    -------
-    The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
+    `repaired` is the recording screened, None where a map refuses it. Returns also the seconds that `uwblite map` will take.
     """
     from ..mapping import MappingConfig, build_map
     from ..pipeline.recordings import thinned
@@ -55,7 +48,6 @@ def examined(log: SensorLog, repaired: SensorLog | None, began: float) -> tuple[
 
 
 def summary_json(name: str, diagnosis: Diagnosis, cost: dict[str, float]) -> dict[str, Any]:
-    """Return the findings and figures for programs."""
     return {
         "log": name,
         "findings": [dataclasses.asdict(f) for f in diagnosis.findings],

@@ -20,12 +20,7 @@ _ENDING = 10.0
 
 
 class Child:
-    """A command that runs until its end, or that of the process that made this.
-
-    Parameters
-    ----------
-    niceness : 0..19; 19 = it runs when nobody else wants to.
-    """
+    """A command that runs until its end, or that of the process that made this; at niceness 19 when nobody else wants to."""
 
     def __init__(self, words: Sequence[str], niceness: int = 0) -> None:
         root = Path(__file__).resolve().parents[__name__.count(".")]
@@ -54,7 +49,6 @@ class Child:
         return (errors or tail.splitlines() or [""])[-1][:400]
 
     def stop(self) -> None:
-        """End it."""
         self._process.terminate()
         try:
             self._process.wait(_ENDING)

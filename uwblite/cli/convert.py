@@ -25,7 +25,6 @@ _RECORDINGS = ("log", "csv", "mcap", "sqlite3", "tum", "kitti")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     kind = format_of(args.source)
     if args.list:
         return _list(args, kind)
@@ -44,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _target_format(args: argparse.Namespace) -> str:
-    """Return the format that --to or the target's name states; '' where neither does."""
     if args.to:
         return str(args.to)
     if args.target.endswith(".mcap"):

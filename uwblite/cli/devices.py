@@ -18,8 +18,6 @@ LISTEN, ASK = 0.6, 5.0
 
 @dataclass
 class PortReport:
-    """What was seen on one port."""
-
     path: str
     kind: str = "unknown"
     found: bool = False
@@ -30,12 +28,10 @@ class PortReport:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing needs mending."""
         return all(level == "info" for level, _ in self.findings)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at the ports and report."""
     if args.kinds:
         for kind in (kind for sensor in SENSORS for kind in DEVICES.values() if kind.sensor == sensor):
             say(f"--{kind.sensor} {kind.name}:PORT".ljust(28) + kind.title)
@@ -83,13 +79,7 @@ def _report(reports: list[PortReport], as_json: bool) -> None:
 
 
 def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
-    """Open a port, find out who is there, and judge its settings.
-
-    Parameters
-    ----------
-    kinds : of device that it may be; empty = any.
-    pan_id : network id that a tag should have, None = any.
-    """
+    """Open a port, find out who is there among these kinds (none = any), and judge its settings and its network id."""
     seen = PortReport(path)
     tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:

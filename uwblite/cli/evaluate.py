@@ -45,7 +45,6 @@ DEFAULT_RADIUS = 0.3
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     if not args.truth and not args.relations:
         raise UsageError("give --truth, --relations, or both")
     if not args.truth and (args.anchors or args.landmarks or args.walls):
@@ -57,7 +56,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def compare(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
-    """Return what is compared as a JSON-ready summary and as lines of text."""
     folder = Path(args.dir)
     repair_result(folder)
     summary: dict[str, Any] = {}
@@ -116,7 +114,6 @@ def _surfaces(
 
 
 def _relations(folder: Path, path: str, number: int) -> Shown:
-    """Compare a recording of a result with relations."""
     result = read_result(folder)
     if number > len(result.trajectories):
         raise ConfigError(f"{folder} is a map of {len(result.trajectories)} recordings, not of {number}")
@@ -126,7 +123,6 @@ def _relations(folder: Path, path: str, number: int) -> Shown:
 
 
 def _recording(folder: Path, truth: str, number: int) -> Paired:
-    """Return stamps and poses of a recording in a result, and the true ones."""
     estimate = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
     if number > 1 and folder.is_dir() and not estimate.exists():
         raise ConfigError(f"{folder} has no {estimate.name}: it is a map of fewer recordings")

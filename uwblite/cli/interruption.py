@@ -3,10 +3,9 @@
 import os
 import signal
 import sys
-from _thread import interrupt_main
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Timer
+from threading import Timer, main_thread
 from typing import Any
 
 _SOON = 0.02
@@ -66,7 +65,8 @@ def _raised_again(came: list[int]) -> Iterator[None]:
             usual(error)
             return
         came.clear()
-        timer = Timer(_SOON, interrupt_main)
+        # A signal to the thread itself also ends what sleeps or waits for a device.
+        timer = Timer(_SOON, signal.pthread_kill, (main_thread().ident, signal.SIGINT))
         timer.daemon = True
         timer.start()
 

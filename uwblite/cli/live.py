@@ -19,8 +19,7 @@ from ..io.stored_result import StoredResult, read_result
 from ..localization import LocalizerState
 from ..localization.known_map import KnownMap, from_result
 from ..localization.live_feed import LiveFeed, Patience
-from ..server.live import LivePage
-from ..server.pose_status import PoseStatus
+from ..server.live import LivePage, PoseStatus
 from . import console
 from .inputs import mounted
 from .interruption import stopped_by
@@ -30,7 +29,6 @@ DEVICES = ("odometry", "lidar", "uwb", "gyro")
 
 
 def run_live(args: argparse.Namespace) -> int:
-    """Say poses until the log ends or somebody says stop."""
     devices = any(getattr(args, name) for name in DEVICES)
     if devices == bool(args.log):
         raise UsageError("--live needs either a log to follow (- = standard input) or devices: --odometry, --lidar, --uwb")
@@ -47,7 +45,6 @@ def run_live(args: argparse.Namespace) -> int:
 
 
 def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
-    """Follow devices or a log and return the exit code."""
     with stopped_by(signal.SIGINT, signal.SIGTERM) as stopped:
         if devices:
             from .record import record_into
@@ -63,8 +60,6 @@ def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
 
 
 class Tracker:
-    """From pieces of a log to lines on stdout."""
-
     def __init__(self, known: KnownMap, args: argparse.Namespace) -> None:
         self.state: LocalizerState | None = None
         self.on_state: Callable[[LocalizerState], None] = lambda _: None
@@ -76,7 +71,6 @@ class Tracker:
         self._said, self._was_lost = -float("inf"), True
 
     def take(self, data: bytes) -> None:
-        """Use a piece of the log."""
         for state in self._feed.take(data):
             self._say(state)
         self._heard = self._clock()

@@ -16,7 +16,8 @@ from ..io.stored_result import read_result
 from ..io.tum import write_tum
 from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
-from ..report.picture import Overlay, PictureAnchor, draw_map
+from ..report.drawn_map import DrawnAnchor, DrawnMap
+from ..report.picture import draw_map
 from ..report.printable import signed
 from . import console
 from .inputs import effective_config, recording
@@ -24,7 +25,6 @@ from .live import run_live, tell_doubts
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     if args.live:
         return run_live(args)
     if not args.log or not args.out:
@@ -41,8 +41,9 @@ def run(args: argparse.Namespace) -> int:
         localization = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
     summary = _summary(localization, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
-    anchors, caption = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors], os.path.basename(args.log)
-    picture = draw_map(earlier.grid, localization.trajectory, Overlay(anchors), caption=caption) if "picture" in files else None
+    anchors = [DrawnAnchor(a.id, a.position, a.covariance) for a in earlier.anchors]
+    drawn = DrawnMap(earlier.grid, [localization.trajectory], anchors)
+    picture = draw_map(drawn, caption=os.path.basename(args.log)) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, localization, picture, json_lines(about | summary))
     if args.json:
@@ -79,7 +80,6 @@ _OWN = {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"
 
 
 def _files(args: argparse.Namespace) -> dict[str, str]:
-    """Return the files to be written, by what they hold."""
     if args.out.endswith((".tum", ".tum.gz")):
         named = {"trajectory": args.out, "covariance": args.covariance, "picture": args.picture}
         return {what: name for what, name in named.items() if name}
@@ -95,7 +95,6 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
-    """Return what was found, ready for JSON."""
     return {
         "files": files,
         "poses": len(localization.stamps),

@@ -30,8 +30,6 @@ from .workers import versions
 
 
 class Recordings(NamedTuple):
-    """What was read."""
-
     logs: list[SensorLog]
     seconds: float
     """That reading took."""
@@ -66,13 +64,9 @@ def make(
     note: Callable[[str], None] | None = None,
     maps: int = 1,
 ) -> Made:
-    """Map recordings and write the result; say nothing but notes.
+    """Map recordings, as many at a time as `maps`, and write the result; say nothing but notes.
 
-    Parameters
-    ----------
-    recordings : the list of logs is emptied, for scans that no map looks at are most of the memory.
-    note : is told beforehand where memory will be short.
-    maps : how many maps are made at a time, each in a process.
+    The list of logs is emptied, for scans that no map looks at are most of the memory.
 
     Raises
     ------
@@ -135,7 +129,6 @@ _LONG = 600.0
 
 
 def config_text(config: MappingConfig) -> str:
-    """Return the config.toml of a result."""
     return to_toml(config, header="settings in force; `uwblite config` explains them")
 
 
@@ -163,10 +156,6 @@ def repeat_command(args: argparse.Namespace, config: MappingConfig) -> str:
     """Return the command that makes the same map again, in a folder with the recordings and other files that it names.
 
     Files stand with their names alone: the result is the same wherever they lie.
-
-    Parameters
-    ----------
-    config : the settings in force.
     """
     words = ["uwblite", "map", *map(base_name, args.logs)]
     words += [f"--preset={args.preset}"] if args.preset else []

@@ -25,7 +25,6 @@ from .workers import workers
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     name_recordings_once(args)
     _check_corrected_log(args)
     if args.dry_run:
@@ -133,7 +132,6 @@ _LABELS = {"doubt": "DOUBT", "warning": "warning", "note": "note"}
 
 
 def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
-    """Return the summary for people."""
     result, seconds = made.result, made.seconds
     span = sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in made.logs)
     lines = [f"mapped {duration(span)} of driving in {duration(seconds)} ({span / max(seconds, 1e-9):.0f} times real time)"]
@@ -186,8 +184,6 @@ without, and the means over two with radio alone, where the last optimisation co
 
 
 class Overall:
-    """Turns the progress of stages into the progress of all."""
-
     def __init__(self, *, lidar: bool = True) -> None:
         self._shares = [(name, with_lidar if lidar else alone) for name, (with_lidar, alone) in _SHARES.items()]
         self.share = 0.0
@@ -196,10 +192,7 @@ class Overall:
     def take(self, stage: Stage, done: int, total: int) -> float:
         """Return the share of the whole work that is done; a stage that is not known leaves it as it is.
 
-        Parameters
-        ----------
-        stage : of one with laps, whose number is not known beforehand, each lap takes half of what is left of its share.
-        done, total : steps of the stage.
+        Each lap of a stage, whose number is not known beforehand, takes half of what is left of its share.
         """
         within = min(done / total, 1.0) if total > 0 else 0.0
         if stage.lap:

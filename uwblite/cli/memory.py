@@ -49,11 +49,9 @@ class Shortage(NamedTuple):
 
 
 def shortage(megabytes: float, maps: int = 1) -> Shortage | None:
-    """Compare the memory that a map is expected to need with the limits of this process; None where it suffices.
+    """Compare the memory that so many maps at a time need with the limits of this process; None where it suffices.
 
-    Parameters
-    ----------
-    maps : how many of that size are made at a time, each in a process: addresses are limited for each, memory for all.
+    Each map has a process of its own: addresses are limited for each, memory for all.
     """
     shares = [(_needed(megabytes, limit) / limit.bytes, limit) for limit in limits()]
     worst, limit = max(((one * (1 if limit.of_a_process else maps), limit) for one, limit in shares), default=(0.0, None))

@@ -24,7 +24,6 @@ from . import console
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     if args.out:
         graph_format(args.out)
     refuse_existing(args.force, args.out, args.trajectory)

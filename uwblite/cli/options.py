@@ -26,7 +26,6 @@ class Verb(NamedTuple):
     """Whether it makes or reads maps in this process, for which numpy and scipy must fit into memory."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare its options."""
         for add in self.options:
             add(parser)
 
@@ -34,9 +33,7 @@ class Verb(NamedTuple):
 def option(name: str, help_text: str, kind: Callable[[str], Any] = str, default: Any = None, **more: Any) -> Add:
     """Return an option ``--name METAVAR`` whose value `kind` reads, a switch ``--name``, or a place ``name``.
 
-    Parameters
-    ----------
-    more : further arguments of argparse; a name without METAVAR takes nothing else.
+    Further arguments are those of argparse; a name without METAVAR takes nothing else.
     """
     word, _, metavar = name.partition(" ")
     if metavar:

@@ -11,7 +11,8 @@ from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.stored_result import read_space
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
-from ..report.picture import Overlay, PictureAnchor, draw_map
+from ..report.drawn_map import DrawnAnchor, DrawnMap
+from ..report.picture import draw_map
 from . import console
 
 _HEAD = "x,y,theta,distance,clearance"
@@ -19,7 +20,6 @@ _HEAD = "x,y,theta,distance,clearance"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
@@ -34,8 +34,8 @@ def run(args: argparse.Namespace) -> int:
             console.say_json({"error": str(error), "nearest": error.nearest, "exit_code": 1})
         raise
     write_text(table, _table(path))
-    shown = [PictureAnchor(a.id, a.position) for a in anchors]
-    write_png(picture, draw_map(grid, path.poses, Overlay(shown), caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
+    drawn = DrawnMap(grid, [path.poses], [DrawnAnchor(a.id, a.position) for a in anchors])
+    write_png(picture, draw_map(drawn, caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
     if args.json:
         console.say_json(_figures(args, path) | {"files": [table, picture], "exit_code": 0})
         return 0
@@ -55,7 +55,6 @@ def _leaving(path: PlannedPath, radius: float) -> float:
 
 
 def _table(path: PlannedPath) -> str:
-    """Return the path as CSV; m, m, rad, m from the start, m from the nearest obstacle."""
     rows = zip(path.poses.tolist(), path.distances.tolist(), path.clearances.tolist(), strict=True)
     lines = [f"{x:.4f},{y:.4f},{theta:.4f},{far:.4f},{clear:.3f}" for (x, y, theta), far, clear in rows]
     return "\n".join([_HEAD, *lines]) + "\n"

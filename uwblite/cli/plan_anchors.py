@@ -11,8 +11,8 @@ from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.stored_result import read_space
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
-from ..report.error_map import draw_errors, side_by_side
-from ..report.picture import PictureAnchor
+from ..report.drawn_map import DrawnAnchor
+from ..report.picture import draw_errors, side_by_side
 from ..report.printable import signed
 from . import console
 
@@ -21,18 +21,17 @@ _HEAD = "id,x,y,mean_error,error_95"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, _HEAD)
     warnings = list[str]()
     grid, anchors = read_space(args.map, warnings)
     console.note_of(args.map, warnings)
-    placed = [PictureAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
+    placed = [DrawnAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
     plan = plan_anchors(grid, np.array([a.position for a in placed]).reshape(-1, 2), args.count, reach=args.reach)
     figures = _figures(args, plan, len(placed))
     write_text(table, _table(figures))
-    new = [PictureAnchor(f"new{k}", place, proposed=True) for k, place in enumerate(plan.places, 1)]
+    new = [DrawnAnchor(f"new{k}", place, kind="proposed") for k, place in enumerate(plan.places, 1)]
     about = "Expected error of a position"
     today = plan.errors[0], placed, f"{about}, {len(placed)} anchors"
     then = plan.errors[-1], [*placed, *new], f"{about}, {len(new)} more"
@@ -64,7 +63,6 @@ def _figures(args: argparse.Namespace, plan: AnchorPlan, today: int) -> dict[str
 
 
 def _table(figures: dict[str, Any]) -> str:
-    """Return the places as CSV; lengths in metres; errors with this anchor and those before it."""
     lines = [_HEAD]
     lines += [f"{a['id']},{a['x']:.3f},{a['y']:.3f},{a['mean_error']:.3f},{a['error_95']:.3f}" for a in figures["anchors"]]
     return "\n".join(lines) + "\n"

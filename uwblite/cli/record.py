@@ -27,7 +27,6 @@ _PAGE_NICENESS = 10
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record until the time is over or somebody stops it."""
     if not any(getattr(args, sensor) for sensor in MOST):
         note("uwblite: error: name at least one of --uwb, --lidar, --gyro, --odometry; `uwblite devices` lists what is there")
         return 2
@@ -127,14 +126,12 @@ class _Watching:
             note(f"the map while it grows: http://{host}:{port}/")
 
     def look(self) -> None:
-        """Say once that the page has ended, where it has."""
         if self._child is not None and self._child.code() is not None:
             why = self._child.output().removeprefix("uwblite: error: ")
             note(f"uwblite: warning: the page has ended: {why}; the recording goes on")
             self._child = None
 
     def stop(self) -> None:
-        """End the page."""
         if self._child is not None:
             self._child.stop()
 
@@ -153,7 +150,6 @@ def _status_line(recorder: Recorder, watching: _Watching | None = None) -> Any:
 
 
 def status_text(recorder: Recorder) -> str:
-    """Return rates, anchors, damage and disk in one line."""
     parts = []
     for link in recorder.links:
         counts = link.counts
@@ -206,12 +202,10 @@ def use_lasting_names(links: list[Link]) -> None:
 
 
 def host_name() -> str:
-    """Return this computer's name as one word of a log."""
     return re.sub(r"\s+", "_", socket.gethostname()) or "host"
 
 
 def show_note(seconds: float, message: Note) -> None:
-    """Print what a recorder notes, with the seconds since its begin."""
     note(f"[{seconds:8.1f} s] {message.level}: {message.text}")
 
 
@@ -223,7 +217,6 @@ class LinesTo(LogFile):
         self.head, self.path, self.first, self.bytes, self.part = [], Path("-"), Path("-"), 0, 1
 
     def write(self, lines: list[str]) -> None:
-        """Hand lines on."""
         if lines:
             data = ("\n".join(lines) + "\n").encode("ascii", "replace")
             self.bytes += len(data)

@@ -9,14 +9,13 @@ from ..errors import ConfigError
 from ..io.files import sha256_of
 from ..io.formats import format_of
 from ..io.stored_result import StoredResult, read_result
-from ..server.app import app_of
+from ..server.app import App
 from ..server.web import server_for
 from . import console
 from .child import Child
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     folders = [path for path in args.paths if format_of(path) == "map"]
     if not folders:
         raise ConfigError(f"{args.paths[0]} holds no result; map it first: uwblite map {args.paths[0]} --out map")
@@ -24,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     recordings = _recordings([path for path in args.paths if path not in folders], results)
     first = os.path.abspath(folders[0])
     constraints = Path(args.constraints or f"{first}_constraints.toml")
-    app = app_of(results, recordings, constraints, Child)
+    app = App(results, recordings, constraints, Child)
     server = server_for(app, args.port)
     address = f"http://{app.host}/"
     console.say(f"open {address} in a browser; Ctrl-C ends it")
@@ -40,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         console.note("uwblite: the page has ended")
     finally:
         if app.job is not None and app.job.code() is None:
-            app.job.stop()  # type: ignore[attr-defined]
+            app.job.stop()
         server.server_close()
     return 0
 

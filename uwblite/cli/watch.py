@@ -26,7 +26,6 @@ _LONGEST = 1800.0
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the verb."""
     effective_config(args)
     folder = _folder(args)
     page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
@@ -63,19 +62,13 @@ def _folder(args: argparse.Namespace) -> str:
 
 
 def map_options(args: argparse.Namespace) -> list[str]:
-    """Return the options of `uwblite map` that settings and mounting amount to."""
     words = [f"--set={value}" for value in args.set]
     words += [f"--{name}={value}" for name in ("preset", "config") if (value := getattr(args, name))]
     return words + mounting_words(args)
 
 
 class Watch:
-    """The log, its rounds and what the page shows of them.
-
-    Parameters
-    ----------
-    folder : where the maps go; a map of an earlier watch is shown at once.
-    """
+    """The log, its rounds and what the page shows of them; a map of an earlier watch is shown at once."""
 
     def __init__(self, log: str, folder: str, page: LivePage, options: list[str]) -> None:
         self.tail, self.folder, self.page, self.options = LogTail(log), folder, page, options
@@ -89,12 +82,7 @@ class Watch:
         self._read_result(float("-inf"))
 
     def step(self, now: float) -> None:
-        """Look at the log and the running round, begin another where it is due, and show what there is.
-
-        Parameters
-        ----------
-        now : s, a clock that never leaps.
-        """
+        """Look at the log and the running round, begin another where it is due, and show what there is."""
         self._follow(now)
         if self.tail.restarts != self._restarts:
             self._forget()
@@ -106,7 +94,6 @@ class Watch:
         self.page.show_status(watch_status(self.tail, self.result, max(now - self._grown, 0.0), self._rounds(now)))
 
     def close(self) -> None:
-        """End a round that runs."""
         if self._job is not None:
             self._job.stop()
 

@@ -1,10 +1,8 @@
 """The map from a device's clock to the host's: the lower envelope of arrivals.
 
-A frame arrives at the host some time after the device stamped it. The delay is never negative and often near its
-minimum, so the host time of a device stamp is the *lower envelope* of (device time, arrival) up to a constant: the
-straight line below all points that lies closest to them, i.e. the edge of their lower convex hull below the middle of
-the window (Moon, Skelly, Towsley 1999, "Estimation and removal of clock skew from network delay measurements").
-Its slope is the skew of the device's crystal; scheduling jitter of the host drops out.
+The delay of a frame is often near its minimum, so the host time of a device stamp is the lower envelope of (device time,
+arrival) up to a constant: the edge of their lower convex hull below the middle of the window (Moon, Skelly, Towsley 1999,
+"Estimation and removal of clock skew from network delay measurements"). Scheduling jitter of the host drops out.
 """
 
 import math
@@ -12,7 +10,7 @@ from collections import deque
 from itertools import pairwise
 
 MAX_SKEW = 1e-3
-"""Largest believable relative error of a crystal; anything above is a broken estimate."""
+"""Largest believable relative error of a crystal; a tenth of it is usual."""
 LEAST_EXCESS = 1e-4
 """s; the smallest delays of two buckets are not alike to less than that."""
 
@@ -49,15 +47,14 @@ class ClockMap:
         """Take one frame: stamped at `device` s by the device, arrived at `host` s."""
         if self._minima and device < self._minima[-1][0]:
             return
-        delay = host - device
-        index = int(device // self._bucket)
-        if index == self._index and self._minima:
-            if delay >= self._minima[-1][1]:
-                return
-            self._minima[-1] = (device, delay)
-        else:
-            self._index = index
+        delay, index = host - device, int(device // self._bucket)
+        if index != self._index or not self._minima:
             self._minima.append((device, delay))
+        elif delay < self._minima[-1][1]:
+            self._minima[-1] = device, delay
+        else:
+            return
+        self._index = index
         self._fit()
 
     def host(self, device: float) -> float:
@@ -85,7 +82,7 @@ class ClockMap:
 
 def rhythm_map() -> ClockMap:
     """Return the map from a count of frames, or of readings, to host time: their rate is stated within a few percent only."""
-    return ClockMap(4.0, 0.05, 0.1)
+    return ClockMap(window=4.0, bucket=0.05, max_skew=0.1)
 
 
 def _lower_hull(points: deque[tuple[float, float]]) -> list[tuple[float, float]]:

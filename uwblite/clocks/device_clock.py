@@ -1,8 +1,4 @@
-"""Device clocks: counters that wrap or restart, and their time in seconds of the host.
-
-`DeviceClock` is what drivers use: it unwraps the counter, notices resets, counts frames that are missing and maps to
-host time by a `ClockMap`.
-"""
+"""Device clocks: counters that wrap or restart, and their time in seconds of the host."""
 
 import math
 from collections import deque
@@ -25,6 +21,10 @@ WITNESSES = 3
 """Windows in a row that must say so."""
 GAP = 1.6
 """Periods between two frames from which on one is missing."""
+_LONGEST_WAIT = 60.0
+"""s by which the arrivals of two frames may differ from what the counter says, if it does not wrap in four times that."""
+_STEPS, _FEWEST = 25, 5
+"""Most and least steps between frames of which the median is their period."""
 
 
 class Unwrapper:
@@ -38,7 +38,7 @@ class Unwrapper:
 
     def __init__(self, modulus: int, tick: float) -> None:
         self.modulus, self.tick = modulus, tick
-        self._tolerance = min(60.0, modulus * tick / 4) if modulus else 60.0
+        self._tolerance = min(_LONGEST_WAIT, modulus * tick / 4) if modulus else _LONGEST_WAIT
         self._total: float | None = None
         self._count, self._now = 0.0, 0.0
 
@@ -86,10 +86,9 @@ class Reading:
 
 
 class DeviceClock:
-    """The clock that a device stamps its frames with.
+    """The clock that a device stamps its frames with: its counter unwrapped, resets and missing frames, and host time.
 
-    A reset costs the map between the clocks, which begins again, but not what was measured of the link: the delay of a
-    frame is a property of the device and its cable.
+    A reset costs the map between the clocks, but not the delay of a frame, a property of the device and its cable.
 
     Parameters
     ----------
@@ -120,7 +119,7 @@ class DeviceClock:
         self._unwrapper, self._map = Unwrapper(modulus, tick), ClockMap()
         self._last: float | None = None
         self._arrival = 0.0
-        self._steps: deque[float] = deque(maxlen=25)
+        self._steps: deque[float] = deque(maxlen=_STEPS)
         self._half = tick / 2
         self._tie: tuple[float, float] | None = None
         """s, between which host time minus device time lay."""
@@ -173,10 +172,9 @@ class DeviceClock:
                 self._map = ClockMap()
                 self._map.add(device, arrival)
         self._learn_latency()
-        stamp, spread = self._map.host(device) - self.latency, self.tied + self._half + 2 * self._map.excess
-        if not self.proven or self.rate is not None:
-            stamp = arrival
-        return Reading(stamp, elapsed, missing, reset, spread)
+        known = self.proven and self.rate is None
+        stamp = self._map.host(device) - self.latency if known else arrival
+        return Reading(stamp, elapsed, missing, reset, self.tied + self._half + 2 * self._map.excess)
 
     def lateness(self, count: float, arrival: float) -> float | None:
         """Return how much later than the quickest frame one comes, s; below 0 = earlier; None = it cannot be said.
@@ -193,7 +191,7 @@ class DeviceClock:
     def _missing(self, elapsed: float | None, arrival: float) -> int:
         if elapsed is not None and self.rate is None and self.period is None and elapsed > 0:
             self._steps.append(elapsed)
-        period = self.period or (median(self._steps) if len(self._steps) > 4 else math.inf)
+        period = self.period or (median(self._steps) if len(self._steps) >= _FEWEST else math.inf)
         gap = arrival - self._arrival if self._arrival and elapsed is None else elapsed or 0.0
         return round(gap / period) - 1 if gap > GAP * period else 0
 
@@ -211,8 +209,8 @@ class DeviceClock:
             # The unit may be so far off that every frame looks like another power-up.
             self._judge(math.inf)
         if self._windows and arrival < self._windows[-1][0] + RATE_WINDOW:
-            if delay < self._windows[-1][1]:
-                self._windows[-1] = self._windows[-1][0], delay
+            begin, least = self._windows[-1]
+            self._windows[-1] = begin, min(delay, least)
             return
         if len(self._windows) > 1:
             (since, before), (begin, last) = self._windows[-2:]

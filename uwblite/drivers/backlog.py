@@ -51,11 +51,10 @@ class Backlog:
         self._waiting: list[_Held] = []
 
     def take(self, event: Any, now: float, spacing: float | None, members: tuple[str, ...] = ()) -> list[Any]:
-        """Return the events that need not wait at time `now`, s.
+        """Return the events that need not wait at time `now`, s; a frame has a `stamp`, the arrival of its first byte, s.
 
         Parameters
         ----------
-        event : a frame has a `stamp`, the arrival of its first byte, s.
         spacing : s, usual distance from the frame before, 0 = it is to be learnt; None = the event is no frame of a stream.
         members : of a round, which has each once, those in the frame; none = each frame is a round.
         """
@@ -86,7 +85,6 @@ class Backlog:
         return self.release() if deadline is not None and (now >= deadline or len(self._waiting) >= MOST) else []
 
     def release(self) -> list[Any]:
-        """Return all events that wait."""
         waiting, self._waiting = self._waiting, []
         frames = [held for held in waiting if held.spacing is not None]
         if not frames or self._last is None:
@@ -111,7 +109,6 @@ class Backlog:
         return events
 
     def _begins(self, came: set[str], members: tuple[str, ...]) -> bool:
-        """Return whether a frame begins a round after what came of the one before."""
         return not members or not came.isdisjoint(members)
 
     def _remember(self, stamp: float, members: tuple[str, ...]) -> None:

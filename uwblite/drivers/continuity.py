@@ -38,9 +38,7 @@ Item = TypeVar("Item")
 def device_time(counted: float, elapsed: float, turn: float) -> float | None:
     """Return the time between two frames by the device's clock, s; None = it did not keep pace with the host's.
 
-    Parameters
-    ----------
-    counted : difference of the clock's readings, s. elapsed : by the host, s. turn : after how long the clock wraps, s.
+    The clocks went on by `counted` and `elapsed`, s; that of the device wraps after `turn`, s.
     """
     ahead = math.remainder(counted - elapsed, turn)
     return elapsed + ahead if abs(ahead) < LEAP else None
@@ -63,11 +61,9 @@ class Continuity(Generic[Item]):
         """Those that leapt and go on from each other."""
 
     def take(self, item: Item, witnesses: int) -> tuple[list[Item], list[Item]]:
-        """Take the next reading; return those that pass now, in their order, and those that are given up.
+        """Return the readings that pass now, in their order, and those that are given up.
 
-        Parameters
-        ----------
-        witnesses : how many must agree with one that leaps; 0 = it passes.
+        One that leaps passes when so many `witnesses` agree with it; 0 = at once.
         """
         dropped: list[Item] = []
         if witnesses == 0:
@@ -104,11 +100,9 @@ class LinkHealth:
         self._damaged = -math.inf
 
     def damage(self, now: float) -> None:
-        """Note bytes that were no line or frame, at time `now`, s."""
         self._damaged = now
 
     def is_damaged(self, now: float) -> bool:
-        """Return whether that was within DISTRUST before `now`, s."""
         return now - self._damaged < DISTRUST
 
 
@@ -116,12 +110,7 @@ Ranged = tuple[RangeEpoch, RangeReading]
 
 
 class RangeGuard:
-    """Ranges that no sum protects: on a damaged link one that leaps, and a new anchor, must be seen again.
-
-    Parameters
-    ----------
-    health : of the link.
-    """
+    """Ranges that no sum protects: on a damaged link one that leaps, and a new anchor, must be seen again."""
 
     def __init__(self, health: LinkHealth) -> None:
         self._health, self._damaged = health, False
@@ -164,7 +153,6 @@ class RangeGuard:
         return abs(after[1].range - before[1].range) <= SPREAD + SPEED * min(seconds, MOST_GAP)
 
     def _forgotten(self, stamp: float) -> list[Ranged]:
-        """Return what has waited for too long."""
         forgotten: list[Ranged] = []
         for name, series in list(self._anchors.items()):
             if series.waiting and stamp - series.waiting[-1][0].stamp > FORGET:

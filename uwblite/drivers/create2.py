@@ -68,7 +68,6 @@ class Create2Protocol(FixedPackets):
         return sum(packet) & 0xFF == 0 and bytes(packet[place] for place in (2, 4, 7, 10)) == PACKETS
 
     def decode(self, frame: bytes, stamp: float) -> Encoders:
-        """Decode a frame."""
         _, _, _, bumps, _, left, _, right, _, millivolts, _ = LAYOUT.unpack(frame)
         return Encoders(stamp, left, right, bumps >> 2 & 3, millivolts / 1000)
 
@@ -76,10 +75,7 @@ class Create2Protocol(FixedPackets):
 class Create2Driver(BaseDriver):
     """A Create 2 or Roomba. It is only listened to: the stream is asked for, no motor is ever moved.
 
-    Parameters
-    ----------
-    start : pose of the base at the first frame; m, m, rad.
-    baud : bit/s; a robot that was switched on with its clean button held for 10 s talks at 19200.
+    One that was switched on with its clean button held for 10 s talks at 19200 bit/s.
     """
 
     frame, rhythm = Encoders, PERIOD
@@ -111,7 +107,6 @@ class Create2Driver(BaseDriver):
                     yield from self.take(event)
 
     def take(self, event: Encoders) -> list[Action]:
-        """Turn a frame into a pose."""
         self.ready, last, self._last = True, self._last, event
         actions: list[Action] = []
         stamp = self._stamp(event)
@@ -137,5 +132,4 @@ class Create2Driver(BaseDriver):
         return self._map.host(self._frames * PERIOD)
 
     def stop(self) -> list[Action]:
-        """Pause the stream."""
         return [Send(PAUSE)]

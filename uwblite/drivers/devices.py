@@ -319,13 +319,7 @@ ALIASES = {("uwb", "dwm1001"): "tlv", ("uwb", "line"): "uwb-line", ("gyro", "lin
 
 
 def open_device(sensor: str, spec: str, setup: Setup = Setup()) -> tuple[Session, str]:
-    """Return the session for what a user wrote, and the URL of its port.
-
-    Parameters
-    ----------
-    sensor : one of SENSORS.
-    spec : ``[NAME:]PORT[?option=value&...]``.
-    setup : what the driver gets besides its options.
+    """Return the session for what a user wrote, ``[NAME:]PORT[?option=value&...]``, and the URL of its port.
 
     Raises
     ------
@@ -360,11 +354,6 @@ def _names(sensor: str) -> list[str]:
 
 
 def kinds_on_usb(usb_id: str, text: str) -> list[DeviceKind]:
-    """Return the devices that a USB port may belong to.
-
-    Parameters
-    ----------
-    usb_id : "vvvv:pppp" in lower-case hexadecimal. text : manufacturer and product.
-    """
+    """Return the devices that a USB port may belong to, by its "vvvv:pppp" in hexadecimal, and manufacturer and product."""
     of_usb = (kind for kind in DEVICES.values() if usb_id in kind.usb or (kind.product and kind.product in text.lower()))
     return [kind for kind in of_usb if kind.probe]

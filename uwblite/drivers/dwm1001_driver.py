@@ -56,10 +56,7 @@ _SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly
 def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float) -> list[Note]:
     """Name every setting that makes ranges rare or absent, the worst first, and how to mend each.
 
-    Parameters
-    ----------
-    tag : the node is a tag, not an anchor. active : its radio is on. stationary : stationary detection is on.
-    joined : it is part of a network; None = not known yet. low_power : low-power mode is on. period : s between fixes.
+    The node is a `tag`, `active` = its radio is on, `joined` None = not known yet, `period` s between fixes.
     """
     resting = f"stationary detection is on: the rate falls to once in 10 s at rest: {_SHELL}, `acts` shows its arguments;"
     rows = (
@@ -84,13 +81,7 @@ def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, lo
 
 
 class Dwm1001Driver(Driver):
-    """One DWM1001 tag.
-
-    Parameters
-    ----------
-    shell : read the text stream instead of polling TLV.
-    stream : False: stop after the queries (for a look at what is plugged in).
-    """
+    """One DWM1001 tag, by TLV or its `shell`; without `stream` it stops after the queries, for a look at what is plugged in."""
 
     baud = BAUD
 
@@ -143,11 +134,9 @@ class Dwm1001Driver(Driver):
         return [event for event in events if not isinstance(event, Corrupt)]
 
     def spacing(self, event: Any) -> float | None:
-        """Return the time between two lines of the stream, s."""
         return self.period if self._streaming and isinstance(event, RangeLine) else None
 
     def stop(self) -> list[Action]:
-        """Return what ends a stream; polling ends by itself."""
         noise = self._noise if self._text and self._binary else []
         return [*noise, *self._guard.finish(), *([Send(b"lec\r")] if self._streaming else [])]
 
@@ -299,7 +288,6 @@ class Dwm1001Driver(Driver):
     # ---- for people
 
     def identity(self) -> Identity:
-        """Say who answered."""
         details = {}
         node, network = self.values.get("node_id"), self.values.get("pan_id", self.info.pan_id)
         if node is not None:

@@ -51,7 +51,6 @@ NOT_JOINED = Note(
 
 
 def _slow(width: float) -> Note:
-    """Return the note on answers that take so long that fixes are known to so many seconds only."""
     text = f"uwb: answers are slow: the time of a range is known to {width:.1f} s only, and beyond {WIDEST} s it is not logged"
     return Note("warning", "uwb-slow", f"{text}; read the module's stream instead (`shell`), or connect it directly")
 
@@ -61,13 +60,7 @@ Bracket = tuple[float, float]
 
 
 class FixPoller:
-    """Polls one module for a driver.
-
-    Parameters
-    ----------
-    driver : whose script this is part of.
-    period : s between fixes.
-    """
+    """Polls one module, as part of its driver's script; `period` s between fixes."""
 
     def __init__(self, driver: Driver, period: float) -> None:
         self._driver, self._period = driver, period

@@ -84,7 +84,6 @@ class ShellProtocol:
         self._lines = LineReader(MAX_LINE, ends=(b"\r", b"\n", PROMPT))
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Event] = []
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):

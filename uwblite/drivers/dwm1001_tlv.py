@@ -212,7 +212,6 @@ class TlvProtocol(HeadedFrames):
         return 3 if _may_begin(head) else -1
 
     def measure(self, offset: int) -> int:
-        """Return the size of the head or block at `offset`; 0 = wait for more bytes; -n = the first n bytes are noise."""
         buffer = self.pending.data
         if buffer[offset] == self.lead:
             # Bytes that were taken already are accepted as a head only together with the block that follows.
@@ -232,7 +231,6 @@ class TlvProtocol(HeadedFrames):
         return 0 if end > len(buffer) else end - offset
 
     def decode(self, frame: bytes, stamp: float) -> Event:
-        """Decode a head or a block."""
         event = decode(frame, stamp)
         self._inside = not isinstance(event, Corrupt) and not (isinstance(event, Answer) and event.error)
         return event

@@ -24,7 +24,6 @@ class StampedBuffer:
         self._marks: list[tuple[int, float]] = []
 
     def append(self, piece: bytes, stamp: float) -> None:
-        """Hold a piece that arrived at `stamp`, s."""
         self._marks.append((len(self.data), stamp))
         self.data += piece
 
@@ -40,7 +39,6 @@ class StampedBuffer:
         return ((0, self.stamp_at(start)), *inner)
 
     def drop(self, count: int) -> None:
-        """Forget the first bytes."""
         if count >= len(self.data):
             self.clear()
         elif count:
@@ -48,7 +46,6 @@ class StampedBuffer:
             del self.data[:count]
 
     def clear(self) -> None:
-        """Forget all bytes."""
         self.data.clear()
         self._marks.clear()
 
@@ -82,13 +79,7 @@ class FrameReader(ABC):
         return 0
 
     def feed(self, data: bytes, stamp: float) -> list[Any]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-        """
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Any] = []
         for start in range(0, len(data), CHUNK):
             self.pending.append(data[start : start + CHUNK], stamp)
@@ -140,15 +131,9 @@ class HeadedFrames(FrameReader):
 
     @abstractmethod
     def frame_size(self, head: bytes) -> int:
-        """Return the size of the frame that begins so; 0 = more bytes are needed to say, -1 = none begins so.
-
-        Parameters
-        ----------
-        head : the first `head_size` bytes, or as many as have come.
-        """
+        """Return the size of the frame that begins so; 0 = more bytes are needed to say, -1 = none begins so."""
 
     def measure(self, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
         size = self.frame_size(bytes(buffer[offset : offset + self.head_size]))
         if size < 0:
@@ -170,7 +155,6 @@ class HeadedFrames(FrameReader):
         return 0
 
     def overlap(self, frame: bytes) -> int:
-        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
         sizes = range(min(self.head_size, len(frame)) - 1, 0, -1)
         return next((k for k in sizes if self.frame_size(frame[-k:]) >= 0), 0)
 
@@ -194,7 +178,6 @@ class PacketReader(FrameReader):
         return True
 
     def measure(self, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.pending.data
         size, behind = self.size_at(buffer, offset), offset + 1
         end = len(buffer) if size == 0 else offset + size if size > 0 and not self.is_checked(buffer[offset]) else offset
@@ -223,7 +206,6 @@ class FixedPackets(PacketReader):
         """Return whether a whole packet with the right head has a right check, and holds what the device can send."""
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        """Return the size of the good packet at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[offset] != self.head[0]:
             return to_next(buffer, offset, self.head[0])
         packet = buffer[offset : offset + self.size]
@@ -258,14 +240,7 @@ class RawLine:
 
 
 class LineReader:
-    """Text lines.
-
-    Parameters
-    ----------
-    most : bytes; of a longer line only the end is kept.
-    keep : bytes of it that are kept at least.
-    ends : what ends a line.
-    """
+    """Text lines; of one longer than `most` bytes the end is kept, at least `keep` of them."""
 
     def __init__(self, most: int, *, keep: int = 0, ends: tuple[bytes, ...] = (b"\r", b"\n")) -> None:
         self._pending = StampedBuffer()
@@ -276,7 +251,6 @@ class LineReader:
 
     @property
     def pending(self) -> int:
-        """Number of bytes not yet decoded."""
         return len(self._pending.data)
 
     def feed(self, data: bytes, stamp: float) -> list[RawLine | Corrupt]:

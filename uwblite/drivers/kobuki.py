@@ -75,12 +75,10 @@ class KobukiProtocol(HeadedFrames):
     lead, head_size, noise = SIGNATURE[0], len(SIGNATURE), "no packet"
 
     def frame_size(self, head: bytes) -> int:
-        """Return the size of the packet that begins so; 0 = more bytes are needed to say, -1 = none begins so."""
         fits = all((i == 2 and byte >= SHORTEST) or byte == SIGNATURE[i] for i, byte in enumerate(head))
         return -1 if not fits else 4 + head[2] if len(head) > 2 else 0
 
     def decode(self, frame: bytes, stamp: float) -> Feedback | Corrupt:
-        """Decode a packet."""
         if reduce(xor, frame[2:], 0):
             return corrupt(frame, "packet with a wrong sum")
         subs: dict[int | None, bytes] = {}
@@ -109,12 +107,7 @@ def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
 
 
 class KobukiDriver(BaseDriver):
-    """A Kobuki base. Nothing is ever sent.
-
-    Parameters
-    ----------
-    start : pose of the base at the first packet; m, m, rad.
-    """
+    """A Kobuki base. Nothing is ever sent."""
 
     frame, rhythm = Feedback, PERIOD
 
@@ -131,7 +124,6 @@ class KobukiDriver(BaseDriver):
         return self._series.confirmed(event, 1, self._pose)
 
     def stop(self) -> list[Action]:
-        """Return Corrupt for a packet that nothing confirmed."""
         return self._series.unconfirmed()
 
     def _pose(self, event: Feedback) -> list[Action]:

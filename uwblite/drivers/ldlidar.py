@@ -54,11 +54,9 @@ class LdLidarProtocol(FixedPackets):
     head, size = b"\x54\x2c", SIZE
 
     def is_good(self, packet: bytearray) -> bool:
-        """Return whether the CRC is right, and the angles are angles."""
         return crc8(packet[:-1]) == packet[-1] and _is_sound(packet)
 
     def decode(self, frame: bytes, stamp: float) -> Samples:
-        """Decode a packet."""
         speed, start = struct.unpack_from("<HH", frame, 2)
         fields = struct.unpack_from("<" + "HB" * READINGS + "HH", frame, 6)
         end, time = fields[-2:]

@@ -42,7 +42,6 @@ class Lds01Protocol(FixedPackets):
         return FIRST <= packet[1] < FIRST + PACKETS and packet[-1] == packet[-2]
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Corrupt:
-        """Decode a packet."""
         if not self._sum_is_right(frame):
             return corrupt(frame, "packet with a wrong sum")
         (speed,) = struct.unpack_from("<H", frame, 2)
@@ -71,10 +70,8 @@ class Lds01Driver(SpinningDriver):
         super().__init__(Lds01Protocol(), FAN)
 
     def start_up(self) -> Script[bool]:
-        """Start motor and stream."""
         yield Send(START)
         return True
 
     def stop(self) -> list[Action]:
-        """Stop motor and stream."""
         return [Send(STOP)]

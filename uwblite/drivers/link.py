@@ -4,7 +4,9 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from ..errors import DeviceError
 from .events import Note, Send, SetBaud, SetDtr
@@ -69,55 +71,33 @@ class Host:
 
 
 class Opening:
-    """A port that is being opened by a thread of its own, so that nobody has to wait for it.
-
-    Parameters
-    ----------
-    open_port : (url, baud) -> Port; raises DeviceError.
-    url, baud : as for `open_port`.
-    """
+    """A port that is being opened by a thread of its own, so that nobody has to wait for it."""
 
     def __init__(self, open_port: Callable[[str, int], Port], url: str, baud: int) -> None:
-        self._open, self._place = open_port, (url, baud)
-        self._lock = threading.Lock()
-        self._result: Port | DeviceError | None = None
-        self._given_up = False
-        threading.Thread(target=self._run, name=f"uwblite-open {url}", daemon=True).start()
+        self._port = Future[Port]()
+        opening = partial(open_port, url, baud)
+        threading.Thread(target=self._run, args=(opening,), name=f"uwblite-open {url}", daemon=True).start()
 
-    def _run(self) -> None:
+    def _run(self, opening: Callable[[], Port]) -> None:
         try:
-            result: Port | DeviceError = self._open(*self._place)
+            self._port.set_result(opening())
         except DeviceError as error:
-            result = error
-        with self._lock:
-            if not self._given_up:
-                self._result = result
-                return
-        if not isinstance(result, DeviceError):
-            result.close()
+            self._port.set_exception(error)
 
-    def result(self) -> "Port | DeviceError | None":
+    def result(self) -> Port | DeviceError | None:
         """Return the port, why not, None while that is unknown."""
-        return self._result
+        try:
+            return self._port.result() if self._port.done() else None
+        except DeviceError as error:
+            return error
 
     def give_up(self) -> None:
         """Close the port when it opens after all."""
-        with self._lock:
-            self._given_up = True
-        if self._result is not None and not isinstance(self._result, DeviceError):
-            self._result.close()
+        self._port.add_done_callback(lambda done: None if done.exception() else done.result().close())
 
 
 class Link:
-    """One device: its port, session and counts.
-
-    Parameters
-    ----------
-    sensor : "uwb", "lidar" or "odometry".
-    url : of the port.
-    session : start-up, running and recovery.
-    number : the robot's first (1), second ... of its kind.
-    """
+    """One device: its port, session and counts; the robot's first (1), second ... of its kind."""
 
     def __init__(self, sensor: str, url: str, session: Session, number: int = 1) -> None:
         self.name = sensor if number == 1 else f"{sensor}{number}"
@@ -138,13 +118,7 @@ class Link:
     # ---- its port
 
     def connect(self, now: float, open_port: Callable[[str, int], Port]) -> Port | DeviceError | None:
-        """Open the port in the background; return it once it is open, why not, None while that is unknown.
-
-        Parameters
-        ----------
-        now : s.
-        open_port : (url, baud) -> Port.
-        """
+        """Open the port in the background; return it once it is open, why not, None while that is unknown."""
         if self.opening is None:
             self.opening = Opening(open_port, self.url, self.session.baud)
         port = self.opening.result()

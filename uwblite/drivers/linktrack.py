@@ -28,11 +28,9 @@ class LinkTrackProtocol(FixedPackets):
     noise, head, size = "no tag frame", b"\x55\x01", 128
 
     def is_good(self, packet: bytearray) -> bool:
-        """Return whether the sum is right."""
         return sum(packet[:-1]) & 0xFF == packet[-1]
 
     def decode(self, frame: bytes, stamp: float) -> Line:
-        """Decode a frame."""
         millimetres = [int.from_bytes(frame[22 + 3 * i : 25 + 3 * i], "little", signed=True) for i in range(ANCHORS)]
         (time,) = struct.unpack_from("<I", frame, 108)
         return Line(stamp, Ranges(_readings(millimetres), time))
@@ -44,7 +42,6 @@ class Bu03Protocol(PacketReader):
     noise, smallest = "no range frame", BU03_SHORT
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[offset] != BU03_HEAD[0]:
             return to_next(buffer, offset, BU03_HEAD[0])
         frame = bytes(buffer[offset : offset + BU03_SIZE])
@@ -57,7 +54,6 @@ class Bu03Protocol(PacketReader):
         return BU03_SIZE if frame[-1] == BU03_END else -1
 
     def decode(self, frame: bytes, stamp: float) -> Line:
-        """Decode a frame."""
         return Line(stamp, Ranges(_readings(struct.unpack_from("<8I", frame, 3))))
 
 

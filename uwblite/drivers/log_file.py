@@ -39,18 +39,15 @@ def number_text(value: float) -> str:
 
 
 def pose_line(pose: OdometryPose, tail: str) -> str:
-    """Write ODOM x y theta tv rv accel."""
     fields = (pose.x, pose.y, pose.theta, pose.speed, pose.turn_rate, 0.0)
     return f"ODOM {' '.join(number_text(field) for field in fields)} {tail}"
 
 
 def gyro_line(gyro: GyroHeading, tail: str) -> str:
-    """Write GYRO heading turn_rate."""
     return f"GYRO {number_text(gyro.heading)} {number_text(gyro.turn_rate)} {tail}"
 
 
 def numbered(name: str, number: int) -> str:
-    """Return the name of a message of a robot's first (1), second ... tag: UWB, UWB2 ..."""
     return name if number == 1 else f"{name}{number}"
 
 
@@ -62,15 +59,9 @@ def range_lines(epoch: RangeEpoch, tail: str, number: int = 1) -> list[str]:
 def scan_line(
     scan: LaserScan, laser: tuple[float, float, float], robot: OdometryPose | None, tail: str, number: int = 1
 ) -> str:
-    """Write ROBOTLASER1, ROBOTLASER2 ...
+    """Write ROBOTLASER1, ROBOTLASER2 ... of a laser at x, y, theta on the base, with the robot's latest odometry.
 
-    Parameters
-    ----------
-    scan : the sweep.
-    laser : x, y, theta of the laser on the base; m, m, rad.
-    robot : latest odometry, None = origin. The reader interpolates odometry itself; this is for other readers.
-    tail : ipc timestamp, host and logger timestamp.
-    number : of the robot's first (1), second ... lidar.
+    The reader interpolates odometry itself; this is for other readers.
     """
     count = len(scan.ranges)
     readings = " ".join([metre_text(value, scan.range_max) for value in scan.ranges])
@@ -129,11 +120,7 @@ class LogFile:
         return fd
 
     def write(self, lines: list[str]) -> None:
-        """Append lines in one write.
-
-        Parameters
-        ----------
-        lines : without line ends.
+        """Append lines, without their ends, in one write.
 
         Raises
         ------
@@ -202,12 +189,10 @@ class LogFile:
         return True
 
     def free_bytes(self) -> int:
-        """Return the space left on the disk."""
         disk = os.fstatvfs(self._fd)
         return disk.f_bavail * disk.f_frsize
 
     def close(self) -> None:
-        """Sync and close."""
         self._closing.set()
         self._thread.join(timeout=10.0)
         with contextlib.suppress(OSError):
@@ -216,17 +201,7 @@ class LogFile:
 
 
 def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
-    """Read where a log broke off.
-
-    Parameters
-    ----------
-    path : a log of ours, possibly with a broken last line.
-
-    Returns
-    -------
-    stamp : largest ipc timestamp near the end, s; None where there is none.
-    pose : last odometry x, y, theta; m, m, rad; zero where there is none.
-    """
+    """Return the largest ipc timestamp near the end of a log of ours, s, and its last odometry; None and zero without any."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - TAIL))
         lines = file.read().decode("ascii", "replace").split("\n")[:-1]
@@ -250,12 +225,7 @@ def _number(text: str) -> float | None:
 
 
 class LogText:
-    """Lines on their way to the log.
-
-    Parameters
-    ----------
-    log : where to write. mounting : sensors on the base. host : the computer that records.
-    """
+    """Lines on their way to the log."""
 
     def __init__(self, log: LogFile, mounting: Mounting, host: Host) -> None:
         self._log, self._mounting, self._host = log, mounting, host

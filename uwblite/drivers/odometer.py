@@ -35,7 +35,6 @@ class WheelOdometer:
 
         Parameters
         ----------
-        left, right : ticks.
         heading : rad, of a gyro, from any zero; None = the turn is the wheels'.
         still : what the counters did is unknown: the wheels count as still, a gyro does not.
         """
@@ -54,7 +53,6 @@ class WheelOdometer:
 
     @property
     def started(self) -> bool:
-        """The counters or the pose were read."""
         return self._last is not None
 
     def place(self, x: float, y: float, theta: float) -> None:
@@ -67,13 +65,7 @@ class WheelOdometer:
 
 
 class BaseDriver(Driver):
-    """A base with two wheels, switches that show a wheel in the air, and a battery; kinds derive from this.
-
-    Parameters
-    ----------
-    protocol : bytes to events. title : for people.
-    odometer : of its wheels. low : V, of a battery that is nearly empty.
-    """
+    """A base with two wheels, switches that show a wheel in the air, and a battery that is low below so many V."""
 
     def __init__(self, protocol: ByteProtocol, title: str, odometer: WheelOdometer, low: float) -> None:
         super().__init__(protocol, title)
@@ -92,7 +84,6 @@ class BaseDriver(Driver):
         return Note("warning", "odometry-gap", f"odometry: the base {what} meanwhile is unknown")
 
     def identity(self) -> Identity:
-        """Say who answered."""
         if self._voltage is None:
             return Identity(self.title)
         findings = []

@@ -45,11 +45,7 @@ class LineFormat:
 
 
 def odometry_format(columns: str = "t,x,y,theta", **units: Any) -> LineFormat:
-    """Build the form of a base's lines.
-
-    Parameters
-    ----------
-    columns : names from COLUMNS, parted by commas. units : other fields of LineFormat.
+    """Return the form of a base's lines, from column names parted by commas and other fields of LineFormat.
 
     Raises
     ------
@@ -80,14 +76,7 @@ def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str
 
 
 class OdometryLineDriver(LineDriver):
-    """A base that prints text lines.
-
-    Parameters
-    ----------
-    line_format : columns and units.
-    baud : bit/s.
-    start : pose at the first line, where the lines hold ticks; m, m, rad.
-    """
+    """A base that prints text lines; where these hold ticks, its pose at the first one is `start`."""
 
     def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
         unit = line_format.time_unit
@@ -97,7 +86,6 @@ class OdometryLineDriver(LineDriver):
         self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
 
     def time_of(self, content: dict[str, float]) -> float | None:
-        """Return the base's time in a line, its own unit; None = there is none."""
         return content.get("t")
 
     def follows(self, before: Line, after: Line) -> bool:
@@ -115,7 +103,6 @@ class OdometryLineDriver(LineDriver):
         return max(ways) <= LEAP_SPEED * seconds and turn <= LEAP_TURN * seconds
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into a pose."""
         self.ready, values, unit = True, line.content, self._format
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
@@ -146,17 +133,11 @@ LEAP_RATE, LEAP_ACCELERATION = 1.0, 50.0
 
 
 def gyro_format(columns: str, time_unit: float = 1.0, angle_unit: float = 1.0, prefix: str = "") -> LineFormat:
-    """Build the form of a gyro's lines.
-
-    Parameters
-    ----------
-    columns : names of ``t``, ``turn_rate``, ``theta``, ``-``, with one of turn_rate and theta.
-    time_unit : s per unit of t. angle_unit : rad per unit of theta, rad/s per unit of turn_rate; below 0 = clockwise.
-    prefix : what the lines begin with.
+    """Return the form of a gyro's lines; units are s of t, rad of theta and rad/s of turn_rate, below 0 = clockwise.
 
     Raises
     ------
-    ConfigError : other columns, or neither rate nor heading.
+    ConfigError : other columns than t, turn_rate, theta and -, or neither rate nor heading.
     """
     names = named_columns(columns, ("t", "turn_rate", "theta"), "gyro line")
     if not {"turn_rate", "theta"} & set(names):
@@ -169,10 +150,6 @@ class GyroLineDriver(LineDriver):
 
     A heading that the gyro sends is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
     the heading stays: the mapper sees the gap by the stamps.
-
-    Parameters
-    ----------
-    line_format : columns and units. baud : bit/s.
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:
@@ -188,11 +165,9 @@ class GyroLineDriver(LineDriver):
         self._last = None
 
     def time_of(self, content: dict[str, float]) -> float | None:
-        """Return the gyro's time in a line, its own unit; None = there is none."""
         return content.get("t")
 
     def follows(self, before: Line, after: Line) -> bool:
-        """Return whether a robot can have turned so meanwhile."""
         step = {name: (after.content[name] - before.content[name]) * self._angle_unit for name in after.content}
         seconds = max(after.stamp - before.stamp, 0.0)
         rate, turn = step.get("turn_rate", 0.0), math.remainder(step.get("theta", 0.0), 2 * math.pi)
@@ -200,7 +175,6 @@ class GyroLineDriver(LineDriver):
         return smooth and super().follows(before, after)
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into a heading."""
         self.ready, values = True, line.content
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:

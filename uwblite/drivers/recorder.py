@@ -27,16 +27,7 @@ POLL = 0.005
 
 
 class Recorder:
-    """Record until asked to stop.
-
-    Parameters
-    ----------
-    links : the devices.
-    log : where to write.
-    host : the computer that records.
-    mounting : sensors on the base.
-    on_note : called with (seconds since start, Note) for each thing a person must know.
-    """
+    """Record until asked to stop; `on_note` gets the seconds since the start and each thing a person must know."""
 
     def __init__(
         self,
@@ -58,13 +49,7 @@ class Recorder:
     # ---- running
 
     def run(self, *, duration: float | None, stopping: Callable[[], bool], on_status: Callable[[], None] | None = None) -> None:
-        """Record.
-
-        Parameters
-        ----------
-        duration : s; None = until `stopping`.
-        stopping : asked several times a second.
-        on_status : called a few times a second.
+        """Record for a `duration`, s, or until `stopping`, which is asked several times a second, as `on_status` is called.
 
         Raises
         ------
@@ -236,12 +221,10 @@ class Recorder:
     # ---- the end
 
     def summary(self) -> list[str]:
-        """Return one line per device for people."""
         size = f"{self.log.bytes / 1e6:.2f} MB in {self.log.path}"
         return [f"recorded {self.end - self.start:.1f} s, {size}", *summary_lines(self.links, self.start, self.end)]
 
     def doubts(self) -> list[str]:
-        """Return why the recording should not be trusted; empty when it can be."""
         return doubts(self.links, self.start, self.end)
 
     def _finish(self) -> None:

@@ -81,21 +81,17 @@ class RpLidarProtocol(PacketReader):
         self._span, self._misfits = 0, 0
 
     def reset(self) -> None:
-        """Forget what is half received, and the stream."""
         super().reset()
         self._stream, self._waiting, self._span = 0, None, 0
         self.smallest = DESCRIPTOR
 
     def feed(self, data: bytes, stamp: float) -> list[Samples | Reply | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete."""
         return [event for event in super().feed(data, stamp) if event is not None]
 
     def is_checked(self, lead: int) -> bool:
-        """Return whether frames that begin with this byte have a check; replies have none."""
         return lead != SYNC
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        """Return the size of the frame at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[offset] == SYNC and (size := reply_size(buffer, offset, KINDS)) >= 0:
             return size
         if self._stream == EXPRESS_REPLY:
@@ -184,13 +180,7 @@ def _decode_capsule(capsule: bytes, stamp: float, first: int, step: float, perio
 
 
 class RpLidarDriver(SlamtecDriver):
-    """An RPLIDAR.
-
-    Parameters
-    ----------
-    express : 4000 readings a second and more, where the firmware has it (from 1.17); otherwise standard scan.
-    baud : bit/s to try first.
-    """
+    """An RPLIDAR; `express` = 4000 readings a second and more, where the firmware has it (from 1.17)."""
 
     title, dtr = "Slamtec RPLIDAR", False
 
@@ -216,5 +206,4 @@ class RpLidarDriver(SlamtecDriver):
         return (yield from self.ask(STANDARD, answers(STANDARD_REPLY), 0.5, 2)) is not None
 
     def stop(self) -> list[Action]:
-        """Stop stream and motor."""
         return [Send(STOP), Send(motor(0)), *super().stop()]

@@ -39,7 +39,6 @@ class Reply:
     """Payload lines without sums."""
 
     def fields(self) -> dict[str, str]:
-        """Return the ``KEY:value`` lines of VV, PP and II as a dictionary."""
         return {key: value for key, colon, value in (line.partition(":") for line in self.lines) if colon}
 
 
@@ -76,7 +75,6 @@ def checksum(data: bytes) -> int:
 
 
 def decode_number(data: bytes) -> int:
-    """Decode a number of any width."""
     value = 0
     for char in data:
         value = value << 6 | (char - 0x30)
@@ -84,13 +82,7 @@ def decode_number(data: bytes) -> int:
 
 
 def decode_values(data: bytes, width: int) -> tuple[int, ...]:
-    """Decode joined data characters.
-
-    Parameters
-    ----------
-    data : characters 0x30..0x6F.
-    width : 2 or 3 characters a value.
-    """
+    """Decode joined data characters, 0x30..0x6F, 2 or 3 a value."""
     if width == 2:
         return tuple([(a << 6) + b - 0xC30 for a, b in zip(data[0::2], data[1::2], strict=True)])
     columns = zip(data[0::3], data[1::3], data[2::3], strict=True)
@@ -118,13 +110,11 @@ class ScipProtocol:
         self.reset()
 
     def reset(self) -> None:
-        """Forget half a reply."""
         self._lines = LineReader(MAX_LINE, keep=LONGEST_ECHO, ends=(b"\n",))
         self._frame: list[tuple[float, bytes]] = []
         self._text_owner = ""
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Event] = []
         for line in self._lines.feed(data, stamp):
             if not isinstance(line, Corrupt):

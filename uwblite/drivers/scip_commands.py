@@ -29,17 +29,14 @@ class Geometry:
 
     @property
     def step_angle(self) -> float:
-        """Angle between steps, rad."""
         return 2 * math.pi / self.resolution
 
     @property
     def step_time(self) -> float:
-        """Time between steps, s."""
         return 60.0 / self.speed / self.resolution
 
     @property
     def period(self) -> float:
-        """Time of a turn, s."""
         return 60.0 / self.speed
 
 
@@ -74,13 +71,9 @@ class ScanRequest:
 
 
 def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = None) -> tuple[float, ...]:
-    """Return raw values in m; +inf = nothing seen, nan = invalid (REP-117).
+    """Return raw values, mm, in m; +inf = nothing seen, nan = invalid (REP-117).
 
-    Parameters
-    ----------
-    values : mm, below DMIN codes of the model.
-    geometry : gives DMIN and DMAX.
-    limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
+    Below DMIN values are codes of the model; 2 characters hold at most `limit`, mm.
     """
     low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
     nothing = NOTHING_SEEN.get(geometry.model[:3], ())
@@ -112,65 +105,36 @@ NOTHING_SEEN = {"URG": (0, 6), "UBG": (0, 6), "UHG": (0, 6), "UTM": (1,)}
 (table 4 of the specification). All others are errors, as low intensity, readings that disagree, a strong reflector; of a model
 that is not known too, so that nothing is taken for free space."""
 
-_TIME_ADJUST = ("ok", "bad code", "in time-adjust mode already", "left time-adjust mode already", "not in time-adjust mode")
-_BIT_RATE = ("ok", "not a number", "no such bit rate", "that rate is set already", "rate not possible")
-STATUS_BY_COMMAND = {
-    "QT": {"00": "laser off, stream stopped"},
-    "TM": {f"{code:02d}": text for code, text in enumerate(_TIME_ADJUST)},
-    "SS": {f"{code:02d}": text for code, text in enumerate(_BIT_RATE)},
-}
-STATUS_OF_SCANS = {
-    "00": "ok",
-    "01": "start step is not a number",
-    "02": "end step is not a number",
-    "03": "cluster is not a number",
-    "04": "end step out of range",
-    "05": "end step is before the start step",
-    "06": "skip is not a number",
-    "07": "count is not a number",
-    "10": "laser is off",
+_MEANINGS = {
+    "01": "a bad first step, or a code of the time-adjust mode",
+    "04": "the last step is out of range",
+    "10": "the laser is off",
     "98": "resumed after a pause",
-    "99": "data follow",
-}
-STATUS_OF_ALL = {
-    "0A": "cannot create the transmission",
-    "0B": "buffer short, or the command was repeated in one batch",
-    "0C": "too few parameters",
-    "0D": "too few parameters",
     "0E": "undefined command",
     "0F": "undefined command",
-    "0G": "string too long",
-    "0H": "string has bad characters",
     "0I": "in firmware-update mode",
     "0L": "abnormal state",
     "0M": "unstable",
 }
+"""Of statuses that a unit may answer to what is sent here; all are in the specification."""
+_PAUSES, _FAULTS, _RESUMED = range(21, 50), range(50, 98), 98
+_GOOD = {("TM", "02"), ("TM", "03"), ("SS", "03")}
+"""Refusals that say that it is so already."""
 
 
 def status_meaning(command: str, status: str) -> tuple[str, str]:
-    """Name a status code.
+    """Return the kind of a status that came with a command, and what it means.
 
-    Parameters
-    ----------
-    command : the echo it came with.
-    status : two characters.
-
-    Returns
-    -------
-    kind : "ok", "paused", "resumed", "hardware-fault", "refused" or "scip1".
-    text : what it means.
+    Kinds are "ok", "paused", "resumed", "hardware-fault", "refused" and "scip1".
     """
     if len(status) == 1:
         return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit has SCIP 1.1; send SCIP2.0")
-    known = STATUS_BY_COMMAND.get(command[:2], STATUS_OF_SCANS if command[:1] in "GM" else {})
-    text = known.get(status) or STATUS_OF_ALL.get(status)
+    text = f"status {status}: {_MEANINGS.get(status, 'see the specification of SCIP 2.0')}"
     if command[:1] in "GM" and status.isdigit():
-        number = int(status)
-        if 21 <= number <= 49:
+        if int(status) in _PAUSES:
             return "paused", f"status {status}: the unit paused to verify itself and comes back by itself"
-        if 50 <= number <= 97:
+        if int(status) in _FAULTS:
             return "hardware-fault", f"status {status}: hardware fault (laser, motor or the like)"
-        if number == 98:
-            return "resumed", f"status {status}: {text}"
-    good = status in ("00", "99") or (command[:2], status) in {("TM", "02"), ("TM", "03"), ("SS", "03")}
-    return "ok" if good else "refused", f"status {status}: {text or 'not in the manual'}"
+        if int(status) == _RESUMED:
+            return "resumed", text
+    return "ok" if status in ("00", "99") or (command[:2], status) in _GOOD else "refused", text

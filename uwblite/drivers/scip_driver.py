@@ -41,13 +41,9 @@ NARROW = 4095
 
 
 class ScipDriver(ScipUnit):
-    """One lidar with SCIP 2.0.
+    """One lidar with SCIP 2.0; without `stream` it stops after VV, PP and II, for a look at what is plugged in.
 
-    Parameters
-    ----------
-    request : which scans; what does not fit the line is asked for less often.
-    baud : bit/s to begin with; other rates are tried when nothing answers.
-    stream : False: stop after VV, PP and II (for a look at what is plugged in).
+    What does not fit the line is asked for less often; where nothing answers at `baud`, other rates are tried.
     """
 
     def __init__(self, request: ScanRequest | None = None, baud: int = BAUD_RATES[0], *, stream: bool = True) -> None:
@@ -58,7 +54,6 @@ class ScipDriver(ScipUnit):
         self._series = Continuity(_follows, "scan whose time", summed=True)
 
     def stop(self) -> list[Action]:
-        """Return what switches the laser off and ends the stream."""
         return [*self._series.unconfirmed(), Send(b"QT\n")]
 
     def script(self) -> Script[None]:
@@ -203,7 +198,6 @@ class ScipDriver(ScipUnit):
     # ---- for people
 
     def identity(self) -> Identity:
-        """Say who answered."""
         unit, facts, findings = self.geometry, self.facts, []
         fields = (("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT"))
         details = [(name, facts[key]) for name, key in fields if key in facts]

@@ -34,12 +34,7 @@ TRUNCATION = 0.5
 
 
 class ScipUnit(Driver):
-    """A lidar that speaks SCIP 2.0, up to the moment at which it can measure.
-
-    Parameters
-    ----------
-    baud : bit/s to begin with; other rates are tried when nothing answers.
-    """
+    """A lidar that speaks SCIP 2.0, up to the moment at which it can measure."""
 
     def __init__(self, baud: int) -> None:
         super().__init__(ScipProtocol(), "laser scanner")

@@ -59,11 +59,6 @@ class Driver:
     """What one kind of device needs; kinds derive from this.
 
     A driver lives as long as the recording: what it learned (a clock, a pose, known anchors) stays after a reconnect.
-
-    Parameters
-    ----------
-    protocol : bytes to events.
-    title : of the device, for people.
     """
 
     baud = 115200
@@ -143,12 +138,7 @@ class Driver:
 
 
 class Session:
-    """Start-up, running and recovery of one device, without a port.
-
-    Parameters
-    ----------
-    driver : of the device.
-    """
+    """Start-up, running and recovery of one device, without a port."""
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
@@ -160,7 +150,6 @@ class Session:
 
     @property
     def baud(self) -> int:
-        """bit/s to open the port with."""
         return self.driver.baud
 
     def start(self, now: float) -> list[Action]:

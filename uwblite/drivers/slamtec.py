@@ -36,13 +36,7 @@ class Reply:
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """Return the bytes of a request.
-
-    Parameters
-    ----------
-    command : 0..255; those with bit 7 set carry a payload.
-    payload : at most 255 bytes.
-    """
+    """Return the bytes of a request; commands with bit 7 set carry a payload of at most 255 bytes."""
     if not payload:
         return bytes((SYNC, command))
     body = bytes((SYNC, command, len(payload))) + payload
@@ -53,13 +47,7 @@ def request(command: int, payload: bytes = b"") -> bytes:
 
 
 def reply_size(buffer: bytearray, offset: int, kinds: dict[int, int]) -> int:
-    """Return the size of a reply for `FrameFinder`: 0 = wait, -1 = none begins here.
-
-    Parameters
-    ----------
-    buffer, offset : begins with A5 or nothing begins.
-    kinds : type -> length of its payload.
-    """
+    """Return the size of a reply at `offset`, of which each kind has one length of payload; 0 = wait, -1 = none begins here."""
     head = bytes(buffer[offset : offset + DESCRIPTOR])
     if head[:2] != HEAD[: len(head)]:
         return -1
@@ -75,7 +63,6 @@ def reply_size(buffer: bytearray, offset: int, kinds: dict[int, int]) -> int:
 
 
 def decode_reply(data: bytes, stamp: float) -> Reply:
-    """Take a reply apart."""
     return Reply(stamp, data[DESCRIPTOR - 1], data[DESCRIPTOR:])
 
 
@@ -116,5 +103,4 @@ class SlamtecDriver(SpinningDriver):
         yield from self.sleep(0.1)
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, tuple(self.facts.items()), self._findings())

@@ -66,12 +66,7 @@ class Fan:
 
 
 class SweepAssembler:
-    """Collect readings with their times, give a scan for each whole turn.
-
-    Parameters
-    ----------
-    fan : the rays of the scans.
-    """
+    """Collect readings with their times, give a scan for each whole turn."""
 
     def __init__(self, fan: Fan) -> None:
         self.fan = fan
@@ -81,7 +76,6 @@ class SweepAssembler:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the turn at hand."""
         self._last: tuple[float, float] | None = None
         self._turned: list[float] = []
         self._times: list[float] = []
@@ -140,11 +134,7 @@ class SweepAssembler:
 def _resample(samples: list[tuple[float, float]], rays: int, spacing: float) -> tuple[list[float], int]:
     """Return the ranges, m, at the bearings 0, 1/rays ... turns, and how many rays lie between samples.
 
-    Parameters
-    ----------
-    samples : (bearing, range), turns and m, sorted by bearing.
-    rays : how many.
-    spacing : of the rays, turns.
+    Samples are (bearing, range), turns and m, sorted by bearing.
     """
     bearings = [bearing for bearing, _ in samples]
     ranges, known = [math.nan] * rays, 0
@@ -179,12 +169,6 @@ class SpinningDriver(Driver):
 
     A lidar that stamps its packets has a `DeviceClock`. For others the readings themselves are the clock: they come at a
     constant rate, and how many are missing follows from where the motor stands.
-
-    Parameters
-    ----------
-    protocol : bytes to Samples.
-    fan : the rays of its scans.
-    clock : of its packets; None = it has none.
     """
 
     title = "lidar"
@@ -210,7 +194,6 @@ class SpinningDriver(Driver):
         self._last, self._time, self._map = None, 0.0, rhythm_map()
 
     def script(self) -> Script[None]:
-        """Start the lidar and listen, again and again."""
         while True:
             if self.dtr is not None:
                 yield SetDtr(self.dtr)
@@ -240,17 +223,14 @@ class SpinningDriver(Driver):
                 yield from self.take(event)
 
     def stop(self) -> list[Action]:
-        """Return what stops the motor."""
         return [] if self.dtr is None else [SetDtr(not self.dtr)]
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, tuple(self.facts.items()))
 
     # ---- readings
 
     def take(self, event: Samples) -> list[Action]:
-        """Turn readings into the scans that they complete."""
         self.ready = True
         last, lost = self._host_time(event) if self._clock is None else self._device_time(event, self._clock)
         count = len(event.ranges)

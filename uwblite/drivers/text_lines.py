@@ -32,15 +32,9 @@ class Line:
 
 
 def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, str] | str | None:
-    """Part a line by commas, semicolons or blanks.
+    """Return the texts of named columns of a line, parted by commas, semicolons or blanks; ``-`` = skip.
 
-    Parameters
-    ----------
-    columns : their names; ``-`` = skip. prefix : text before them.
-
-    Returns
-    -------
-    dict of column -> text; a str says why the line is damaged; None = it has another prefix and is not meant.
+    A str says why the line is damaged; None = it has another prefix and is not meant.
     """
     start = text.rfind(prefix) if prefix else 0
     if start < 0:
@@ -54,9 +48,7 @@ def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, st
 def named_columns(text: str, known: Collection[str], what: str) -> tuple[str, ...]:
     """Return the columns that a user names, parted by commas; ``-`` = skip.
 
-    Parameters
-    ----------
-    known : names that there are; one that ends in a colon stands for all that begin so. what : prints the lines.
+    A known name that ends in a colon stands for all that begin so.
 
     Raises
     ------
@@ -86,10 +78,7 @@ _COLOUR = re.compile(rb"\x1b\[[\d;]*m")
 class LineProtocol:
     """Bytes in, Line and Corrupt out. Holds at most one line.
 
-    Parameters
-    ----------
-    parse : a line -> its content; a str says why it is damaged; None = it is not meant for us.
-    most : bytes of a line.
+    `parse` makes a line its content; a str says why it is damaged; None = it is not meant for us.
     """
 
     def __init__(self, parse: Callable[[str], Any], most: int = 4096) -> None:
@@ -97,11 +86,9 @@ class LineProtocol:
         self.reset()
 
     def reset(self) -> None:
-        """Forget half a line."""
         self._lines = LineReader(self._most)
 
     def feed(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Line | Corrupt] = []
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):
@@ -123,14 +110,7 @@ class LineProtocol:
 
 
 class LineDriver(Driver, ABC):
-    """A device that is only listened to, perhaps with its own time in what it sends. Nothing is ever sent.
-
-    Parameters
-    ----------
-    protocol : bytes to Line.
-    title : of the device, for people. baud : bit/s.
-    clock : of the device. unit : s per unit of its time.
-    """
+    """A device that is only listened to, perhaps with its own time, in units of so many s. Nothing is ever sent."""
 
     first_is_whole = False
     """The first line cannot be the end of one that began before the port was opened."""
@@ -186,5 +166,4 @@ class LineDriver(Driver, ABC):
         return reading.stamp, reading.elapsed, [Lost(reading.stamp, reading.missing)] if reading.missing else []
 
     def stop(self) -> list[Action]:
-        """Return Corrupt for lines that nothing confirmed."""
         return self._series.unconfirmed()

@@ -58,7 +58,6 @@ def check_pyserial(url: str) -> None:
 
 
 def is_socket(url: str) -> bool:
-    """Return whether a URL names a TCP port."""
     return url.lower().startswith("socket://")
 
 
@@ -96,11 +95,6 @@ class Port(Protocol):
 def open_port(url: str, baud: int) -> Port:
     """Open a port, which may take seconds where it is behind a network.
 
-    Parameters
-    ----------
-    url : a path, ``socket://host:port``, or what `serial.serial_for_url` takes.
-    baud : bit/s.
-
     Raises
     ------
     DeviceError : cannot be opened; the message says how to fix it.
@@ -109,12 +103,7 @@ def open_port(url: str, baud: int) -> Port:
 
 
 class SocketPort:
-    """A TCP bridge such as ser2net or an emulator. See `Port` for the methods.
-
-    Parameters
-    ----------
-    url : ``socket://host:port``.
-    """
+    """A TCP bridge such as ser2net or an emulator, ``socket://host:port``."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -127,11 +116,9 @@ class SocketPort:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def fileno(self) -> int | None:
-        """Return the descriptor to select on."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return what has arrived."""
         try:
             data = self._socket.recv(CHUNK)
         except BlockingIOError:
@@ -143,7 +130,6 @@ class SocketPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Write all bytes."""
         try:
             sent = self._socket.send(data)
         except OSError as error:
@@ -158,18 +144,11 @@ class SocketPort:
         """Do nothing: a bridge has no DTR line."""
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()
 
 
 class SerialPort:
-    """A port that pyserial opens. See `Port` for the methods.
-
-    Parameters
-    ----------
-    url : what `serial.serial_for_url` takes.
-    baud : bit/s.
-    """
+    """A port that pyserial opens: a path, or what `serial.serial_for_url` takes."""
 
     def __init__(self, url: str, baud: int) -> None:
         serial = pyserial()
@@ -196,14 +175,12 @@ class SerialPort:
             self._serial.set_low_latency_mode(True)
 
     def fileno(self) -> int | None:
-        """Return the descriptor to select on, or None where the port has none."""
         try:
             return int(self._serial.fileno())
         except (AttributeError, OSError, ValueError):
             return None
 
     def read(self) -> bytes:
-        """Return what has arrived."""
         try:
             if not self._local:
                 return bytes(self._serial.read(min(self._serial.in_waiting, CHUNK)))
@@ -223,7 +200,6 @@ class SerialPort:
         return any(flags & ~select.POLLIN for _, flags in poller.poll(0))
 
     def write(self, data: bytes) -> None:
-        """Write all bytes in one write."""
         try:
             sent = self._serial.write(data)
         except self._errors as error:
@@ -232,17 +208,14 @@ class SerialPort:
             raise DeviceError(f"{self.url}: it takes no bytes")
 
     def set_baud(self, rate: int) -> None:
-        """Set the speed, bit/s."""
         with contextlib.suppress(ValueError, *self._errors):
             self._serial.baudrate = rate
 
     def set_dtr(self, on: bool) -> None:
-        """Set the DTR line."""
         with contextlib.suppress(ValueError, *self._errors):
             self._serial.dtr = on
 
     def close(self) -> None:
-        """Close the port."""
         with contextlib.suppress(*self._errors):
             self._serial.close()
 
@@ -272,12 +245,7 @@ def _explain(url: str, error: Exception) -> str:
 
 
 def stable_name(url: str) -> str | None:
-    """Return the by-id path of a port that was named by a number that changes with the order of plugging.
-
-    Parameters
-    ----------
-    url : as the user gave it.
-    """
+    """Return the by-id path of a port that was named by a number that changes with the order of plugging."""
     if "://" in url or "/serial/by-" in url or not BY_ID.is_dir():
         return None
     target = os.path.realpath(url)

@@ -60,9 +60,9 @@ def _each(whole: str, row: str, part: str, unit: float = 1.0, number: str = "$^"
 
     Parameters
     ----------
-    whole : form of a line. row : of each range in it, with a group for the anchor and one for the range, empty = none.
+    row : of each range in it, with a group for the anchor and one for the range, empty = none; `unit` m.
     part : what such lines alone hold: another line that has it was one of them.
-    unit : m per unit of range. number : of the round, where the line states it.
+    number : of the round, where the line states it.
     """
     whole_form, row_form, part_form, number_form = (re.compile(form) for form in (whole, row, part, number))
 
@@ -221,11 +221,7 @@ MUCH = 50
 class UwbDriver(LineDriver):
     """A UWB tag that sends its ranges unasked. Nothing is ever sent.
 
-    Parameters
-    ----------
-    protocol : bytes to Line of Ranges or Refused.
-    title, baud, clock, unit : as for `LineDriver`.
-    tag : the tag whose ranges to take, where lines name several; "" = the first that is seen twice.
+    Of several tags in its lines `tag` counts; "" = the first that is seen twice.
     """
 
     def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = "") -> None:
@@ -239,7 +235,6 @@ class UwbDriver(LineDriver):
         self._guard = RangeGuard(self.health)
 
     def time_of(self, content: Ranges | Refused) -> float | None:
-        """Return the board's time, its own unit; None = there is none."""
         return content.time if isinstance(content, Ranges) else None
 
     def members(self, event: Line | Corrupt) -> tuple[str, ...]:
@@ -248,7 +243,6 @@ class UwbDriver(LineDriver):
         return tuple(f"{content.tag}/{r.anchor_id}" for r in content.readings) if isinstance(content, Ranges) else ()
 
     def measured(self, line: Line) -> list[Action]:
-        """Turn a line into ranges."""
         if isinstance(line.content, Refused):
             text = f"uwb: it prints {line.content.what}, which are no ranges: set it to two-way ranging, and to print distances"
             return self.say_once(Note("error", "uwb-no-ranges", text))
@@ -289,9 +283,7 @@ class UwbDriver(LineDriver):
         return leap if 0 < step <= NEAR else 0
 
     def stop(self) -> list[Action]:
-        """Return Corrupt for what nothing confirmed."""
         return [*super().stop(), *[Corrupt(b"", OTHER_TAG)] * (self._first is not None), *self._guard.finish()]
 
     def identity(self) -> Identity:
-        """Say who answered."""
         return Identity(self.title, (("tag", self._tag),) if self._tag else ())

@@ -40,12 +40,7 @@ _FAR = math.atan(-_OFFSET / _BASE) / (2.0 * math.pi)
 
 
 class YdLidarProtocol(PacketReader):
-    """Bytes of the lidar in, Samples, Reply and Corrupt out.
-
-    Parameters
-    ----------
-    rate : readings per second.
-    """
+    """Bytes of the lidar in, Samples, Reply and Corrupt out."""
 
     smallest = DESCRIPTOR
 
@@ -54,11 +49,9 @@ class YdLidarProtocol(PacketReader):
         self._period = 1.0 / rate
 
     def is_checked(self, lead: int) -> bool:
-        """Return whether frames that begin with this byte have a check; replies have none."""
         return lead != SYNC
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        """Return the size of the packet or reply at `offset`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[offset] == SYNC:
             return reply_size(buffer, offset, KINDS)
         if buffer[offset] != HEAD[0]:
@@ -74,7 +67,6 @@ class YdLidarProtocol(PacketReader):
         return size if reduce(xor, struct.unpack_from(f"<{size // 2}H", buffer, offset)) == 0 else -1
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Reply:
-        """Decode a packet or a reply."""
         if frame[0] == SYNC:
             return decode_reply(frame, stamp)
         count = frame[3]
@@ -118,5 +110,4 @@ class YdLidarX4Driver(SlamtecDriver):
         return (yield from self.ask(START, answers(STREAM), 0.5, 2)) is not None
 
     def stop(self) -> list[Action]:
-        """Stop stream and motor."""
         return [Send(STOP), *super().stop()]

@@ -1,33 +1,25 @@
-"""How far a map is from the truth: distances between named columns, and how well its cells lie on the walls.
-
-The mean absolute error of distances between columns is the figure of the paper's Table I. It needs no alignment of the
-common frames: distances are the same in all of them. The alignment only gives where to look for a column.
-"""
+"""How far a map is from the truth: distances between named columns (the paper's Table I), which need no alignment of frames,
+and how well its cells lie on the walls."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, dots
 from ..grid.columns import find_column
 
 REACH = 4.0
 """Distance up to which a column or a wall counts as visible, m: the reach of a URG-04LX."""
-
-
-@dataclass(frozen=True, slots=True)
-class VisibilityPolicy:
-    """What of a true surface can be seen, and how often it is looked at."""
-
-    observations: ClassVar[int] = 200
-    """Used of each column, evenly spread over the path."""
-    step: ClassVar[float] = 0.05
-    """m between samples on true surfaces: a cell of the map."""
-    views: ClassVar[int] = 24
-    """Nearest viewpoints tried for each point of a surface."""
+_OBSERVATIONS = 200
+"""Used of each column, evenly spread over the path."""
+_STEP, _APART = 0.05, 0.5
+"""m between samples on true surfaces, a cell of the map; and between viewpoints, which then differ in direction."""
+_VIEWS = 24
+"""Nearest viewpoints tried for each point of a surface."""
+_SHORT = 0.02
+"""m by which a ray stops short of the surface, which otherwise would hide itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +95,7 @@ def landmark_errors_along(
     """Compare distances between columns as a trajectory would draw them with the true ones.
 
     Every observation draws a column once more. The error of a pair is the mean over all combinations of an observation of one
-    with an observation of the other, so it needs no map and also judges one too smeared to find a column in it.
+    with an observation of the other: it also judges a map too smeared to find a column in it.
 
     Parameters
     ----------
@@ -115,7 +107,7 @@ def landmark_errors_along(
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(VisibilityPolicy.observations, len(seen))).astype(np.intp))]
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_OBSERVATIONS, len(seen))).astype(np.intp))]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
@@ -149,7 +141,7 @@ def wall_errors(
     viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `reach` m counts for the recall.
     tolerance : m.
     """
-    surface = sample_surfaces(walls, columns, VisibilityPolicy.step)
+    surface = sample_surfaces(walls, columns, _STEP)
     if not len(occupied) or not len(surface):
         return WallErrors(tolerance, 0.0, 0.0)
     distance = cKDTree(surface).query(occupied)[0]
@@ -176,15 +168,13 @@ def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Flo
     """Return which points (n,) on surfaces one of the nearest viewpoints (v, 2) sees, m; surfaces hide one another."""
     if not len(viewpoints):
         return np.zeros(len(points), dtype=bool)
-    # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
-    coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.intp), axis=0, return_index=True)[1]]
-    count = min(VisibilityPolicy.views, len(coarse))
+    coarse = viewpoints[np.unique(np.round(viewpoints / _APART).astype(np.intp), axis=0, return_index=True)[1]]
+    count = min(_VIEWS, len(coarse))
     distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=reach)
     point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))
     start = coarse[view.reshape(len(points), count)[point, rank]]
-    # The ray stops short of the surface, which otherwise would hide itself.
     gap = points[point] - start
-    end = start + gap * (1.0 - 0.02 / np.maximum(np.hypot(*gap.T), 0.04))[:, None]
+    end = start + gap * (1.0 - _SHORT / np.maximum(np.hypot(*gap.T), 2.0 * _SHORT))[:, None]
     free = ~_blocked(start, end, walls, columns)
     seen = np.zeros(len(points), dtype=bool)
     seen[point[free]] = True
@@ -196,15 +186,15 @@ def _blocked(start: Floats, end: Floats, walls: Floats, columns: Floats) -> Bool
     way = end - start
     blocked = np.zeros(len(start), dtype=bool)
     for x1, y1, x2, y2 in walls:
-        wall, first = np.array([x2 - x1, y2 - y1]), np.array([x1, y1])
-        side_start = (start - first) @ np.array([-wall[1], wall[0]])
-        side_end = (end - first) @ np.array([-wall[1], wall[0]])
-        turn_first = way[:, 0] * (y1 - start[:, 1]) - way[:, 1] * (x1 - start[:, 0])
-        turn_last = way[:, 0] * (y2 - start[:, 1]) - way[:, 1] * (x2 - start[:, 0])
-        blocked |= (side_start * side_end < 0) & (turn_first * turn_last < 0)
-    length2 = np.maximum((way * way).sum(axis=1), 1e-12)
+        first, last = np.array([x1, y1]), np.array([x2, y2])
+        sides = _cross(last - first, start - first) * _cross(last - first, end - first)
+        blocked |= (sides < 0.0) & (_cross(way, first - start) * _cross(way, last - start) < 0.0)
+    length2 = np.maximum(dots(way, way), 1e-12)
     for x, y, radius in columns:
-        centre = np.array([x, y])
-        u = np.clip(((centre - start) * way).sum(axis=1) / length2, 0.0, 1.0)
-        blocked |= np.hypot(*(start + u[:, None] * way - centre).T) < radius - 0.02
+        u = np.clip(dots([x, y] - start, way) / length2, 0.0, 1.0)
+        blocked |= np.hypot(*(start + u[:, None] * way - [x, y]).T) < radius - _SHORT
     return blocked
+
+
+def _cross(one: Floats, other: Floats) -> Floats:
+    return np.asarray(one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0])

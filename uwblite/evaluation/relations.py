@@ -1,8 +1,7 @@
 """How far relative poses of a trajectory are from given ones: the metric of Kuemmerle et al. 2009.
 
-A relation is the pose of one scan relative to another; relations of neighbouring scans show local accuracy,
-those between visits to one place judge the map as a whole, and no alignment of frames is needed. With the given relative
-pose d* and the estimated one d, the error is the translation and the rotation of d*^-1 d; each relation counts once.
+Relations of neighbouring scans show local accuracy, those between visits to one place judge the map as a whole, and no
+alignment of frames is needed. The error is the translation and the rotation of d*^-1 d; each relation counts once.
 
 (R. Kuemmerle, B. Steder, C. Dornhege, M. Ruhnke, G. Grisetti, C. Stachniss, A. Kleiner: On measuring the accuracy of SLAM
 algorithms, Autonomous Robots 27, 2009; the errors are not squared, as in the tables there.)
@@ -15,12 +14,10 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..errors import DataError
-from .trajectory import ErrorStatistics, statistics
+from .trajectory import EDGE, ErrorStatistics, covered, statistics
 
 FAR = 0.5
 """Translational error from which a relation is grossly wrong, m."""
-_EDGE = 1e-3
-"""Rounded stamps may stick out of the trajectory by so much, s."""
 _LONGEST_GAP = 10.0
 """Time between poses of the trajectory over which a relation is not answered, s."""
 
@@ -68,23 +65,16 @@ def evaluate_relations(stamps: Floats, poses: Floats, relations: Relations, dela
     ------
     DataError : the trajectory answers none of them.
     """
-    answered = _answered(stamps, relations.first, delay) & _answered(stamps, relations.second, delay)
+    first, second = relations.first + delay, relations.second + delay
+    # The trajectory's ends may be overhung by the offset of the clock.
+    answered = np.logical_and(*(covered(stamps, at, _LONGEST_GAP, abs(delay) + EDGE) for at in (first, second)))
     if not answered.any():
         raise DataError(
             f"the trajectory ({stamps[0]:.3f} .. {stamps[-1]:.3f} s) answers none of the {len(relations)} relations"
             f" (from {min(relations.first.min(), relations.second.min()):.3f} s on): are both of the same recording?"
         )
-    ends = (relations.first[answered] + delay, relations.second[answered] + delay)
-    first, second = (se2.interpolate_trajectory(stamps, poses, at) for at in ends)
-    error = se2.between(relations.T_first_second[answered], se2.between(first, second))
+    start, end = (se2.interpolate_trajectory(stamps, poses, at[answered]) for at in (first, second))
+    error = se2.between(relations.T_first_second[answered], se2.between(start, end))
     translation, rotation = np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap_angle(error[:, 2]))
     far = float((np.sum(translation > FAR) + np.sum(~answered)) / len(relations))
     return RelationErrors(translation, rotation, answered, statistics(translation), statistics(rotation), far)
-
-
-def _answered(stamps: Floats, scans: Floats, delay: float) -> Bools:
-    """Return for which scans (r,) the trajectory has a pose; its ends may be overhung by the offset of the clock."""
-    after = np.clip(np.searchsorted(stamps, scans + delay), 1, max(len(stamps) - 1, 1))
-    gap = stamps[np.minimum(after, len(stamps) - 1)] - stamps[after - 1]
-    slack = abs(delay) + _EDGE
-    return np.asarray((scans + delay >= stamps[0] - slack) & (scans + delay <= stamps[-1] + slack) & (gap <= _LONGEST_GAP))

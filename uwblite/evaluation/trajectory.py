@@ -1,8 +1,7 @@
-"""How far an estimate is from the truth: trajectory (ATE, RPE, heading) and anchors. Maps: see evaluate_map.
+"""How far an estimate is from the truth: trajectory (ATE, RPE, heading) and anchors.
 
-The estimate's frame is arbitrary: it is first aligned with the truth by the rigid motion that fits the positions best
-(Umeyama 1991 without scale). Stamps are associated by interpolation: the estimate, which has a pose per odometry stamp, is
-read at the stamps of the truth; where it has no pose within `max_gap`, that stamp of the truth is left out.
+The estimate is first aligned with the truth by the rigid motion that fits the positions best (Umeyama 1991 without scale), and
+read at the stamps of the truth by interpolation; where it has no pose within `max_gap`, that stamp of the truth is left out.
 """
 
 from collections.abc import Sequence
@@ -12,12 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from ..se2 import align
 
 _PAUSE = 1e6
 """s between two recordings that are compared as one: more than any gap that is bridged."""
+EDGE = 1e-3
+"""s by which rounded stamps may stick out of a trajectory."""
 
 
 class Paired(NamedTuple):
@@ -141,7 +142,7 @@ def evaluate_trajectory(
     ------
     DataError : fewer than two true stamps lie within the estimate.
     """
-    matched = _covered(stamps, true_stamps, max_gap)
+    matched = np.flatnonzero(covered(stamps, true_stamps, max_gap))
     if len(matched) < 2:
         raise DataError(
             f"only {len(matched)} of {len(true_stamps)} true stamps ({_span(true_stamps)}) lie within the trajectory"
@@ -159,17 +160,14 @@ def evaluate_trajectory(
     return TrajectoryErrors(T_truth_map, matched, position, statistics(position), heading, rpe_delta, rpe_position, rpe_heading)
 
 
-def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
-    """Return the indices of queries that lie between stamps at most max_gap apart, or at a stamp."""
-    right = np.clip(np.searchsorted(stamps, queries), 1, max(1, len(stamps) - 1))
-    if len(stamps) < 2:
-        return np.empty(0, dtype=np.intp)
-    before, after = stamps[right - 1], stamps[right]
-    inside = (queries >= before) & (queries <= after) & (after - before <= max_gap)
-    # Rounded stamps may stick out by a little; a pose extended for longer than that would be invented.
-    edge = 1e-3
-    at_a_stamp = (np.abs(queries - before) <= edge) | (np.abs(queries - after) <= edge)
-    return np.flatnonzero(inside | at_a_stamp)
+def covered(stamps: Floats, queries: Floats, max_gap: float, overhang: float = EDGE) -> Bools:
+    """Return which queries (q,) lie at a stamp, between stamps (n,) at most max_gap apart, or stick out by the overhang, s."""
+    if not len(stamps):
+        return np.zeros(len(queries), dtype=bool)
+    after = np.clip(np.searchsorted(stamps, queries), 1, max(len(stamps) - 1, 1))
+    before, behind = stamps[after - 1], stamps[np.minimum(after, len(stamps) - 1)]
+    inside = (queries >= before - overhang) & (queries <= behind + overhang) & (behind - before <= max_gap)
+    return np.asarray(inside | (np.minimum(np.abs(queries - before), np.abs(queries - behind)) <= EDGE))
 
 
 def _span(stamps: Floats) -> str:
@@ -188,15 +186,12 @@ def _relative_errors(estimate: Floats, truth: Floats, delta: float) -> tuple[Err
 
 def stretches(positions: Floats, delta: float) -> Ints:
     """Return indices (k,) that cut a path (n, 2) into stretches: each is the shortest that is at least delta long."""
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
-    ends = [0]
-    while True:
-        # Rounding of the running sum must not make a stretch of exactly delta one sample longer.
-        after = int(np.searchsorted(way, way[ends[-1]] + delta - 1e-9 * delta))
-        after = max(after, ends[-1] + 1)
-        if after >= len(way):
-            return np.array(ends, dtype=np.intp)
+    way, ends, after = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))]), list[int](), 0
+    while after < len(way):
         ends.append(after)
+        # Rounding of the running sum must not make a stretch of exactly delta one sample longer.
+        after = max(int(np.searchsorted(way, way[after] + (1.0 - 1e-9) * delta)), after + 1)
+    return np.array(ends, dtype=np.intp)
 
 
 def evaluate_anchors(
@@ -212,10 +207,8 @@ def evaluate_anchors(
     """
     place = {name: xy for name, xy in zip(ids, positions, strict=True) if np.all(np.isfinite(xy))}
     common = tuple(name for name in true_ids if name in place)
-    missing = tuple(name for name in true_ids if name not in place)
-    if not common:
-        return AnchorErrors((), np.empty(0), float("nan"), missing)
-    truth = np.array([true_positions[true_ids.index(name)] for name in common])
-    estimate = se2.transform(T_truth_map, np.array([place[name] for name in common]))
+    truth = np.array([xy for name, xy in zip(true_ids, true_positions, strict=True) if name in place]).reshape(-1, 2)
+    estimate = se2.transform(T_truth_map, np.array([place[name] for name in common]).reshape(-1, 2))
     distances = np.hypot(*(estimate - truth).T)
-    return AnchorErrors(common, distances, float(np.sqrt(np.mean(distances**2))), missing)
+    rmse = float(np.sqrt(np.mean(distances**2))) if common else float("nan")
+    return AnchorErrors(common, distances, rmse, tuple(name for name in true_ids if name not in place))

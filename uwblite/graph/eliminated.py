@@ -45,13 +45,6 @@ def entries(rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int]) -
     return sparse.csr_matrix((values[free], (row[free], column[free])), shape=shape)
 
 
-def side_by_side(one: Blocks, other: Blocks) -> Blocks:
-    """Return the normal equations of the measurements of both, each with its own blocks."""
-    across = sparse.csr_matrix(sparse.vstack([one.across, other.across]))
-    own, own_slope = np.concatenate([one.own, other.own]), np.concatenate([one.own_slope, other.own_slope])
-    return Blocks(one.among + other.among, across, own, one.slope + other.slope, own_slope)
-
-
 def rows_of(linearized: Linearization, unknowns: Unknowns) -> sparse.csr_matrix:
     """Return the Jacobian (e d, n) of measurements (e) by the unknowns of a graph."""
     columns = np.concatenate([unknowns.number[name][index] for name, index, _ in linearized.blocks], axis=1)

@@ -48,7 +48,7 @@ def _scores(centres: Floats, cells: Floats, radius: float, cell: float) -> tuple
     in_clear = tree.query((centres[:, None] + clear).reshape(-1, 2), distance_upper_bound=cell)[0]
     spoilt = np.isfinite(in_clear).reshape(len(centres), directions).mean(axis=1)
     offset = np.where(np.isfinite(on_rim), on_rim, cell).reshape(len(centres), directions).mean(axis=1)
-    return arc - 0.7 * spoilt - 0.5 * offset / cell, arc
+    return arc - spoilt - 0.5 * offset / cell, arc
 
 
 def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Floats:
@@ -58,10 +58,10 @@ def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Flo
         distance = np.hypot(*ray.T)
         residual = distance - radius
         near = np.abs(residual) < gate
-        if near.sum() < 3:
+        if near.sum() <= 2:
             return centre
         weight = (1.0 - (residual[near] / gate) ** 2) ** 2
-        unit = ray[near] / np.maximum(distance[near], 1e-9)[:, None]
+        unit = ray[near] / np.maximum(distance[near], np.finfo(np.float64).tiny)[:, None]
         # A column seen from one side is hardly measured across the line of sight: the initial value fixes it there.
         normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
         step = np.linalg.solve(normal, (weight * residual[near]) @ unit)

@@ -13,8 +13,14 @@ BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 _STRIP = 256
 """Rows of a map that are processed at a time."""
+_OUTER = 0.01
+"""Share of the points left out on each side of a box without outliers."""
+_LEAST_MARGIN = 10.0
+"""m; least size of that box: the path of a robot that stands has none."""
 _MARGIN = 2
 """Cells added on every side of the area that a map must contain."""
+_COARSER = 0.25
+"""Of the edge of a cell, by which it grows where there would be too many."""
 
 
 @documented
@@ -94,22 +100,15 @@ class GridGeometry:
                     "smaller grid.max_range"
                 )
             times = resolution / finest * np.sqrt(width * height / max_cells)
-            resolution = finest * max(np.ceil(4.0 * times) / 4.0, resolution / finest + 0.25)
+            resolution = finest * max(np.ceil(times / _COARSER) * _COARSER, resolution / finest + _COARSER)
         return GridGeometry(resolution, first * resolution, int(height), int(width))
 
 
 def central_box(points: Floats) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of a box around the points (n, 2) without outliers.
+    """Return the corners (2,) of a box around the points (n, 2) without outliers, such as poses that a wrong reading displaced.
 
-    The box around the central 98 % of each coordinate, wider by its longer side in every direction; never larger than the
-    box around all points. A path fits into it; a pose that one wrong reading displaced by kilometres lies outside.
+    The box around the central 98 % of each coordinate, wider by its longer side in every direction, where there are points.
     """
     low, high = np.quantile(points, _OUTER, axis=0, method="higher"), np.quantile(points, 1.0 - _OUTER, axis=0, method="lower")
     margin = max(float((high - low).max()), _LEAST_MARGIN)
     return np.maximum(low - margin, points.min(axis=0)), np.minimum(high + margin, points.max(axis=0))
-
-
-_OUTER = 0.01
-"""Share of the points left out on each side."""
-_LEAST_MARGIN = 10.0
-"""m; least size of the box: the path of a robot that stands has none."""

@@ -1,13 +1,9 @@
 """The map: a grid of log-odds of being occupied, from rays through a binary Bayes filter (paper: step 3).
 
-A cell starts unknown, log-odds 0. Every scan contributes at most one observation to a cell: *hit* where a ray ended, *miss*
-where rays passed through (a hit of the same scan has priority, so that rays grazing a wall do not erase it). With independent
-scans Bayes' rule adds log-odds,
+Every scan contributes at most one observation to a cell: *hit* where a ray ended, else *miss* where rays passed through. With
+independent scans Bayes' rule adds log-odds, so that only two counts per cell need be kept:
 
-    l = hits log(p_hit / (1 - p_hit)) + misses log(p_miss / (1 - p_miss)),    |l| <= clamp,
-
-so only two counts per cell need be kept, the order of scans does not matter, and work can be split and added up exactly. A
-person who stood somewhere for a few scans is removed by later scans in which the place is free.
+    l = hits log(p_hit / (1 - p_hit)) + misses log(p_miss / (1 - p_miss)),    |l| <= clamp.
 """
 
 import math

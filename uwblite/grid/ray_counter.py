@@ -1,13 +1,8 @@
 """Hits and misses: counts of the cells in which rays end and through which they pass, scan by scan.
 
-Many rays are drawn in lockstep by Bresenham's line. Along its longer axis a ray of n steps advances one cell at a time; after
-k steps it has moved
-
-    floor((2 k d + n) / (2 n))
-
-cells along the other axis, where d <= n is the distance along that axis: the midpoint rule of J. E. Bresenham (Algorithm
-for computer control of a digital plotter, 1965) in closed form. So step k of all rays is a few array operations; with rays
-sorted by length, the unfinished ones are a prefix of the array.
+Rays are drawn in lockstep by Bresenham's line (Algorithm for computer control of a digital plotter, 1965): after k of n
+steps along its longer axis a ray has moved floor((2 k d + n) / (2 n)) cells along the other, of length d <= n. With rays sorted
+by length, the unfinished ones are a prefix of the array.
 """
 
 from copy import copy
@@ -33,9 +28,8 @@ _SPARSE = 0.1
 """Share of the cells of a window up to which they are added one by one, in as much time for each as ten in a row take."""
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
-
-_MANY = 1 << 16
-"""Scans whose hits 16 bits do not hold."""
+_MANY = np.iinfo(np.uint16).max
+"""Scans whose hits 16 bits just hold."""
 
 
 class RayCounter:
@@ -48,11 +42,11 @@ class RayCounter:
     most : scans at most; of fewer than 65,536, hits are of 16 bits.
     """
 
-    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY) -> None:
+    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5, most: int = _MANY + 1) -> None:
         self.geometry = geometry
         self._weak = round(clear_weight * WEIGHT_UNIT)
         shape = (geometry.rows, geometry.cols)
-        self.hits: Counts = np.zeros(shape, np.uint16) if most < _MANY else np.zeros(shape, np.int32)
+        self.hits: Counts = np.zeros(shape, np.uint16) if most <= _MANY else np.zeros(shape, np.int32)
         self.misses: Counts = np.zeros(shape, dtype=np.int32)
         self._scratch = np.zeros(0, dtype=np.uint8)
 
@@ -175,11 +169,8 @@ class RayCounter:
         return counter
 
 
-_Places = NDArray[np.int32]
-
 _HALF = 0.5 + 1e-7
-"""Values k d / n that are no ties are at least 1 / (2 n) from a tie, more than the rounding errors of their sum for rays of
-thousands of steps, and ties are raised."""
+"""Ties are raised; values k d / n that are none are at least 1 / (2 n) from one, more than the rounding errors of their sum."""
 
 
 def mark_rays(
@@ -197,13 +188,17 @@ def mark_rays(
     """
     steps = np.maximum(np.abs(d_row), np.abs(d_col))
     # Sorting numbers of 16 bits takes a quarter of the time.
-    order = np.argsort(-steps.astype(np.int16) if len(steps) and steps.max() < 2**15 else -steps, kind="stable")
+    short = steps.max(initial=0) <= np.iinfo(np.int16).max
+    order = np.argsort(-steps.astype(np.int16) if short else -steps, kind="stable")
     if walls is not None:
         order = order[~walls[start[order]]]
     shorter_by = -steps[order]
     if len(order) == 0 or shorter_by[0] == 0:
         return
-    here, along, across, slope = _strides(start[order], d_row[order], d_col[order], -shorter_by, stride)
+    here, d_row, d_col = start[order].astype(np.int32), d_row[order], d_col[order]
+    steep, row_step, col_step = np.abs(d_row) > np.abs(d_col), np.sign(d_row) * stride, np.sign(d_col)
+    along, across = (np.where(one, row_step, col_step).astype(np.int32) for one in (steep, ~steep))
+    slope = np.abs(np.where(steep, d_col, d_row)) / np.maximum(-shorter_by, 1)
     moved, aside, cell = np.full(len(order), _HALF), np.empty_like(here), np.empty(len(order), dtype=np.intp)
     for r in np.searchsorted(shorter_by, -np.arange(-shorter_by[0])).tolist():
         aside[:r] = moved[:r]
@@ -220,14 +215,3 @@ def mark_rays(
         marks[cell[:r]] = value
         moved[:r] += slope[:r]
         here[:r] += along[:r]
-
-
-def _strides(start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int) -> tuple[_Places, _Places, _Places, Floats]:
-    """Return the first cell, the flat steps along the longer and across to the shorter axis, and the slope d / n."""
-    steep = np.abs(d_row) > np.abs(d_col)
-    row_step, col_step = np.sign(d_row) * stride, np.sign(d_col)
-    along = np.where(steep, row_step, col_step)
-    across = np.where(steep, col_step, row_step)
-    shorter = np.abs(np.where(steep, d_col, d_row))
-    slope = shorter / np.maximum(steps, 1)
-    return start.astype(np.int32), along.astype(np.int32), across.astype(np.int32), slope

@@ -1,8 +1,7 @@
 """Scans of recordings traced into one map.
 
-A beam without a reading is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
-Such beams never mark cells as occupied; runs of adjacent ones clear space, with less weight, up to a given distance and never
-beyond a wall that other beams have drawn. This needs a second pass over the scans, once the walls are known.
+A beam without a reading is a weak observation: "nothing there", or "too dark or too oblique". Runs of adjacent ones clear
+space, with less weight, up to a distance and never beyond a wall that other beams have drawn: in a second pass over the scans.
 """
 
 import math
@@ -34,17 +33,7 @@ class ScanRays:
 
 
 def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
-    """Choose scans such that between neighbours the laser moved or turned far enough; the first is always in.
-
-    Parameters
-    ----------
-    poses : (k, 3) T_map_laser of each scan.
-    distance : m; 0 chooses every scan.
-
-    Returns
-    -------
-    (s,) indices.
-    """
+    """Choose scans (s,) such that between neighbours the laser, at poses (k, 3), moved or turned far enough; 0 m: all."""
     if distance <= 0.0 or len(poses) == 0:
         return np.arange(len(poses))
     chosen = [0]
@@ -57,84 +46,18 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
     return np.array(chosen, dtype=np.intp)
 
 
-def seen_reach(scans: LaserScans, chosen: Ints, max_range: float = math.inf) -> NDArray[np.float32]:
-    """Return the length (s, b) of the rays of chosen scans (s,) that ended at something up to max_range, m; 0 = none."""
-    readings = scans.ranges[chosen]
-    return np.where(scans.hits(readings, max_range), readings, np.float32(0.0))
-
-
-def empty_reach(scans: LaserScans, chosen: Ints, distance: float, run: int) -> NDArray[np.float32]:
-    """Return `distance` (s, b), m, for beams of chosen scans that saw nothing, in runs of at least `run`; 0 = others."""
-    reach = np.float32(min(distance, scans.range_max))
-    return np.where(in_runs(np.isposinf(scans.ranges[chosen]), run), reach, np.float32(0.0))
-
-
-def scan_rays(
-    scans: LaserScans, reach: NDArray[np.float32], first: Floats, last: Floats | None = None, *, flipped: bool = False
-) -> ScanRays:
-    """Return the rays of some scans.
-
-    Parameters
-    ----------
-    reach : (s, b) length of the rays of each scan, m; where it is 0 there is no ray.
-    first : (s, 3) T_map_laser at the first ray of each scan.
-    last : (s, 3) T_map_laser at the last ray; in between the laser moves evenly. None = it stood still.
-    flipped : the laser is mounted upside down; its rays run clockwise.
-    """
-    rows = np.flatnonzero(reach > 0)
-    beams = reach.shape[1]
-    moved = np.zeros_like(first) if last is None else last - first
-    moved[:, 2] = se2.wrap_angle(moved[:, 2])
-    fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
-    bearing = (first[:, 2:] + (-scans.angles if flipped else scans.angles)) + moved[:, 2:] * fraction
-    # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
-    bearing, length = bearing.astype(np.float32).take(rows), reach.take(rows)
-    origins, ends = np.empty((2, 2, len(rows)))
-    for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
-        origins[axis] = (first[:, axis, None] + moved[:, axis, None] * fraction).take(rows)
-        ends[axis] = origins[axis] + length * direction
-    return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(reach > 0, axis=1)))
-
-
-def extent(
-    scans: LaserScans, reach: NDArray[np.float32], first: Floats, last: Floats | None = None, *, flipped: bool = False
-) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of a box that holds all rays of some scans (see scan_rays), quickly and hardly too large."""
-    low, high = first[:, :2].min(axis=0), first[:, :2].max(axis=0)
-    angles = -scans.angles if flipped else scans.angles
-    ahead, aside = reach * np.cos(angles).astype(np.float32), reach * np.sin(angles).astype(np.float32)
-    c, s = (v[:, None].astype(np.float32) for v in se2.cos_sin(first[:, 2]))
-    slack = np.zeros(len(first)) if last is None else _sweep_reach(first, last, reach.max(axis=1))
-    for axis, offset in enumerate((c * ahead - s * aside, s * ahead + c * aside)):
-        low[axis] = min(low[axis], (first[:, axis] + offset.min(axis=1) - slack).min())
-        high[axis] = max(high[axis], (first[:, axis] + offset.max(axis=1) + slack).max())
-    return low - 1e-4, high + 1e-4
-
-
-def _sweep_reach(first: Floats, last: Floats, reach: NDArray[np.float32]) -> Floats:
-    """Return how far (s,) the motion within a scan can move the end of a ray, m."""
-    moved = np.abs(last - first)
-    return np.hypot(moved[:, 0], moved[:, 1]) + np.abs(se2.wrap_angle(moved[:, 2])) * reach
-
-
 def in_runs(flags: Bools, least: int) -> Bools:
     """Return which flags (s, b) stand in a run of at least `least` neighbours along the last axis that are all set."""
-    if least <= 1:
-        return flags
-    if flags.shape[1] < least:
-        return np.zeros_like(flags)
-    total = np.cumsum(np.pad(flags, ((0, 0), (1, 0))), axis=1, dtype=np.int32)
-    begins = total[:, least:] - total[:, :-least] == least
-    # A flag is in a run when one of the last `least` positions begins one.
-    count = np.cumsum(np.pad(begins, ((0, 0), (1, least - 1))), axis=1, dtype=np.int32)
-    before = np.pad(count, ((0, 0), (least, 0)))[:, : count.shape[1]]
-    return (count - before)[:, 1:] > 0
+    inside, count = np.zeros_like(flags), flags.shape[1] - least + 1
+    if count > 0:
+        begins = np.logical_and.reduce([flags[:, k : k + count] for k in range(least)])
+        for k in range(least):
+            inside[:, k : k + count] |= begins
+    return inside
 
 
 Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
-
-_SCANS_AT_A_TIME = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,8 +74,23 @@ class Sweeps:
 
     def __post_init__(self) -> None:
         count, first, last = len(self.scans.stamps), self.first, self.last
-        if first.shape != (count, 3) or (last is not None and last.shape != first.shape):
+        if len(first) != count or (last is not None and last.shape != first.shape):
             raise DataError(f"{count} scans need as many poses, not {first.shape}")
+
+    def rays(self, chosen: Ints, reach: NDArray[np.float32]) -> ScanRays:
+        """Return the rays of chosen scans (s,), whose lengths (s, b) are given, m; where one is 0 there is no ray."""
+        rows, first, beams = np.flatnonzero(reach > 0), self.first[chosen], reach.shape[1]
+        moved = np.zeros_like(first) if self.last is None else self.last[chosen] - first
+        moved[:, 2] = se2.wrap_angle(moved[:, 2])
+        fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
+        bearing = (first[:, 2:] + (-self.scans.angles if self.flipped else self.scans.angles)) + moved[:, 2:] * fraction
+        # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
+        bearing, length = bearing.astype(np.float32).take(rows), reach.take(rows)
+        origins, ends = np.empty((2, 2, len(rows)))
+        for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
+            origins[axis] = (first[:, axis, None] + moved[:, axis, None] * fraction).take(rows)
+            ends[axis] = origins[axis] + length * direction
+        return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(reach > 0, axis=1)))
 
 
 def from_sweeps(
@@ -175,16 +113,16 @@ def from_sweeps(
     ConfigError : poses or readings are not finite.
     DataError : there are no scans.
     """
-    if not any(len(sweeps.first) for sweeps in recordings):
+    tasks = [_Task(sweeps, _traced(sweeps.first, config), config) for sweeps in recordings if len(sweeps.first)]
+    if not tasks:
         raise DataError("there are no scans to make a map of")
-    tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
     chosen = sum(len(task.chosen) for task in tasks)
-    low, high = _around([task.extent() for task in tasks])
+    low, high = _extent(tasks)
     if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
         # Scans that lie far from all others are left out.
-        box = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
+        box = central_box(np.concatenate([task.places for task in tasks]))
         tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
-        low, high = _around([task.extent() for task in tasks])
+        low, high = _extent(tasks)
     count = sum(len(task.chosen) for task in tasks)
     grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
@@ -192,19 +130,19 @@ def from_sweeps(
     counter = RayCounter(grid, config.clear_weight, most=count)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
-    def trace(counter: RayCounter, walls: Bools | None, before: int) -> None:
+    def trace(walls: Bools | None, before: int) -> None:
         for task in tasks:
-            for done, rays in task.batches(empty=walls is not None):
+            for some in task.parts():
+                rays = task.sweeps.rays(some, task.reach(some, empty=walls is not None))
                 counter.insert_rays(rays.origins, rays.endpoints, rays.scan, walls)
+                before += len(some)
                 if progress is not None:
-                    progress(before + done, count * (2 if clears else 1))
-            before += len(task.chosen)
+                    progress(before, count * (2 if clears else 1))
 
-    trace(counter, None, 0)
+    trace(None, 0)
     if clears:
-        trace(counter, walls_of(counter, config), count)
+        trace(walls_of(counter, config), count)
     drawn = from_counts(counter if geometry else counter.cropped(), config, spent=True)
-    del counter
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)
 
@@ -216,15 +154,13 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
     """
     met = lost = 0
     states, g = np.pad(grid.states(), 1, constant_values=UNKNOWN), grid.geometry
-    for sweeps in recordings:
+    for sweeps in (each for each in recordings if len(each.first)):
         chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.intp))
-        last = None if sweeps.last is None else sweeps.last[chosen]
         far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
         far[:, ::_EVERY] = reach
-        readings = sweeps.scans.ranges[chosen][:, ::_EVERY].reshape(-1)
-        rays = scan_rays(sweeps.scans, far, sweeps.first[chosen], last, flipped=sweeps.flipped)
+        readings, rays = sweeps.scans.ranges[chosen][:, ::_EVERY].reshape(-1), sweeps.rays(chosen, far)
         along = np.linspace(0.0, 1.0, int(np.ceil(reach / g.resolution)) + 1)[1:]
-        for part in np.array_split(np.arange(len(rays.origins)), max(len(chosen) // 16, 1)):
+        for part in np.array_split(np.arange(len(rays.origins)), len(chosen)):
             origins, way = rays.origins[part], rays.endpoints[part] - rays.origins[part]
             row, col = g.cell_of(origins + along[:, None, None] * way)
             inside = g.inside(row, col)
@@ -239,64 +175,55 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
 
 _SAMPLED, _EVERY, _BEFORE = 200, 8, 0.3
 """Scans of a recording, and which of their beams, that are compared with the map; and how far before a wall, m, one may end."""
+_AT_ONCE = 64
+"""Scans whose rays are in memory at once."""
 
 
-def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
-    chosen = moved_scans(sweeps.first, config.move_distance, config.move_angle)
+def _traced(poses: Floats, config: GridConfig) -> Ints:
+    """Return the scans to trace of a laser at poses (k, 3)."""
+    chosen = moved_scans(poses, config.move_distance, config.move_angle)
     most = max(config.most_scans, len(chosen) // 3)
-    if config.move_distance > 0.0 and len(chosen) > most:
-        chosen = chosen[np.arange(most) * len(chosen) // most]
-    return _Task(sweeps.scans, np.arange(len(sweeps.first)), sweeps.first, sweeps.last, sweeps.flipped, config).rows(chosen)
+    thin = config.move_distance > 0.0 and len(chosen) > most
+    return chosen[np.arange(most) * len(chosen) // most] if thin else chosen
 
 
-def _around(boxes: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Return the box, given by two corners, around several."""
-    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+def _extent(tasks: Sequence["_Task"]) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of a box around all rays, and around the laser where it sees nothing, m."""
+    low, high = (end([end(task.places, axis=0) for task in tasks], axis=0) for end in (np.min, np.max))
+    for task in tasks:
+        for some in task.parts():
+            rays = task.sweeps.rays(some, np.maximum(task.reach(some, False), task.reach(some, True)))
+            low = np.minimum(low, rays.endpoints.min(axis=0, initial=np.inf))
+            high = np.maximum(high, rays.endpoints.max(axis=0, initial=-np.inf))
+    return low, high
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """Scans to trace and how."""
+    """Scans (s,) of a recording to be traced."""
 
-    scans: LaserScans
+    sweeps: Sweeps
     chosen: Ints
-    first: Floats
-    last: Floats | None
-    flipped: bool
     config: GridConfig
 
-    def _parts(self) -> Iterator[slice]:
+    @property
+    def places(self) -> Floats:
+        """(s, 2) m, of the laser."""
+        return self.sweeps.first[self.chosen, :2]
+
+    def parts(self) -> Iterator[Ints]:
         """Yield a bounded number of scans at a time."""
-        for start in range(0, len(self.chosen), _SCANS_AT_A_TIME):
-            yield slice(start, min(start + _SCANS_AT_A_TIME, len(self.chosen)))
+        for start in range(0, len(self.chosen), _AT_ONCE):
+            yield self.chosen[start : start + _AT_ONCE]
 
-    def _reach(self, part: slice, empty: bool) -> NDArray[np.float32]:
-        config, chosen = self.config, self.chosen[part]
+    def reach(self, some: Ints, empty: bool) -> NDArray[np.float32]:
+        """Return the length of the beams of some scans, m, with a reading or without; 0 = others."""
+        scans, config, readings = self.sweeps.scans, self.config, self.sweeps.scans.ranges[some]
         if empty:
-            return empty_reach(self.scans, chosen, config.max_clear_distance, config.clear_run)
-        return seen_reach(self.scans, chosen, config.max_range or math.inf)
-
-    def _poses(self, part: slice) -> tuple[Floats, Floats | None]:
-        return self.first[part], None if self.last is None else self.last[part]
-
-    def batches(self, empty: bool) -> Iterator[tuple[int, ScanRays]]:
-        """Yield (scans done, rays): of beams with a reading, or of those without."""
-        for part in self._parts():
-            yield part.stop, scan_rays(self.scans, self._reach(part, empty), *self._poses(part), flipped=self.flipped)
-
-    def extent(self) -> tuple[Floats, Floats]:
-        """Return the corners (2,) of a box around all rays, m."""
-        boxes = []
-        for part in self._parts():
-            reach = np.maximum(self._reach(part, False), self._reach(part, True))
-            boxes.append(extent(self.scans, reach, *self._poses(part), flipped=self.flipped))
-        return _around(boxes)
+            reach = np.float32(min(config.max_clear_distance, scans.range_max))
+            return np.where(in_runs(np.isposinf(readings), config.clear_run), reach, np.float32(0.0))
+        return np.where(scans.hits(readings, config.max_range or math.inf), readings, np.float32(0.0))
 
     def within(self, low: Floats, high: Floats) -> "_Task":
         """Return the task with the scans whose laser stood in a box."""
-        return self.rows(np.flatnonzero(np.all((self.first[:, :2] >= low) & (self.first[:, :2] <= high), axis=1)))
-
-    def rows(self, which: Ints) -> "_Task":
-        """Return the task with some of its scans."""
-        last = None if self.last is None else self.last[which]
-        return replace(self, chosen=self.chosen[which], first=self.first[which], last=last)
+        return replace(self, chosen=self.chosen[np.all((self.places >= low) & (self.places <= high), axis=1)])

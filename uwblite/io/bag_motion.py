@@ -19,7 +19,7 @@ _SIMULATED = 1e8
 
 
 class BagClock:
-    """Times of headers, or of recording where these bear none; collects how much later messages were recorded, by sensor."""
+    """Times of headers, or of recording where these bear none."""
 
     def __init__(self) -> None:
         self.unstamped = 0
@@ -185,21 +185,12 @@ class MovingFrames:
 
 
 def no_odometry(topics: Sequence[tuple[str, str]], truths: Sequence[str], frames: Sequence[str]) -> str:
-    """Return the words on a bag without odometry.
-
-    Parameters
-    ----------
-    topics : name and type of what it holds. truths : topics that are named as the truth. frames : transforms that move.
-    """
+    """Return the words on a bag with such topics and types, topics named as the truth, and transforms, but no odometry."""
     text = "the bag has no odometry: neither nav_msgs/Odometry nor, in tf, a transform from odom to the base"
     if truths:
         text += f"; {', '.join(truths)} is the truth by its name, and `topics.odometry={truths[0]}` takes it nevertheless"
     if frames:
         text += f"; tf moves {', '.join(frames[:4])}"
-    held = [f"{name} ({kind})" for name, kind in topics]
-    more = f" and {len(held) - _SHOWN} more" if len(held) > _SHOWN else ""
-    return f"{text}; it holds: {', '.join(held[:_SHOWN]) or 'nothing'}{more}"
-
-
-_SHOWN = 12
-"""Topics named in an error."""
+    shown, most = [f"{name} ({kind})" for name, kind in topics], 12
+    more = f" and {len(shown) - most} more" if len(shown) > most else ""
+    return f"{text}; it holds: {', '.join(shown[:most]) or 'nothing'}{more}"

@@ -1,8 +1,6 @@
 """Scans, headings and ranges in a bag.
 
-The heading is the robot's rotation about the vertical, which is measured: an accelerometer feels gravity whatever way it is
-mounted. Where the messages hold no gravity, the transforms say which way is up, and without these the sensor's z axis is taken,
-as REP-145 has it.
+The heading turns about the vertical: that of gravity, else of the transforms, else the sensor's z axis (REP-145).
 """
 
 from array import array
@@ -16,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Floats
 from ..sensor_log import Gyro, LaserScans, UwbRanges, fault_of_id
 from .bag_motion import Frames
-from .readings import ScanGeometry, clean, ranges_of, reach_of, resampled, resampling_warning
+from .readings import MOST_TAGS, ScanGeometry, clean, ranges_of, reach_of, resampled, resampling_warning
 from .uwb_mapping import Reading
 
 
@@ -137,12 +135,8 @@ class ImuReadings:
     def gyro(self, frames: Frames, base: str, warnings: list[str]) -> Gyro | None:
         """Return the heading; None, and a warning, where the messages hold none.
 
-        The angular velocity is integrated with the trapezoidal rule. Without it the orientation is taken, of which only
-        changes matter: they are turns about the vertical however the sensor is mounted.
-
-        Parameters
-        ----------
-        frames, base : where the sensor sits on the robot, and the robot's frame.
+        The angular velocity is integrated with the trapezoidal rule. Without it the orientation is taken: its changes are turns
+        about the vertical however the sensor is mounted.
         """
         rows = np.array(self._rows).reshape(-1, 11)
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
@@ -189,12 +183,10 @@ class ImuReadings:
 
 
 _USUAL_FRAMES = ("uwb_tag", "uwb_link", "uwb", "tag")
-_MOST_TAGS = 9
-"""Tags on one robot that a log keeps apart."""
 
 
 class RangeReadings:
-    """Collects the ranges of all topics: by one tag of the robot or several, and those between other nodes."""
+    """Collects the ranges of all topics."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, Reading, str]] = []
@@ -228,10 +220,7 @@ class RangeReadings:
         return ranges_of(stamps, anchor, list(number), metres, quality, tag if len(tags) > 1 else None), tags
 
     def places(self, tags: tuple[str, ...], frames: Frames, base: str, warnings: list[str]) -> Floats:
-        """Return where the tags sit on the robot (t, 3), m, by the transforms; the middle of the robot where these do not tell.
-
-        Messages name the tag's frame, or the anchor's; then the usual names are tried.
-        """
+        """Return where the tags sit on the robot (t, 3), m, by the frame of their messages or usual names; else its middle."""
         positions, unknown = np.zeros((len(tags), 3)), []
         for place, tag in zip(positions, tags, strict=True):
             named = [name for name, _ in self._frames.get(tag, Counter[str]()).most_common(1)]
@@ -254,15 +243,11 @@ class RangeReadings:
 
 
 def _of_the_robot(every: list[tuple[float, Reading, str]], kind: str, warnings: list[str]) -> list[tuple[float, Reading]]:
-    """Return stamps and ranges of one kind of messages without those between other nodes.
-
-    Tags that others range to as to an anchor are not on this robot. Where all tags are such, the one that measured most is the
-    robot's.
-    """
+    """Return stamps and ranges of one kind of messages by tags to which nobody ranges as to an anchor, else the busiest one."""
     rows = [(t, r) for t, r, k in every if k == kind]
     by_tag, anchors = Counter(r.tag for _, r in rows), {r.anchor for _, r in rows}
     ranked = sorted(by_tag, key=lambda tag: (-by_tag[tag], tag))
-    robot = ([tag for tag in ranked if tag not in anchors] or ranked[:1])[:_MOST_TAGS]
+    robot = ([tag for tag in ranked if tag not in anchors] or ranked[:1])[:MOST_TAGS]
     others = Counter(f"{r.tag} to {r.anchor}" for _, r in rows if r.tag not in robot)
     if others:
         shown = ", ".join(name for name, _ in others.most_common(3))

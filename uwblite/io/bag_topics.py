@@ -1,7 +1,4 @@
-"""Which topics of a bag hold wheels, scans, an IMU, ranges and transforms; and which may hold ranges that no mapping reads.
-
-For messages of an unknown kind that may hold ranges a mapping to begin with is guessed from the names of their fields.
-"""
+"""Which topics of a bag hold wheels, scans, an IMU, ranges and transforms; and which may hold ranges that no mapping reads."""
 
 import json
 import re
@@ -84,9 +81,7 @@ def plan_topics(
 
     Parameters
     ----------
-    topics : all of the bag.
-    samples : gives the first messages of a topic.
-    asked : topics that the user names.
+    topics : all of the bag. samples : gives the first messages of a topic. asked : topics that the user names.
     mappings : the user's mappings of ranges; the known ones are tried after these.
 
     Raises
@@ -220,13 +215,8 @@ _MOST_SAMPLES = 20
 """Messages looked at: a list may be empty at first."""
 
 
-def suggested(topic: str, message_type: str, samples: Callable[[str], Sequence[Any]]) -> UwbMapping | None:
-    """Return a mapping for a topic that may hold ranges to anchors, None where it does not look like it.
-
-    Parameters
-    ----------
-    samples : gives the first messages of a topic.
-    """
+def suggested(topic: str, message_type: str, samples: Samples) -> UwbMapping | None:
+    """Return a mapping for a topic that may hold ranges to anchors, by the names of its fields; None where it does not."""
     kind = short_type(message_type)
     hinted = _HINT.search(topic) is not None or _HINT.search(kind) is not None
     if kind == "sensor_msgs/Range":

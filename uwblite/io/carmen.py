@@ -1,9 +1,7 @@
 """CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds; docs/formats.md lists the messages.
 
 ``NAME contents ipc_timestamp ipc_hostname logger_timestamp``. UWB and GYRO are uwblite's own; other CARMEN readers skip them.
-ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp: both are
-accepted, and then the logger's time counts. A reading at or above the maximum range saw nothing (+inf); one below range_min is
-an error code (nan).
+ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp.
 """
 
 import hashlib
@@ -21,13 +19,11 @@ from .carmen_stamps import LineClock, judged, time_order
 from .carmen_words import BrokenLine, Params, is_message_name, numbers, stamp_of, why_broken
 from .carmen_writer import write_log
 from .log_parts import parts_of
-from .readings import ranges_of
+from .readings import MOST_TAGS, ranges_of
 from .source import OVERLONG_LINE, open_source
 
 __all__ = ["read_log", "write_log"]
 
-MOST_TAGS = 9
-"""Tags on one robot that a log keeps apart: UWB, UWB2 ... UWB9."""
 BROKEN_LINES_KEPT = 20
 """Broken lines reported one by one; all are counted."""
 _UNUSED = frozenset(
@@ -49,7 +45,6 @@ def read_log(
     """Read one CARMEN log, plain or gzip; ``-`` reads standard input.
 
     A log that was cut into parts by `uwblite record --rotate` is read whole, whichever of its parts is named.
-    Memory grows with the kept readings (four bytes each), not with the text.
 
     Parameters
     ----------
@@ -63,7 +58,7 @@ def read_log(
 
     Raises
     ------
-    FormatError : the file cannot be read, is no CARMEN log, has no odometry, or too many of its lines are broken.
+    FormatError : it is no CARMEN log, has no odometry, or too many of its lines are broken.
     ConfigError : there are no scans of the message that was asked for.
     """
     if every_nth_scan < 1:
@@ -247,8 +242,7 @@ class LogReader:
     def _tied(self, rows: Floats) -> Floats:
         """Return stamp and robot pose (k, 4) of the laser messages where those of ODOM messages (n, 4) have stamps in bursts.
 
-        What drove between two scans is then known by the poses that came with them, whatever the stamps say. A corrected log
-        gives poses of another frame: these are farther from the odometry than from each other.
+        A corrected log gives poses of another frame: these are farther from the odometry than from each other.
         """
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         odometry = Odometry(rows[:, 0], rows[:, 1:])

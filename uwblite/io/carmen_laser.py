@@ -5,6 +5,7 @@ import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,7 @@ _URG_PERIOD = 0.1
 Bytes = NDArray[np.uint8]
 
 
-@dataclass(slots=True, eq=False)
-class Pending:
+class Pending(NamedTuple):
     """One message of the block at hand, parsed but for its readings."""
 
     number: int
@@ -87,15 +87,13 @@ def decode_equal_widths(
 
     Parameters
     ----------
-    begins : (k,) index of each row's first character.
-    count : numbers in a row.
+    begins : (k,) index of each row's first character. count : numbers in a row.
     width : characters of each number; one blank stands between numbers and behind the last.
     decimals : digits behind the dot, 1..6.
 
     Returns
     -------
-    values : (k, count) the numbers, in the unit of the text.
-    plain : (k,) whether every number of the row has that form; the values of other rows mean nothing.
+    The numbers (k, count), and whether every number of the row has that form (k,); the values of other rows mean nothing.
     """
     span = count * (width + 1)
     characters = np.empty((len(begins), count, width + 1), dtype=np.uint8)
@@ -236,7 +234,6 @@ class LaserMessages:
             ranges = ranges[order]
         angles = geometry.angle_min, geometry.angle_increment
         laser = LaserScans(stamps[order], ranges, *angles, time_increment, range_min, range_max)
-        warnings.extend(_fence_posts(laser))
         return laser, self._mounting(what, warnings)
 
     def _geometry(self, layout: Layout, params: Params) -> ScanGeometry:
@@ -318,31 +315,8 @@ class LaserMessages:
         return np.round(middle, 6)
 
 
-def _fence_posts(scans: LaserScans) -> list[str]:
-    """Report an increment that looks like the field of view divided by one beam too few, as in logs of SICK scanners."""
-    beams, degrees = scans.ranges.shape[1], math.degrees(abs(scans.angle_increment))
-    true = degrees * (beams - 1) / max(beams, 1)
-    usual = min(_USUAL_STEPS, key=lambda step: abs(step - true))
-    if beams < _FEW_BEAMS or abs(true - usual) > 1e-4 * usual:
-        return []
-    return [
-        f"{beams} beams are said to be {degrees:.4f} degrees apart; {usual:g} would be usual, with {beams + 1} beams over "
-        f"{usual * beams:g} degrees. The log is used as it is; if it is a SICK's, turns come out {1 / beams:.1%} too large: "
-        f"write {math.radians(usual):.9f} rad as angular_resolution"
-    ]
-
-
-_USUAL_STEPS = (0.25, 0.5, 1.0)
-"""Angles between beams of SICK scanners, degrees."""
-_FEW_BEAMS = 90
-"""Fewer beams than any of these scanners has."""
-
-
 def _sweep_of_urg(geometry: ScanGeometry, range_max: float, stamps: Floats, every_nth: int) -> float:
-    """Return the time between rays, s: that of a URG-04LX where the scans look like one's, otherwise 0 (snapshot).
-
-    A URG-04LX turns once in 0.1 s, sees 240 degrees of it in up to 683 steps and reaches 5.6 m.
-    """
+    """Return the time between rays, s: that of a URG-04LX (240 degrees, 5.6 m) where it looks like one, else 0."""
     beams = geometry.beams
     fov = math.degrees(abs(geometry.angle_increment) * (beams - 1))
     if not (238.0 < fov < 242.0 and 680 <= beams <= 684 and range_max < 6.0 and len(stamps) > 1):

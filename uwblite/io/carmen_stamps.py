@@ -1,8 +1,7 @@
 """Stamps of a CARMEN log judged by the order of its lines: false ones, and those that stand still while the robot drives.
 
-A recorder writes messages as they come, so lines tell which was first even where stamps do not: stamps written with six
-digits, or GMapping's corrected logs, which repeat each laser message as an ODOM whose stamp was never set. Between two of
-their scans the ODOM messages are the wheels', and at each scan they leap to the corrected pose.
+GMapping's corrected logs repeat each laser message as an ODOM whose stamp was never set. Between two of their scans the ODOM
+messages are the wheels', and at each scan they leap to the corrected pose.
 """
 
 from bisect import bisect_right
@@ -124,8 +123,8 @@ def judged(
 def _remove_leaps(poses: Floats, wheels: Bools) -> Floats:
     """Return the poses (n, 3) of a corrected log without leaps; some (n,) are the odometry's own, the others of laser messages.
 
-    Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed. A pose
-    X after a share a of the way becomes X exp(a log C): nothing moves while the robot stands.
+    Between two laser messages at P and Q the odometry leads from P to E, and C = E^-1 Q is what the correction changed: a pose
+    X after a share a of the way becomes X exp(a log C).
     """
     laser, number = np.flatnonzero(~wheels), np.arange(len(wheels))
     following = np.searchsorted(laser, number)
@@ -165,10 +164,9 @@ def _neighbours(lines: Ints, other_lines: Ints, other_stamps: Floats) -> tuple[F
 
 
 def false_stamps(stamps: Floats) -> Bools:
-    """Return which stamps (n,), s, as they were written, cannot be: a few in a row, far off those before and after them.
+    """Return which stamps (n,), s, as they were written, cannot be: a few in a row, far off those before and after them, or 0.
 
-    A stamp of 0 was never set, unless it is in order itself. Where the rest is not in order, as in logs whose lines were
-    mixed, none is called false.
+    Where the rest is not in order, as in logs whose lines were mixed, none is called false.
     """
     false = np.zeros(len(stamps), dtype=bool)
     zero = stamps == 0.0
@@ -216,12 +214,7 @@ def placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[
 
 
 def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> Ints:
-    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
-
-    Parameters
-    ----------
-    set_back : takes by how much the clock was set back at most, s, by what.
-    """
+    """Return the order (n,) that sorts stamps, and warn of late ones; set_back takes by how much at most, s, by what."""
     late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - CONFIRMED))
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
@@ -231,10 +224,7 @@ def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[st
 
 
 def _in_parts(stamps: Floats) -> bool:
-    """Return whether stamps (n,) are those of one clock in parts that only stand in another order, as `cat` writes them.
-
-    Sorted, one part follows the other; a clock that was set back goes through the same time again, or leaves a gap.
-    """
+    """Return whether stamps (n,) are those of one clock in parts that only stand in another order, as `cat` writes them."""
     steps = np.diff(stamps, prepend=np.inf)
     begins = np.flatnonzero((steps < -CONFIRMED) | (steps > _NEXT))
     first, last = np.minimum.reduceat(stamps, begins), np.maximum.reduceat(stamps, begins)

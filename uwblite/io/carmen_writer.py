@@ -1,5 +1,6 @@
 """Write a recording as a CARMEN log."""
 
+import heapq
 import os
 from collections.abc import Iterator
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..sensor_log import LaserScans, SensorLog
+from ..sensor_log import Gyro, LaserScans, Odometry, SensorLog, UwbRanges
 from .carmen_words import LASER_IS_BASE
 from .files import replacing
 
@@ -28,14 +29,11 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
         stream.write(b"# CARMEN Logfile\n")
         for name, value in _params(log):
             stream.write(f"PARAM {name} {value} 0 {HOST} 0\n".encode())
-        sources = [_odometry_lines(log), _gyro_lines(log), _range_lines(log), scan_lines(log)]
-        none = np.zeros(0)
-        sensors = (log.odometry, log.gyro, log.ranges, log.scans)
-        stamps = [none if sensor is None else sensor.stamps for sensor in sensors]
-        kind = np.repeat(np.arange(4), [len(s) for s in stamps])
-        order = np.argsort(np.concatenate(stamps), kind="stable")
-        for source in kind[order].tolist():
-            stream.write(next(sources[source]))
+        parts = [zip(log.odometry.stamps.tolist(), _odometry_lines(log.odometry), strict=True)]
+        parts += [] if log.gyro is None else [zip(log.gyro.stamps.tolist(), _gyro_lines(log.gyro), strict=True)]
+        parts += [] if log.ranges is None else [zip(log.ranges.stamps.tolist(), _range_lines(log.ranges), strict=True)]
+        parts += [] if log.scans is None else [zip(log.scans.stamps.tolist(), scan_lines(log), strict=True)]
+        stream.writelines(line for _, line in heapq.merge(*parts, key=lambda row: row[0]))
 
 
 def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
@@ -59,26 +57,21 @@ def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
         yield "laser_range_min", f"{log.scans.range_min:.6g}"
 
 
-def _odometry_lines(log: SensorLog) -> Iterator[bytes]:
-    for stamp, (x, y, theta) in zip(log.odometry.stamps.tolist(), log.odometry.poses.tolist(), strict=True):
+def _odometry_lines(odometry: Odometry) -> Iterator[bytes]:
+    for stamp, (x, y, theta) in zip(odometry.stamps.tolist(), odometry.poses.tolist(), strict=True):
         yield f"ODOM {x:.6f} {y:.6f} {theta:.6f} 0 0 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
-def _gyro_lines(log: SensorLog) -> Iterator[bytes]:
-    if log.gyro is None:
-        return
-    for stamp, heading in zip(log.gyro.stamps.tolist(), log.gyro.heading.tolist(), strict=True):
+def _gyro_lines(gyro: Gyro) -> Iterator[bytes]:
+    for stamp, heading in zip(gyro.stamps.tolist(), gyro.heading.tolist(), strict=True):
         yield f"GYRO {heading:.6f} 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
-def _range_lines(log: SensorLog) -> Iterator[bytes]:
-    if log.ranges is None:
-        return
-    names = [log.ranges.anchor_ids[i] for i in log.ranges.anchor.tolist()]
-    columns = (log.ranges.stamps, log.ranges.ranges, log.ranges.quality)
-    tags = [""] * len(names) if log.ranges.tag is None else [str(k + 1) if k else "" for k in log.ranges.tag.tolist()]
-    for tag, name, stamp, distance, quality in zip(tags, names, *(c.tolist() for c in columns), strict=True):
-        yield f"UWB{tag} {name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
+def _range_lines(ranges: UwbRanges) -> Iterator[bytes]:
+    names, columns = ranges.anchor_ids, (ranges.tags, ranges.anchor, ranges.stamps, ranges.ranges, ranges.quality)
+    for tag, anchor, stamp, distance, quality in zip(*(c.tolist() for c in columns), strict=True):
+        name = f"UWB{tag + 1 if tag else ''} {names[anchor]}"
+        yield f"{name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
 def scan_lines(log: SensorLog) -> Iterator[bytes]:
@@ -86,8 +79,7 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
     scans = log.scans
     if scans is None:
         return
-    robot = log.odometry.at(scans.stamps)
-    robot = np.round(robot, 6)
+    robot = np.round(log.odometry.at(scans.stamps), 6)
     laser = se2.compose(robot, log.mounting.T_base_laser)
     beams = scans.ranges.shape[1]
     fov = scans.angle_increment * max(beams - 1, 0)
@@ -101,14 +93,8 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
         readings = map(form.__mod__, map(tuple, _clear_signs(scans, part).tolist()))
         rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
         for text, l, r, stamp in rows:
-            yield (
-                head
-                + text
-                + (
-                    f" 0 {l[0]:.9f} {l[1]:.9f} {l[2]:.9f} {r[0]:.6f} {r[1]:.6f} {r[2]:.6f} 0 0 0 0 0 "
-                    f"{stamp:.6f} {HOST} {stamp:.6f}\n"
-                ).encode()
-            )
+            poses = f"{l[0]:.9f} {l[1]:.9f} {l[2]:.9f} {r[0]:.6f} {r[1]:.6f} {r[2]:.6f}"
+            yield head + text + f" 0 {poses} 0 0 0 0 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
 def _clear_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:

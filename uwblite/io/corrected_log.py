@@ -1,6 +1,4 @@
-"""A map's poses with the recording's scans, for other programs: CARMEN logs with corrected laser poses, as users of GMapping
-exchange maps, and the pose graph with its scans, as g2o and the tools around it read them.
-"""
+"""A map's poses with the recording's scans: CARMEN logs with corrected laser poses, and the pose graph with its scans."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -38,9 +36,7 @@ def write_corrected_log(path: str | os.PathLike[str], source: str, poses_at: Pos
 
     Parameters
     ----------
-    path : the file; replaced only when the new one is complete; compressed where it ends in ``.gz``.
     source : the log that was mapped, or one of its parts.
-    poses_at : poses of laser and robot.
 
     Returns
     -------
@@ -143,10 +139,6 @@ def write_graph_with_scans(path: str | os.PathLike[str], result: StoredResult, l
     Returns
     -------
     Number of vertices with a scan.
-
-    Raises
-    ------
-    FormatError : the result has no graph.g2o.
     """
     source = result.folder / "graph.g2o"
     if not source.is_file():

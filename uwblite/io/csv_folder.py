@@ -1,9 +1,4 @@
-"""A recording as a folder of CSV files, for spreadsheets, pandas and other languages; docs/formats.md lists files and columns.
-
-Stamps in seconds, lengths in metres, angles in radians. Columns are found by the names of the header, others are skipped;
-where the header has names of its own, or is missing, they stand in this order. The quality may be missing. Files of sensors
-that were not there are not there either.
-"""
+"""A recording as a folder of CSV files, for spreadsheets and other programs; docs/formats.md lists files and columns."""
 
 import dataclasses
 import hashlib
@@ -72,12 +67,7 @@ class Sensors:
 
 
 def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: bool = False) -> None:
-    """Write a recording as CSV files into a folder, made where it is missing; all files are replaced together.
-
-    Raises
-    ------
-    ConfigError : the folder holds such files already and force is not given, or uwblite has not written them.
-    """
+    """Write a recording as CSV files into a folder, all together; raise ConfigError where others stand there."""
     path = Path(folder)
     present = [path / name for name in _FILES if (path / name).is_file()]
     if present and not force:
@@ -123,12 +113,7 @@ def _sensors(log: SensorLog) -> Sensors:
 
 
 def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
-    """Read a recording from a folder of CSV files.
-
-    Raises
-    ------
-    FormatError : odometry.csv is missing, or a file is not what it should be.
-    """
+    """Read a recording from a folder of CSV files."""
     path, read, sensors = Path(folder), _Reading(), Sensors()
     if (path / "sensors.toml").exists():
         stated = parse_toml("".join(read.lines(path / "sensors.toml")), str(path / "sensors.toml"))

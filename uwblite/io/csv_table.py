@@ -33,16 +33,7 @@ class CsvTable:
         return (default,) * len(self.rows)
 
     def numbers(self, *columns: str, default: float | None = None) -> Floats:
-        """Return columns as numbers (rows, columns).
-
-        Parameters
-        ----------
-        default : value of a column that is absent or a field that is empty; None = it must be there.
-
-        Raises
-        ------
-        FormatError : a column is absent, or a field is not a number.
-        """
+        """Return columns as numbers (rows, columns); default : of what is absent or empty, None = it must be there."""
         values = [self._column(c, default) for c in columns]
         return np.array(values, dtype=np.float64).reshape(len(columns), len(self.rows)).T
 
@@ -61,12 +52,7 @@ class CsvTable:
 
 
 def read_csv(path: str | os.PathLike[str]) -> CsvTable:
-    """Read a comma-separated table whose first line names the columns; empty lines and # lines are skipped.
-
-    Raises
-    ------
-    FormatError : unreadable, not text, or a row has another number of fields than the header.
-    """
+    """Read a comma-separated table whose first line names the columns; empty lines and # lines are skipped."""
     name, data = os.fspath(path), b""
     with open_source(name) as source:
         for block in source.blocks():
@@ -90,17 +76,12 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
 
 _LARGEST = 1 << 26
 """Bytes of a table that is read."""
-_FARTHEST = 1e9
-"""m; a number beyond it is no place on Earth."""
+_FARTHEST = 1e10
+"""m or s; a number beyond it is neither a place on Earth nor a time since 1970."""
 
 
 def csv_rows(lines: Iterable[str], path: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of its last line and the fields of each row that is not empty.
-
-    Raises
-    ------
-    FormatError : this is no comma-separated text.
-    """
+    """Yield the number of its last line and the fields of each row that is not empty."""
     reader = csv.reader(lines)
     try:
         for row in reader:

@@ -17,15 +17,10 @@ WAITING = ".uwblite-partial-"
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes the place of `path` only when the block ends without an error.
+    """Open a file for writing that takes the place of `path`, by one rename, only when the block ends without an error.
 
-    The data goes to a temporary name in the same folder, is forced to the disk and then renamed, which is atomic: a
-    reader sees the old file or the new one. A name ending in ``.gz`` is compressed, with the same bytes every time.
-    Devices and pipes (``/dev/null``) are written directly.
-
-    Raises
-    ------
-    OSError : the disk is full, the folder is missing or may not be written; the previous file is untouched.
+    A name ending in ``.gz`` is compressed, with the same bytes every time. Devices and pipes are written directly. An OSError
+    leaves the previous file untouched.
     """
     target = os.path.realpath(os.fspath(path))
     if os.path.exists(target) and not os.path.isfile(target):
@@ -87,12 +82,7 @@ def _use_handle(path: str | os.PathLike[str], work: Callable[[int], object]) -> 
 
 
 def sync_files(folder: str | os.PathLike[str]) -> None:
-    """Force all files of a folder, and their names, to the disk; writing begins for all of them before one is waited for.
-
-    Raises
-    ------
-    OSError : the disk cannot take them.
-    """
+    """Force all files of a folder, and their names, to the disk; writing begins for all of them before one is waited for."""
     files = [entry.path for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
     for work in (_begin_writing, os.fsync):
         # One at a time: a process may have few files open.

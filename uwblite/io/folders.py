@@ -1,9 +1,8 @@
 """Replacing a folder of files as a whole, as far as the system allows, by one writer at a time.
 
-A reader that looks at any time, and whoever looks after a crash, shall find all of the old files or all of the new ones.
-A new folder appears by one rename. One that holds nothing but an earlier result changes places with its successor in
-one step, where the system can do that (Linux' renameat2). In a folder that others use too, which therefore has to stay,
-the finished files are first named as such and then renamed one by one: what a crash leaves undone is done by `mend`.
+A new folder appears by one rename. One that holds nothing but an earlier result changes places with its successor in one step,
+where the system can (Linux' renameat2). In a folder that others use too, the finished files are first named as such and then
+renamed one by one: what a crash leaves undone is done by `mend`.
 """
 
 import ctypes
@@ -28,12 +27,7 @@ Owned = Callable[[str], bool]
 
 @contextmanager
 def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Path]:
-    """Give an empty folder to write into; when the block ends well, its files replace those of a folder.
-
-    Parameters
-    ----------
-    path : the folder, made with its parents where it is missing.
-    owned : which files of an earlier result go; all others stay.
+    """Give an empty folder to write into; when the block ends well, its files replace those of a folder that `owned` names.
 
     Raises
     ------
@@ -48,12 +42,7 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
 
 
 def check_free(folder: str | os.PathLike[str], owned: Owned) -> None:
-    """Refuse a folder in which another folder has the name of a file, for then only some of the files could be replaced.
-
-    Raises
-    ------
-    ConfigError : there is one.
-    """
+    """Raise ConfigError where another folder in a folder has the name of a file: only some of the files could be replaced."""
     inside = Path(folder).iterdir() if os.path.isdir(folder) else iter(())
     blocked = next((p for p in inside if owned(p.name) and p.is_dir() and not p.is_symlink()), None)
     if blocked is not None:
@@ -61,12 +50,7 @@ def check_free(folder: str | os.PathLike[str], owned: Owned) -> None:
 
 
 def refuse_foreign(files: Iterable[Path]) -> None:
-    """Refuse to replace files that somebody else has written.
-
-    Raises
-    ------
-    ConfigError : there is one.
-    """
+    """Raise ConfigError for the first of files that somebody else has written."""
     for file in files:
         raise ConfigError(f"{file} was not written by uwblite, or was changed since; move it away, or choose another folder")
 
@@ -175,19 +159,13 @@ def _exchange(one: Path, other: Path) -> bool:
     call = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
     if call is None:
         return False
-    names = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
-    first, second = names
+    first, second = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
     return bool(call(_AT_FDCWD, first, _AT_FDCWD, second, ctypes.c_uint(_RENAME_EXCHANGE)) == 0)
 
 
 @contextmanager
 def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold the name of a result while it is computed, so that no second run computes in vain.
-
-    Raises
-    ------
-    ConfigError : another run of this user holds it.
-    """
+    """Hold the name of a result while it is computed; raise ConfigError where another run of this user holds it."""
     with _held(path, "run", wait=False) as held:
         if not held:
             raise ConfigError(f"another run is writing {os.fspath(path)}; wait for it, or choose another `folder`")

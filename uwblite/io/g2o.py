@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import WIDE, Ints, Wides
+from ..arrays import WIDE, Ints, Wides, concatenated
 from ..errors import FormatError
 from ..graph.graph import Graph
 from .files import replacing
@@ -32,10 +32,9 @@ from .graph_file import (
     ENDS,
     GraphFile,
     Measured,
-    assembled,
+    Vertices,
     check_lines,
     check_planar,
-    given_places,
     measured,
     measurements,
     plain_edges,
@@ -73,8 +72,7 @@ _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
     """Read a planar pose graph, g2o or TORO, plain or gzip; ``-`` = standard input.
 
-    Poses without a VERTEX line are reached from the others along edges; in a file without any, the first pose is the
-    origin. Landmarks without one are placed by the first edge that sees them, or stay nan.
+    What has no VERTEX line is reached along edges, see graph_file.along_edges.
 
     Parameters
     ----------
@@ -114,18 +112,12 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
             raise
         raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
     plain["landmark_range"] = measured("landmark_range")
-    poses = given_places(vertices, pose_of, len(pose_ids), content)
-    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
     fixed = records["FIX"].names[:, 0]
-    graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
-    file = GraphFile.checked(
-        graph,
-        tuple(map(str, pose_ids.tolist())),
-        tuple(map(str, landmark_ids.tolist())),
-        np.arange(len(pose_ids), dtype=np.float64),
-        content,
-        from_odometry,
+    poses, landmarks = (
+        Vertices(tuple(map(str, ids.tolist())), place, given, place[fixed][place[fixed] >= 0])
+        for ids, place, given in ((pose_ids, pose_of, vertices), (landmark_ids, landmark_of, records["VERTEX_XY"]))
     )
+    file = GraphFile.of(content, plain, (poses, landmarks), np.arange(len(pose_ids), dtype=np.float64), from_odometry)
     return replace(file, warnings=(*_degrees(steps), *file.warnings))
 
 
@@ -150,8 +142,7 @@ def write_g2o(
 
     gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
     them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is
-    fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
-    worked in at the present estimate (see plain_edges); robust kernels are not written.
+    fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow; for what is written see plain_edges.
 
     Parameters
     ----------
@@ -194,9 +185,8 @@ def _lines(graph: Graph, plain: dict[str, Measured], ranges: bool, number: Ints)
 
 def _together(a: Records, b: Records) -> Records:
     """Return the lines of both kinds in the order of the file."""
-    order = np.argsort(np.concatenate([a.lines, b.lines]), kind="stable")
-    columns = zip((a.lines, a.stamps, a.names, a.numbers), (b.lines, b.stamps, b.names, b.numbers), strict=True)
-    return Records(*(np.concatenate(pair)[order] for pair in columns))
+    both = concatenated([a, b])
+    return both.rows(np.argsort(both.lines, kind="stable"))
 
 
 def _ids(content: RecordFile) -> Wides:

@@ -1,7 +1,4 @@
-"""Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common.
-
-Measurements stand in files between poses and landmarks, without calibration.
-"""
+"""Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common."""
 
 import math
 import re
@@ -63,11 +60,9 @@ def measured(kind: str, parts: Sequence[Measured] = ()) -> Measured:
 def plain_edges(graph: Graph) -> dict[str, Measured]:
     """Return a graph's measurements by kind with calibration and lever arms worked in at the present estimate.
 
-    Odometry and scan edges become measurements between the poses of the base. A range becomes the range from the pose
-    itself that leaves the same residual at the present estimate. Weights scale the information; robust kernels and
-    priors on calibration have no place in the formats and are left out. Where nothing is calibrated and lever arms are
-    zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out. Directions that
-    an edge does not measure get an information too small to matter (see `definite`).
+    Odometry and scan edges become measurements between the poses of the base, a range that from the pose itself which leaves
+    the same residual. Weights scale the information. Robust kernels, priors on calibration, and ranges to anchors without a
+    position are left out. Directions that an edge does not measure get an information too small to matter (see `definite`).
     """
     kinds: dict[str, list[Measured]] = {kind: [] for kind in ENDS}
     for edges in graph.edges:
@@ -176,27 +171,23 @@ class GraphFile:
     """Oddities, in words."""
 
     @staticmethod
-    def checked(
-        graph: Graph,
-        pose_ids: tuple[str, ...],
-        anchor_ids: tuple[str, ...],
-        stamps: Floats,
-        content: RecordFile,
-        from_odometry: bool = False,
+    def of(
+        content: RecordFile, plain: dict[str, Measured], of: tuple["Vertices", "Vertices"], stamps: Floats, odometry: bool
     ) -> "GraphFile":
         """Return the graph of a file that was read, with a start for whatever the file gives no position of.
 
         Parameters
         ----------
-        from_odometry : forget the positions that it gives.
+        of : poses and landmarks, stamps : (n,) s, of the poses. odometry : forget the positions that the file gives.
 
         Raises
         ------
-        FormatError : a pose is connected with nothing.
+        FormatError : a pose is connected with nothing, or a vertex is given twice.
         """
+        graph, (pose_ids, anchor_ids) = _assembled(content, plain, *of), (vertices.ids for vertices in of)
         started, chains = along_edges(graph)
         file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))
-        file = file.from_odometry() if from_odometry else file
+        file = file.from_odometry() if odometry else file
         lost, floating = ~tied_chains(file.graph, file.chains), floating_components(file.graph) > 0
         words = "pose {} is not connected to the first one ({} such poses)"
         lost_words, floating_words = (words.format(pose_ids[int(np.argmax(p))], p.sum()) for p in (lost, floating))
@@ -220,9 +211,8 @@ class GraphFile:
 def along_edges(graph: Graph) -> tuple[Graph, Ints]:
     """Return a graph with a start for its poses, and for the landmarks that edges see or priors place; and chains (n,).
 
-    Chain 0 stands in the map's frame: what is given, what has a prior, and what edges tie to these; in a graph that holds
-    nothing anywhere, the part of the first pose, which is the origin. Every other chain, which only ranges and landmarks
-    may tie to it, begins at the origin and wants a place.
+    Chain 0 stands in the map's frame: what is given, has a prior, or is tied to these by edges, else the part of the first
+    pose, which is the origin. Every other chain, which only ranges and landmarks may tie to it, begins at the origin.
 
     Parameters
     ----------
@@ -298,22 +288,6 @@ def check_lines(content: RecordFile, checks: Iterable[tuple[Records, Bools, str]
             raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
 
 
-def given_places(vertices: Records, index_of: Ints, count: int, content: RecordFile) -> Floats:
-    """Return the places (count, numbers) that vertices give, nan where none does.
-
-    Raises
-    ------
-    FormatError : a vertex is given twice.
-    """
-    places = np.full((count, vertices.numbers.shape[1]), np.nan)
-    index = index_of[vertices.names[:, 0]]
-    again = np.ones(len(index), dtype=bool)
-    again[np.unique(index, return_index=True)[1]] = False
-    check_lines(content, [(vertices, again, "this vertex was given before")])
-    places[index] = vertices.numbers
-    return places
-
-
 def measurements(of: Records, kind: str, index: dict[str, Ints], content: RecordFile, what: str) -> Measured:
     """Return the measurements of one kind that lines hold: names, values, and the upper triangle of a matrix.
 
@@ -335,17 +309,29 @@ def measurements(of: Records, kind: str, index: dict[str, Ints], content: Record
     return Measured(ends, of.numbers[:, :k], matrices)
 
 
-def assembled(
-    plain: dict[str, Measured], poses: Floats, anchors: Floats, fixed: Ints = _NONE, fixed_anchors: Ints = _NONE
-) -> Graph:
-    """Return the graph of measurements.
+class Vertices(NamedTuple):
+    """Poses, or landmarks, of a file."""
 
-    Parameters
-    ----------
-    poses : (n, 3) given poses, nan where the file gives none.
-    anchors : (a, 2) given landmarks, nan where the file gives none.
-    fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior: the first pose is fixed.
-    """
+    ids: tuple[str, ...]
+    place: Ints
+    """Place of each name of the file among them, -1 = none."""
+    given: Records
+    """Lines that give their positions."""
+    fixed: Ints = _NONE
+    """Of them, places of those that are fixed."""
+
+    def positions(self, content: RecordFile) -> Floats:
+        """Return those that the file gives (n, numbers), nan where it gives none."""
+        positions, index = np.full((len(self.ids), self.given.numbers.shape[1]), np.nan), self.place[self.given.names[:, 0]]
+        again = np.ones(len(index), dtype=bool)
+        again[np.unique(index, return_index=True)[1]] = False
+        check_lines(content, [(self.given, again, "this vertex was given before")])
+        positions[index] = self.given.numbers
+        return positions
+
+
+def _assembled(content: RecordFile, plain: dict[str, Measured], poses: Vertices, landmarks: Vertices) -> Graph:
+    """Return the graph of measurements; where nothing is fixed and there is no prior, the first pose is fixed."""
     L = {kind: root(m.information) for kind, m in plain.items()}
     ((i, j), T_i_j, _), ((pose, anchor), position, _) = plain["relative"], plain["observation"]
     ((prior,), value, _), ((known,), place, _) = plain["pose_prior"], plain["landmark_prior"]
@@ -363,13 +349,13 @@ def assembled(
         PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
         PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
-    gauge_fixed = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
+    gauge_fixed = len(poses.fixed) or len(prior) or len(landmarks.fixed) or len(known)
     return Graph(
-        poses,
-        anchors,
+        poses.positions(content),
+        landmarks.positions(content),
         tuple(e for e in edges if len(e)),
-        fixed_poses=np.isin(np.arange(len(poses)), fixed if gauge_fixed else [0]),
-        fixed_anchors=np.isin(np.arange(len(anchors)), fixed_anchors),
+        fixed_poses=np.isin(np.arange(len(poses.ids)), poses.fixed if gauge_fixed else [0]),
+        fixed_anchors=np.isin(np.arange(len(landmarks.ids)), landmarks.fixed),
     )
 
 

@@ -1,7 +1,6 @@
 """The files of a recording that was cut into parts of bounded size (``run.log``, ``run.2.log`` ...), whole or as they grow.
 
-`uwblite record --rotate` writes into the head of each part which one it continues, and at the end which one follows. Whoever
-names one of them means the recording.
+The head of each part says which one it continues, and its end which one follows.
 """
 
 import errno
@@ -29,13 +28,7 @@ _MARK_BYTES = 1024
 
 
 def parts_of(path: str) -> tuple[list[str], str]:
-    """Return the files of the recording that a file is part of.
-
-    Returns
-    -------
-    parts : in order; `path` alone where it is no part.
-    missing : name of a part that should be there and is not, or "".
-    """
+    """Return the files of the recording that a file is part of, in order, and the name of a part that is missing, or ""."""
     if not os.path.isfile(path):
         return [path], ""
     packed = path.endswith(".gz")
@@ -108,18 +101,9 @@ def _regular(path: str, flags: int) -> int:
 
 
 class GrowingFile:
-    """Follow a file from its head, and what it holds already from near its end or whole.
+    """Follow a regular file and its next parts from the head; what it holds already whole, or from near its end.
 
-    It goes on in the next part, once that is there. A file that became shorter, or that another has taken the place of,
-    is read from its beginning.
-
-    Parameters
-    ----------
-    whole : read all that it holds already.
-
-    Raises
-    ------
-    FormatError : it cannot be opened, or is no regular file.
+    A file that became shorter, or that another has taken the place of, is read from its beginning.
     """
 
     def __init__(self, path: str, *, whole: bool = False) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, FREE_BELOW, LARGEST_CELL, LEAST_CELL, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
-from .files import replacing, write_text
+from .files import write_bytes, write_text
 from .png import MOST_PIXELS, SIGNATURE, decode_png, encode_png, png_shape
 from .source import finite, open_input, read_bounded
 
@@ -35,23 +35,17 @@ _READ_ODDS = 4.0
 def write_map(
     folder: str | os.PathLike[str], grid: OccupancyGrid, *, name: str = "map", mode: str = "trinary"
 ) -> tuple[Path, Path]:
-    """Write a map as an image and a YAML file beside it.
+    """Write a map as an image and a YAML file beside it, and return their paths.
 
     Parameters
     ----------
     name : name of both files without ending.
     mode : 'trinary' writes a binary PGM of occupied, free and unknown; 'scale' a PNG of probabilities with unknown
         cells transparent.
-
-    Returns
-    -------
-    Paths of the image and of the YAML file.
     """
     image = Path(folder) / (f"{name}.png" if mode == "scale" else f"{name}.pgm")
     yaml = Path(folder) / f"{name}.yaml"
-    data = encode_png(scale_image(grid)) if mode == "scale" else encode_pgm(trinary_image(grid))
-    with replacing(image) as stream:
-        stream.write(data)
+    write_bytes(image, encode_png(scale_image(grid)) if mode == "scale" else encode_pgm(trinary_image(grid)))
     x, y = grid.geometry.origin.tolist()
     write_text(
         yaml,
@@ -88,9 +82,8 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
     """Read a map from its YAML file and the image named there (PGM or PNG).
 
     Modes trinary (the default), scale and raw are read, by the rules of map_server, but for one: the grey of unknown cells,
-    205, stays unknown where free_thresh would make it free, as in what nav2's map saver writes by default. Occupied and free
-    cells get fixed log-odds: the file holds no more than the three states. A map whose origin is turned is sampled on a grid
-    along the axes.
+    205, stays unknown where free_thresh would make it free, as in what nav2's map saver writes. A map whose origin is turned is
+    sampled on a grid along the axes.
 
     Parameters
     ----------

@@ -44,14 +44,7 @@ def write_png(path: str | os.PathLike[str], image: Image) -> None:
 
 
 def decode_png(data: bytes, path: str = "") -> Image:
-    """Return the image (height, width, channels) of a PNG with 8 bits per channel, no palette, not interlaced.
-
-    Raises
-    ------
-    FormatError : the data is damaged or of a kind not read here.
-    """
-    if not data.startswith(SIGNATURE):
-        raise FormatError("this is not a PNG picture", path)
+    """Return the image (height, width, channels) of a PNG with 8 bits per channel, no palette, not interlaced."""
     height, width, channels = png_shape(data, path)
     size = height * (1 + width * channels)
     try:
@@ -65,13 +58,10 @@ def decode_png(data: bytes, path: str = "") -> Image:
 
 
 def png_shape(data: bytes, path: str = "") -> tuple[int, int, int]:
-    """Return height, width and channels from the beginning of a PNG.
-
-    Raises
-    ------
-    FormatError : it is no PNG, of a kind not read here, or too large.
-    """
-    if not data.startswith(SIGNATURE) or len(data) < _HEADER.size or data[12:16] != b"IHDR":
+    """Return height, width and channels from the beginning of a PNG; raise FormatError for a kind not read here."""
+    if not data.startswith(SIGNATURE):
+        raise FormatError("this is not a PNG picture", path)
+    if len(data) < _HEADER.size or data[12:16] != b"IHDR":
         raise FormatError("the PNG has no header", path)
     *_, width, height, depth, colour, _, _, interlaced = _HEADER.unpack_from(data)
     if depth != 8 or colour not in _CHANNELS or interlaced:
@@ -113,10 +103,7 @@ def _unfiltered(rows: Image, channels: int, path: str) -> Image:
     above = np.zeros((width, channels), dtype=np.uint8)
     for start in range(0, height, _BAND):
         band = slice(start, start + _BAND)
-        if (kinds[band] > 2).any():
-            image[band] = _by_diagonals(kinds[band], lines[band], above)
-        else:
-            _by_rows(kinds[band], lines[band], above, image[band])
+        image[band] = _by_diagonals(kinds[band], lines[band], above) if kinds[band].any() else lines[band]
         above = image[band][-1]
     return image
 
@@ -125,15 +112,8 @@ _BAND = 1024
 """Rows decoded together, so that they stay in the processor's cache."""
 
 
-def _by_rows(kinds: Image, lines: Image, above: Image, out: Image) -> None:
-    """Undo filters that need no pixel of the same row but as a sum: none, left and up."""
-    for row, kind in enumerate(kinds.tolist()):
-        line = lines[row]
-        out[row] = above = np.cumsum(line, axis=0, dtype=np.uint8) if kind == 1 else line + above if kind == 2 else line
-
-
 def _by_diagonals(kinds: Image, lines: Image, above: Image) -> Image:
-    """Undo all filters of a band of rows.
+    """Undo the filters of a band of rows.
 
     A pixel needs its left, upper and upper left neighbours, so that all pixels of an anti-diagonal, row + column = d, can
     be decoded at once. In a flat array of rows of P pixels these lie P - 1 apart.

@@ -17,6 +17,7 @@ the true poses as vertices: see `from_odometry`.
 import os
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +29,9 @@ from .graph_file import (
     ENDS,
     GraphFile,
     Measured,
-    assembled,
+    Vertices,
     check_lines,
     check_planar,
-    given_places,
     measurements,
     plain_edges,
     rows_of,
@@ -65,12 +65,9 @@ _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
     """Read a planar PyFG graph, plain or gzip; ``-`` = standard input.
 
-    Chains of several robots may be tied by nothing but ranges, between their poses or to landmarks.
-
     Parameters
     ----------
-    from_odometry : forget where the vertices are and start from the edges between successive poses; landmarks that only
-        ranges measure then have no position (nan).
+    from_odometry : forget where the vertices are and start from the edges between successive poses.
 
     Raises
     ------
@@ -111,12 +108,11 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
         inverse, least = _inverted(measured.information)
         check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
         plain[kind] = measured._replace(information=inverse)
-    poses = given_places(vertices, pose_of, len(pose_ids), content)
-    anchors = given_places(landmarks, landmark_of, len(landmark_ids), content)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
-    return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content, from_odometry)
+    named = Vertices(pose_ids, pose_of, vertices), Vertices(landmark_ids, landmark_of, landmarks)
+    return GraphFile.of(content, plain, named, stamps, from_odometry)
 
 
 def write_pyfg(
@@ -130,8 +126,7 @@ def write_pyfg(
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
-    Calibration and lever arms are worked in at the present estimate (see plain_edges); robust kernels
-    are not written. The vertices hold the estimate.
+    For what is written see plain_edges. The vertices hold the estimate.
 
     Parameters
     ----------
@@ -212,5 +207,5 @@ def _kinds_of_ranges(ranged: Records, pose_of: Ints, landmark_of: Ints) -> tuple
     names[swapped] = names[swapped, ::-1]
     first, second = pose_of[names[:, 0]] >= 0, pose_of[names[:, 1]] >= 0
     kinds = (first & ~second, first & second, ~first)
-    mixed, meetings, surveys = (Records(ranged.lines[k], ranged.stamps[k], names[k], ranged.numbers[k]) for k in kinds)
+    mixed, meetings, surveys = (replace(ranged, names=names).rows(kind) for kind in kinds)
     return mixed, meetings, surveys

@@ -1,9 +1,7 @@
 """What readers of recordings share: ranges by the names of anchors, scans brought to one geometry, a reach that is not stated.
 
-Cheap spinning lidars send 672 to 682 readings a turn, as their motor runs; logs of others mix 180 and 181 beams. Some of these
-interlace: scans of one beam fewer lie between the beams of the others, in turn with them. A log gives the number of readings
-alone. Whether the shorter scans begin half a beam later is shown by the scans themselves: on surfaces that change with the
-angle, readings of following scans agree at one of the two offsets.
+Cheap spinning lidars send 672 to 682 readings a turn, as their motor runs; logs of others mix 180 and 181 beams, of which some
+interlace: scans of one beam fewer lie between the beams of the others, in turn with them.
 """
 
 from collections.abc import Sequence
@@ -33,6 +31,8 @@ def ranges_of(
     return UwbRanges(stamps[order], rank[order], metres[order], quality[order], ids, None if tag is None else tag[order])
 
 
+MOST_TAGS = 9
+"""Tags on one robot that a recording keeps apart: UWB, UWB2 ... UWB9."""
 _SAME_VIEW = 0.03
 """Share of the field of view by which geometries of one lidar differ at most."""
 _STEEPEST = 4.0
@@ -148,8 +148,7 @@ def beams_lie_between(longer: NDArray[np.floating], shorter: NDArray[np.floating
     """Return whether the beams of shorter scans (n, b) lie in the middle between those of longer ones (m, b + 1).
 
     An offset of s beams makes r(k + s) - r(k) = s dr/dk. Least squares would take noise for an offset of a half, so dr/dk is
-    taken once from the two readings and once from those beside them (an instrumental variable). A robot that turns shifts the
-    scans before and after in opposite senses.
+    taken once from the two readings and once from those beside them (an instrumental variable).
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, Table, concatenated
 from ..errors import FormatError
 from .source import OVERLONG_LINE, TextSource, number_table
 
@@ -33,7 +33,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Records:
+class Records(Table):
     """All lines of one tag."""
 
     lines: Ints
@@ -91,7 +91,7 @@ def read_records(source: TextSource, layouts: Mapping[str, Layout]) -> RecordFil
         for tag, lines in rows.items():
             parts[tag].append(_table(lines, known[tag], names, result))
     result.names = list(names)
-    result.records = {tag.decode(): _joined(lines, known[tag]) for tag, lines in parts.items()}
+    result.records = {tag.decode(): concatenated(lines or [_nothing(known[tag])]) for tag, lines in parts.items()}
     return result
 
 
@@ -128,9 +128,6 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
     )
 
 
-def _joined(parts: list[Records], layout: Layout) -> Records:
-    if not parts:
-        none = np.zeros(0, dtype=np.intp)
-        return Records(none, np.zeros(0), none.reshape(0, layout.names), np.zeros((0, layout.numbers)))
-    columns = [(p.lines, p.stamps, p.names, p.numbers) for p in parts]
-    return Records(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+def _nothing(layout: Layout) -> Records:
+    none = np.zeros(0, dtype=np.intp)
+    return Records(none, np.zeros(0), none.reshape(0, layout.names), np.zeros((0, layout.numbers)))

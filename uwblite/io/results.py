@@ -1,7 +1,6 @@
 """The folder that `uwblite map` writes, all of its files or none; docs/formats.md lists them.
 
-A result is replaced as a whole, see folders.py: a full disk or a crash leaves the previous one. report.json holds the
-hash of every other file.
+A result is replaced as a whole, see folders.py. report.json holds the hash of every other file.
 """
 
 import hashlib
@@ -13,12 +12,12 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ConfigError
 from ..map_result import MapResult
+from ..report.drawn_map import drawn_map
 from ..report.html import Heading, render
-from ..report.picture import Overlay, PictureAnchor, draw_map
+from ..report.picture import draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
 from .files import sha256_of, write_text
@@ -60,14 +59,7 @@ def repair_result(folder: str | os.PathLike[str]) -> None:
 
 
 def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
-    """Refuse a folder that cannot or must not be written, before the work is done.
-
-    Raises
-    ------
-    ConfigError : it holds a result and force is not given, it is not a folder, a folder in it has the name of a file, or a
-        file of such a name is no part of a result, or was changed since.
-    OSError : it cannot be written.
-    """
+    """Refuse a folder that cannot be written (OSError), or that holds a result or files that must stay (ConfigError)."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is not a folder; choose another `folder`")
@@ -93,7 +85,7 @@ def _is_written(folder: Path, name: str) -> bool:
 
 
 def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> list[str]:
-    """Write a result into a folder, made where it is missing; files of an earlier result are replaced.
+    """Write a result into a folder, made where it is missing, in place of an earlier one, untouched where an error is raised.
 
     Parameters
     ----------
@@ -102,10 +94,6 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     Returns
     -------
     Names of the files, in the order in which a user wants to see them.
-
-    Raises
-    ------
-    ConfigError, OSError : as for `check_target`, or the disk is full; an earlier result is untouched.
     """
     check_target(folder, force=True)
     with replacing_folder(folder, is_of_result) as waiting:
@@ -124,7 +112,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
             grid_png = encode_png(trinary_image(result.grid))
             if record.scale_map:
                 write_map(waiting, result.grid, name="map_scale", mode="scale")
-        write_png(waiting / "map.png", picture(result, _caption(logs, result)))
+        write_png(waiting / "map.png", draw_map(drawn_map(result), caption=_caption(logs, result)))
         ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
         write_g2o(waiting / "graph.g2o", result.graph, plain=plain)
         write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
@@ -154,15 +142,6 @@ def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
     driven = f"{sums['travelled']:.0f} m in {duration(sums['duration'])}"
     counts = f"{driven}, {len(result.anchors)} anchors, {kept} closures"
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
-
-
-def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
-    """Return the picture of the map with path, anchors and accepted closures."""
-    parts = [np.vstack([result.trajectory[result.recording == s, :2], [[np.nan, np.nan]]]) for s in np.unique(result.recording)]
-    places = result.graph.poses[:, :2]
-    closures = np.array([(*places[c.i], *places[c.j]) for c in result.closures if c.accepted]).reshape(-1, 4)
-    anchors, doubted = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors], result.doubted_paths()
-    return draw_map(result.grid, np.vstack(parts), Overlay(anchors, closures, doubted), caption=caption)
 
 
 def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:

@@ -17,11 +17,11 @@ from ..grid.occupancy_grid import UNKNOWN, OccupancyGrid
 from ..report import canvas
 from ..report.canvas import share
 from ..sensor_log import SensorLog
-from . import ros_messages as ros
+from . import rosbag_writer as ros
 from .files import write_text
 from .folders import refuse_foreign, replacing_folder, unmarked
 from .map_server import write_map
-from .rosbag_writer import TF, Stamped, recording_messages, write_messages
+from .rosbag_writer import TF, Stamped, recording_messages, transforms, write_messages
 from .stored_result import StoredAnchor, StoredResult
 
 _MOST_POSES = 10_000
@@ -42,9 +42,7 @@ def write_result_bag(
 
     Parameters
     ----------
-    path : file (.mcap) or folder to make.
     logs : its recordings in their order, or none; frames and topics of the second begin with ``recording_2/``.
-    storage : 'mcap' or 'sqlite3'.
 
     Raises
     ------
@@ -83,16 +81,11 @@ def _messages(result: StoredResult, logs: Sequence[SensorLog]) -> Iterator[Stamp
             # T_map_odom = T_map_base T_odom_base^-1 at every reading of the wheels.
             stamps = log.odometry.stamps
             poses = se2.compose(result.pose_at(number, stamps), se2.inverse(log.odometry.poses))
-            moving += [recording_messages(log, prefix=prefix), _transforms(ros.MAP, prefix + ros.ODOM, stamps, poses)]
+            moving += [recording_messages(log, prefix=prefix), transforms(ros.MAP, prefix + ros.ODOM, stamps, poses)]
         else:
             yield first, "/tf_static", TF, ros.tf(first, ros.MAP, prefix + ros.ODOM, np.zeros(3))
-            moving.append(_transforms(prefix + ros.ODOM, prefix + ros.BASE, stamps, poses))
+            moving.append(transforms(prefix + ros.ODOM, prefix + ros.BASE, stamps, poses))
     yield from heapq.merge(*moving, key=lambda message: message[0])
-
-
-def _transforms(parent: str, child: str, stamps: Floats, poses: Floats) -> Iterator[Stamped]:
-    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
-        yield stamp, "/tf", TF, ros.tf(stamp, parent, child, pose)
 
 
 def _poses(result: StoredResult) -> Iterator[Stamped]:

@@ -1,8 +1,7 @@
-"""ROS bags to recordings and back, with the package `rosbags` (the extra ``uwblite[bag]``); no ROS is needed.
+"""ROS bags to recordings, with the package `rosbags` (the extra ``uwblite[bag]``); no ROS is needed.
 
-Reads ROS 1 bags and ROS 2 bags in sqlite3 or MCAP. Wheel odometry comes from nav_msgs/Odometry, scans from
-sensor_msgs/LaserScan, headings from sensor_msgs/Imu, ranges by a mapping (see uwb_mapping), mountings from tf. Times are
-those of the headers.
+Odometry comes from nav_msgs/Odometry, scans from sensor_msgs/LaserScan, headings from sensor_msgs/Imu, ranges by a mapping (see
+uwb_mapping), mountings from tf. Times are those of the headers.
 """
 
 import os
@@ -35,16 +34,11 @@ def plan_bag(
 
 
 def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()) -> SensorLog:
-    """Read a bag; of one whose recording was not closed, what is complete.
+    """Read a bag (see open_bag); of one whose recording was not closed, what is complete.
 
     Parameters
     ----------
-    path : a file of any name, or the folder of a ROS 2 bag, with or without its metadata.yaml.
     mappings : how ranges stand in messages; the known ones are tried after these.
-
-    Returns
-    -------
-    SensorLog in time order; stamps are seconds since the epoch, as in the headers.
 
     Raises
     ------
@@ -106,12 +100,7 @@ class Collector:
         return not self.plan.odometry or self.plan.odometry in self.plan.tf
 
     def log(self, path: str, sha256: str, held: tuple[BagTopic, ...] = (), notes: Sequence[str] = ()) -> SensorLog:
-        """Return the collected messages as a recording.
-
-        Parameters
-        ----------
-        held : topics of the bag. notes : what is odd about the bag itself.
-        """
+        """Return the collected messages as a recording; held : topics of the bag. notes : what is odd about the bag itself."""
         warnings = [*notes, *self._warnings()]
         odometry = self._odometry(path, held, warnings)
         mounting, laser, places = SensorMounting(), None, np.zeros((1, 3))

@@ -46,7 +46,7 @@ _OTHER_FORMATS = (
 
 
 class _HashingReader(io.RawIOBase):
-    """Pass bytes on and hash them on the way."""
+    """Pass bytes on, hashed."""
 
     def __init__(self, stream: BinaryIO, digest: "hashlib._Hash | None" = None) -> None:
         self._stream = stream
@@ -85,11 +85,7 @@ class TextSource:
         return self._hashing.hash.hexdigest()
 
     def blocks(self, size: int = BLOCK_BYTES) -> Iterator[bytes]:
-        """Yield the text in blocks of whole lines, each block ending with a newline.
-
-        A last line without newline gets one. Lines longer than MAX_LINE_BYTES are replaced by OVERLONG_LINE, so that
-        line numbers stay true and memory stays bounded.
-        """
+        """Yield the text in blocks of whole lines, each ending with a newline; OVERLONG_LINE stands for too long ones."""
         carry, overlong, first, unpacked = b"", False, True, 0
         while data := self._text.read(size):
             unpacked += len(data)
@@ -132,15 +128,11 @@ class TextSource:
 
 @contextmanager
 def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = None) -> Iterator[TextSource]:
-    """Open a text file, gzip or not (by its content), or standard input for ``-``.
+    """Open a text file, gzip or not (by its content), or standard input for ``-``; raise FormatError where it cannot be read.
 
     Parameters
     ----------
     digest : takes the bytes as stored, where several files are hashed together.
-
-    Raises
-    ------
-    FormatError : the file cannot be read: missing, a directory, damaged or cut-off gzip, or binary.
     """
     name = os.fspath(path)
     stream = open_input(name)
@@ -158,12 +150,7 @@ def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = N
 
 
 def open_input(name: str) -> BinaryIO:
-    """Open a file, a pipe or standard input (``-``) for reading.
-
-    Raises
-    ------
-    FormatError : it is missing, a directory, closed, or a named pipe into which nobody writes.
-    """
+    """Open a file, a pipe or standard input (``-``) for reading; raise FormatError where nothing can be read."""
     if name == "-":
         if sys.stdin is None or getattr(sys.stdin, "closed", False):
             raise FormatError("standard input is closed; name a file, or send one through a pipe", "stdin")
@@ -187,12 +174,7 @@ def open_input(name: str) -> BinaryIO:
 
 
 def read_bounded(name: str, most: int) -> bytes:
-    """Return the bytes of a small file.
-
-    Raises
-    ------
-    FormatError : it cannot be read, or holds more than `most` bytes.
-    """
+    """Return the bytes of a small file; raise FormatError where it cannot be read, or holds more than `most`."""
     with open_input(name) as stream:
         try:
             data = stream.read(most + 1)
@@ -205,12 +187,7 @@ def read_bounded(name: str, most: int) -> bytes:
 
 
 def finite(text: str | bytes, fault: str, path: str, line: int | None = None) -> float:
-    """Return the number that a text is.
-
-    Raises
-    ------
-    FormatError : with the words of `fault`, where it is none or not finite.
-    """
+    """Return the number that a text is; raise FormatError with the words of `fault` where it is none or not finite."""
     try:
         value = float(text)
     except ValueError:
@@ -221,12 +198,7 @@ def finite(text: str | bytes, fault: str, path: str, line: int | None = None) ->
 
 
 def number_table(rows: Sequence[tuple[int, Sequence[bytes]]], path: str) -> Floats:
-    """Return the words of rows, equally many in each behind its line, as finite numbers (n, words).
-
-    Raises
-    ------
-    FormatError : with the line, where a word is no number, or not finite, or beyond what can be squared.
-    """
+    """Return the words of rows, equally many in each behind its line, as finite numbers (n, words) that can be squared."""
     try:
         table = np.array([words for _, words in rows], dtype=np.float64).reshape(len(rows), -1)
     except ValueError:
@@ -245,12 +217,7 @@ _LARGEST_SETTINGS = 1 << 20
 
 
 def read_settings(name: str) -> str:
-    """Return the text of a small file that a user writes: settings, mappings, constraints.
-
-    Raises
-    ------
-    FormatError : it cannot be read, is too large or no text.
-    """
+    """Return the text of a small file that a user writes: settings, mappings, constraints."""
     try:
         return read_bounded(name, _LARGEST_SETTINGS).decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -11,13 +11,7 @@ from .source import number_table, open_source
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> None:
-    """Write planar poses; the previous file stays whole until the new one is complete.
-
-    Parameters
-    ----------
-    stamps : (n,) s, written to the microsecond.
-    poses : (n, 3) x, y, theta; m, rad; written to the micrometre and 1e-9 of the quaternion.
-    """
+    """Write stamps (n,), s, and planar poses (n, 3), m, m, rad, to the microsecond, micrometre and 1e-9 of quaternions."""
     half = 0.5 * poses[:, 2]
     # + 0.0 turns a negative zero into zero, so that equal poses look equal.
     columns = (stamps, poses[:, 0] + 0.0, poses[:, 1] + 0.0, np.sin(half) + 0.0, np.cos(half))
@@ -41,20 +35,11 @@ def write_trajectory(path: str | os.PathLike[str], kind: str, stamps: Floats, po
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
-    """Read a TUM trajectory; roll, pitch and height are dropped.
-
-    Parameters
-    ----------
-    path : the file, plain or gzip; ``-`` = standard input. Blank lines and lines beginning with ``#`` are skipped.
+    """Read a TUM trajectory, plain or gzip; ``-`` = standard input; roll, pitch and height are dropped.
 
     Returns
     -------
-    stamps : (n,) s, in the order of the file.
-    poses : (n, 3) x, y and yaw; m, rad.
-
-    Raises
-    ------
-    FormatError : a line has not eight finite numbers, or there is no pose.
+    stamps : (n,) s, in the order of the file. poses : (n, 3) x, y and yaw; m, rad.
     """
     table = read_rows(path, "timestamp tx ty tz qx qy qz qw", "poses")
     qx, qy, qz, qw = table[:, 4:].T
@@ -65,22 +50,13 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
 
 
 def read_rows(path: str | os.PathLike[str], columns: str, what: str) -> Floats:
-    """Return the rows (n, 8), n >= 1, of a table of eight finite numbers a line.
-
-    Parameters
-    ----------
-    columns : their names. what : the rows hold, for messages.
-
-    Raises
-    ------
-    FormatError : a line has not eight finite numbers, or there is none.
-    """
-    parts = []
+    """Return the rows (n, 8), n >= 1, of a table of eight finite numbers a line; columns, what : of its rows, for messages."""
+    parts, count = [], len(columns.split())
     with open_source(path) as source:
         for rows in filter(None, source.rows()):
             for number, words in rows:
-                if len(words) != 8:
-                    raise FormatError(f"{len(words)} columns, expected 8: {columns}", source.path, number)
+                if len(words) != count:
+                    raise FormatError(f"{len(words)} columns, expected {count}: {columns}", source.path, number)
             parts.append(number_table(rows, source.path))
         if not parts:
             raise FormatError(f"no {what} in it", source.path)
@@ -90,17 +66,9 @@ def read_rows(path: str | os.PathLike[str], columns: str, what: str) -> Floats:
 def read_relations(path: str | os.PathLike[str]) -> tuple[Floats, Floats, Floats]:
     """Read relations between scans, as the SLAM benchmark of Kuemmerle et al. has them; height, roll and pitch are dropped.
 
-    Parameters
-    ----------
-    path : the file, plain or gzip; ``-`` = standard input. Blank lines and lines beginning with ``#`` are skipped.
-
     Returns
     -------
     stamp1, stamp2 : (r,) s. T_1_2 : (r, 3) pose of the second scan as seen from the first; m, m, rad.
-
-    Raises
-    ------
-    FormatError : a line has not eight finite numbers, or there is no relation.
     """
     table = read_rows(path, "stamp1 stamp2 x y z roll pitch yaw", "relations")
     return table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]].copy()

@@ -1,8 +1,6 @@
 """Places of UWB ranges in ROS messages: there is no standard, so a table lists where to look.
 
-As TOML, one ``[[uwb]]`` table per kind of message with the fields of `UwbMapping` (docs/formats.md); the first that fits
-counts. Those of published kinds were written from the definitions that docs/formats.md names; a test makes bags from these.
-A kind whose fields were renamed has a line for each form.
+As TOML, an ``[[uwb]]`` table per kind of message with the fields of `UwbMapping` (docs/formats.md); the first that fits counts.
 """
 
 import math
@@ -70,14 +68,7 @@ class UwbMapping:
         return fnmatchcase(topic, self.topic) and fnmatchcase(short_type(message_type), short_type(self.type))
 
     def extract(self, message: Any, topic: str) -> list[Reading]:
-        """Return every reading in a message.
-
-        An array with a place for each anchor holds zeros or nan where an anchor was out of reach: these are no readings.
-
-        Raises
-        ------
-        MissingField : the message has no such field.
-        """
+        """Return every reading in a message, or raise MissingField; 0 or nan in an array for all anchors is none."""
         readings = _field(message, self.readings, self) if self.readings else [message]
         extracted = []
         for reading in readings:
@@ -147,15 +138,7 @@ def short_type(name: str) -> str:
 
 
 def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> list[Reading]:
-    """Return the readings of a message by the first mapping that finds some.
-
-    Mappings with the same patterns describe forms of one kind of message: fields that were renamed between releases, or
-    directions that are distinguished by `only`.
-
-    Raises
-    ------
-    MissingField : no mapping finds its fields.
-    """
+    """Return the readings of a message by the first mapping that finds some; raise MissingField where none finds its fields."""
     missing: MissingField | None = None
     understood = False
     for mapping in mappings:

@@ -17,7 +17,7 @@ from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
-from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
+from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy, pairs_of
@@ -175,9 +175,9 @@ def follow(
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
-    learnt, miss = with_uncounted_ways(noise, edges, graph), _miss(clouds, noise)
+    miss = _miss(clouds, noise)
     return ScanOdometry(
-        edges, learnt, with_slips(learnt, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
+        edges, noise, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
         _moving(objects, i, mode, choice.covariance), rejected,
     )
 

@@ -7,41 +7,36 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, concatenated
-from . import hypotheses, range_likelihood, search, verdict
+from . import hypotheses, range_model, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
+from .range_model import Ranges
 from .sensing import TRACK_RAYS
-from .walls import PER_FACTOR, PER_RAY, Rays, Walls
-from .window import Ranges, Window
+from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Rays
+from .window import Window
 
-INDEPENDENT_RAYS = 15.0
-"""Rays per metre of driving that count as independent when places are compared."""
-LOOK_BACK = 4.0
-"""m driven; places are compared by the scans of this distance."""
-_SEARCH_LOOKS = 2.5
-"""m driven; the search makes one cloud of the scans of this distance."""
+LOOK_BACK, _SEARCH_LOOKS = 4.0, 2.5
+"""m driven; places are compared by the scans of the first distance, and the search makes one cloud of those of the second."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
-_WORK = search.UNIT
-"""Operations of a step from which on it begins no further unit of work."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; limit of the area of the robot in a map without a grid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Places in the map, and how well each explains the measurements."""
+    """Places in the map, and how well each (h,) explains the measurements."""
 
     bank: Hypotheses
     """The present hypotheses first."""
     complete: bool
     """No equally good place was left out."""
     weight: Floats
-    """(h,) log-likelihood."""
+    """Log-likelihood."""
     fit: Floats
-    """(h,) mean log-likelihood of the rays that do not end in unknown space."""
+    """Mean log-likelihood of the rays that do not end in unknown space."""
     known: Floats
-    """(h,) rays' ends in known space."""
+    """Rays' ends in known space."""
     rays: Rays
     """Of the last metres, in the present frame of the base."""
     looks: int
@@ -68,12 +63,14 @@ class PlaceSearch:
     """
 
     def __init__(self, known: KnownMap) -> None:
-        self.walls, self._biases, self._errors = known.walls, known.anchors.bias_sigma, known.anchors.errors
-        self._field = None if known.walls is None else search.field_of(known.walls)
-        self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
-        self._odom = np.zeros(3)
-        self._present = np.zeros((0, 3))
-        """(h, 3) poses of the present hypotheses, as of that time."""
+        self.walls, self._anchors, places = known.walls, known.anchors, known.anchors.positions
+        if self.walls is None:
+            self._field, self._bounds = None, (places.min(axis=0) - _RADIO_REACH, places.max(axis=0) + _RADIO_REACH)
+        else:
+            self._field, self._bounds = search.field_of(self.walls), (self.walls.geometry.origin, self.walls.geometry.corner)
+        self._odom = np.zeros(0)
+        self._present = np.zeros((0, 0))
+        """(h, 3) poses of the present hypotheses, as of the search's beginning."""
         self._steps: Generator[int, None, Comparison] | None = None
 
     @property
@@ -109,7 +106,7 @@ class PlaceSearch:
         done = 0
         self._present = se2.compose(bank.poses, se2.between(odom, self._odom))
         try:
-            while done < _WORK:
+            while done < search.UNIT:
                 done += next(self._steps)
         except StopIteration as end:
             self._steps = None
@@ -136,22 +133,21 @@ class PlaceSearch:
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        fit, judged, known = np.zeros((3, len(poses)))
+        weight, fit, known = np.zeros(len(poses)), np.zeros(len(poses)), np.zeros(len(poses))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for part in search.units(len(poses), PER_RAY * len(rays.hit)):
                 agreement = self.walls.agreement(poses[part], rays)
-                fit[part], judged[part], known[part] = agreement.log_likelihood, agreement.fit, agreement.known
+                weight[part], fit[part], known[part] = independent * agreement.log_likelihood, agreement.fit, agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
-        weight = independent * fit
-        for part in search.units(len(poses), (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(ranges)):
-            expected = range_likelihood.expected_errors(poses[part], ranges, self._errors) if self._errors else None
-            weight[part] += range_likelihood.range_likelihood(poses[part], ranges, expected=expected)
-            yield (range_likelihood.PER_RANGE + range_likelihood.PER_EXPECTED) * len(poses[part]) * len(ranges)
+        errors, each = self._anchors.errors, (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(ranges)
+        for part in search.units(len(poses), each):
+            expected = range_model.expected_errors(poses[part], ranges, errors) if errors else None
+            weight[part] += range_model.range_likelihood(poses[part], ranges, expected=expected)
+            yield each * len(poses[part])
         new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
         places = started.rows(new[before:])
-        parts_of = (weight[new], judged[new], known[new], rays, looks, ranges, independent)
-        return Comparison(places, found.complete, *parts_of)
+        return Comparison(places, found.complete, weight[new], fit[new], known[new], rays, looks, ranges, independent)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:
         """Return a comparison in the present frame of the robot, with the present hypotheses as they are now first."""
@@ -163,31 +159,15 @@ class PlaceSearch:
 
     def _started(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return hypotheses at poses (c, 3) that a search found."""
-        few = rays.spread(TRACK_RAYS)
+        few, anchors = rays.spread(TRACK_RAYS), self._anchors
         walls = self.walls if few.hit.sum() >= verdict.FEW_BESIDE else None
-        if walls is not None:
-            poses = _refined(walls, poses, ranges, few)
-        hessian, _ = range_likelihood.range_factors(poses, ranges)
-        covariances = np.linalg.inv(hessian + range_likelihood.POOR) + np.diag(np.square(_SIGMA_FLOOR))
-        effect = range_likelihood.bias_effect(poses, ranges, len(self._biases))
-        fresh = hypotheses.started(poses, covariances, self._biases, self._slow)
+        poses = hypotheses.refined(poses, ranges, walls, few)
+        hessian, _ = range_model.range_factors(poses, ranges)
+        covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
+        effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma)
         fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
-
-
-def _refined(walls: Walls, poses: Floats, ranges: Ranges, rays: Rays) -> Floats:
-    """Return poses (c, 3) moved to where scans and ranges together agree best nearby.
-
-    Along a wall scans measure nothing, and the ranges alone say where the robot is: all poses along it become one place.
-    """
-    poses = poses.copy()
-    for gate, width in hypotheses.GATES:
-        information, gradient = range_likelihood.range_factors(poses, ranges)
-        seen, slope = hypotheses.scan_factors(walls, poses, rays, gate, width)
-        total = information + seen + range_likelihood.POOR
-        poses -= np.linalg.solve(total, (gradient + slope)[:, :, None])[:, :, 0]
-    poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    return poses
 
 
 def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
@@ -199,10 +179,3 @@ def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
     better = weight[before:] > weight[:before, None] + verdict.CERTAIN
     new = (hypotheses.apart(poses[:before, None], poses[before:]) | better).all(axis=0)
     return np.concatenate([np.ones(before, bool), new])
-
-
-def _bounds(known: KnownMap) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of the area in which the robot may be, m."""
-    if known.walls is not None:
-        return known.walls.geometry.origin, known.walls.geometry.corner
-    return known.anchors.positions.min(axis=0) - _RADIO_REACH, known.anchors.positions.max(axis=0) + _RADIO_REACH

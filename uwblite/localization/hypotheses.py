@@ -14,44 +14,52 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..lidar.degeneracy import measured_part
-from ..radio.range_errors import HARMONICS, PATTERN_SIGMA
-from .walls import Rays, Walls
+from ..odometry.wheels import OdometryNoiseConfig
+from ..radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
+from .range_model import ANYWHERE, POOR, RangeFacts, Ranges, mixture, range_factors
+from .walls import REACH, Rays, Walls
 
-POSE, WHEELS = slice(0, 3), slice(3, 6)
-"""Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
-PATTERN = slice(6, 6 + 2 * HARMONICS)
-"""Of the state: m, range error as a function of the anchor's direction in the robot's frame (range_errors.pattern_waves): the
-tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
-LASER = PATTERN.stop
-"""Of the state: rad, heading of the laser on the base against the mounting that the map's robot showed."""
-FIRST_ANCHOR = LASER + 1
-"""Of the state: m, of each anchor the range error that fades, and behind all of these, the one that stays."""
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 LASER_SIGMA = 0.02
-"""rad, its prior standard deviation: screws some centimetres apart, each within a millimetre. A map may be another robot's."""
+"""rad, of the laser's heading: screws some centimetres apart, each within a millimetre. A map may be another robot's."""
 SLOW_SIGMA = 0.12
-"""m; common error of ranges to one anchor, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
+"""m; common error of ranges to one anchor: multipath, antennas, the anchor's place."""
 SLOW_LEFT = 0.08
 """m; the same where the map contains the range error at a place: the error that remains after correction by a few ranges
 nearby."""
 BIAS_SIGMA = 0.1
 """m; error of all ranges to one anchor that stays, as CalibrationConfig.range_bias_sound: another tag has another delay."""
 SLOW_LENGTH = 5.0
-"""m; its correlation length: fields of a room's size last longer than the 1.5 m of single reflections."""
-_DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
-"""Random errors of the wheels after one metre (m and rad) and one radian (rad), as in OdometryNoiseConfig, where the heading
-per metre is what a recording begins with before it is learnt; here nothing is learnt."""
+"""m; correlation length of the slow error: fields of a room's size last longer than the 1.5 m of single reflections."""
+_WHEELS = OdometryNoiseConfig(heading_per_metre=0.02)
+"""Random errors of the wheels; the heading per metre, which a recording learns, is what it begins with."""
 _STANDING = 2e-4
 """m and rad, of every step."""
 WALL_SIGMA = 0.03
 """m; standard deviation of a point about its wall: half a cell of 0.05 m and the lidar's noise at 3 m."""
 INDEPENDENT = 20.0
 """Points of a scan whose errors are independent: those of one wall share the cells' rounding."""
-GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
-"""m; gate and kernel width of each iteration of a scan's match."""
-MATCHES = len(GATES)
-"""Iterations."""
+MATCHES = 4
+"""Iterations of a match."""
+WIDTHS = np.geomspace(0.3, 0.1, MATCHES)
+"""m; kernel width of each."""
+SAME = (0.5, 0.3)
+"""m and rad; hypotheses that are closer are one."""
+_UNUSED = 1e-3
+"""Weight up to which a range moves nothing."""
+
+POSE = slice(0, len(POOR))
+"""Of the state: x, y, theta."""
+WHEELS = slice(POSE.stop, POSE.stop + len(WHEEL_SIGMA))
+"""Relative error of distance, of turned angle, and heading per metre, rad/m."""
+PATTERN = slice(WHEELS.stop, WHEELS.stop + 2 * HARMONICS)
+"""m, range error as a function of the anchor's direction in the robot's frame (range_errors.pattern_waves): the tag's
+radiation pattern and the shadow of the robot's own body, the same for all anchors."""
+LASER = PATTERN.stop
+"""rad, heading of the laser on the base against the mounting that the map's robot showed."""
+FIRST_ANCHOR = LASER + 1
+"""m, of each anchor the range error that fades, and behind all of these, the one that stays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,12 +87,6 @@ class Hypotheses(Table):
         return self.covariance[:, POSE, POSE]
 
 
-def none(anchors: int) -> Hypotheses:
-    """Return no hypothesis."""
-    n = FIRST_ANCHOR + 2 * anchors
-    return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
-
-
 def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA) -> Hypotheses:
     """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and prior values of the other unknowns.
 
@@ -92,13 +94,12 @@ def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SL
     ----------
     biases : (a,) standard deviations of each anchor's range error that stays, m. slow : of the one that fades, m.
     """
-    empty = none(len(biases))
-    n = empty.mean.shape[1]
+    n = FIRST_ANCHOR + 2 * len(biases)
     mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
-    mean[:, POSE] = poses
-    covariance[:, POSE, POSE] = covariances
-    pattern, fading = np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(len(biases), slow)
-    covariance[:, np.arange(3, n), np.arange(3, n)] = np.square([*WHEEL_SIGMA, *pattern, LASER_SIGMA, *fading, *biases])
+    mean[:, POSE], covariance[:, POSE, POSE] = poses, covariances
+    prior = [*WHEEL_SIGMA, *np.full(2 * HARMONICS, PATTERN_SIGMA), LASER_SIGMA, *np.full(len(biases), slow), *biases]
+    rest = np.arange(WHEELS.start, n)
+    covariance[:, rest, rest] = np.square(prior)
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
 
@@ -122,14 +123,12 @@ def placed(bank: Hypotheses, which: Ints, poses: Floats, covariances: Floats, ef
 def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float = SLOW_SIGMA) -> Hypotheses:
     """Drive every hypothesis by one step of the odometry.
 
+    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance.
+
     Parameters
     ----------
     step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
         motion that the wheels did not measure. slow_sigma : standard deviation of the common error of ranges to one anchor, m.
-
-    Notes
-    -----
-    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance.
     """
     d, turn = step[:2], float(step[2])
     way = float(np.hypot(*d))
@@ -141,9 +140,8 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     f = np.broadcast_to(np.eye(n), (len(mean), n, n)).copy()
     across = np.stack([-shift[:, 1], shift[:, 0]], axis=1)
     f[:, :2, 2] = across
-    f[:, :2, 3] = along
-    f[:, :2, 4], f[:, :2, 5] = 0.5 * turn * across, 0.5 * way * across
-    f[:, 2, 4], f[:, 2, 5] = turn, way
+    f[:, :2, WHEELS] = np.stack([along, 0.5 * turn * across, 0.5 * way * across], axis=-1)
+    f[:, 2, WHEELS] = 0.0, turn, way
     fade = float(np.exp(-way / SLOW_LENGTH))
     slow = np.arange(FIRST_ANCHOR, (FIRST_ANCHOR + n) // 2)
     f[:, slow, slow] = fade
@@ -151,38 +149,54 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     mean[:, 2] = se2.wrap_angle(mean[:, 2] + (1.0 + g) * turn + m * way)
     mean[:, slow] *= fade
     noise = np.zeros(n)
-    noise[:2] = _STANDING**2 + _DISTANCE**2 * way + slack**2
-    noise[2] = _STANDING**2 + _HEADING_PER_METRE**2 * way + _HEADING_PER_TURN**2 * abs(turn) + slack**2
+    noise[:2] = _WHEELS.distance**2 * way
+    noise[2] = _WHEELS.heading_per_metre**2 * way + _WHEELS.heading_per_turn**2 * abs(turn)
+    noise[POSE] += _STANDING**2 + slack**2
     noise[slow] = slow_sigma**2 * (1.0 - fade**2)
     covariance = f @ bank.covariance @ f.transpose(0, 2, 1)
     covariance[:, np.arange(n), np.arange(n)] += noise
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
-def scan_factors(walls: Walls, poses: Floats, rays: Rays, gate: float, width: float) -> tuple[Floats, Floats]:
+def scan_factors(walls: Walls, poses: Floats, rays: Rays, width: float) -> tuple[Floats, Floats]:
     """Return the information (h, 3, 3) and gradient (h, 3) of a scan at poses (h, 3), of what it measures alone.
 
     Along an aisle H comes from the scatter of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would
     seem to measure a direction that none has measured.
     """
-    hessian, spurious, gradient, weight = walls.factors(poses, rays, gate, width)
+    hessian, spurious, gradient, weight = walls.factors(poses, rays, width)
     hessian, gradient = measured_part(hessian, spurious, gradient)
-    share = np.minimum(INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / WALL_SIGMA**2
+    share = np.minimum(INDEPENDENT / np.maximum(weight, 1.0), 1.0) / WALL_SIGMA**2
     return hessian * share[:, None, None], gradient * share[:, None]
+
+
+def refined(poses: Floats, ranges: Ranges, walls: Walls | None = None, rays: Rays | None = None) -> Floats:
+    """Return poses (c, 3) moved to where ranges, and scans where there are walls, together agree best nearby.
+
+    Along a wall scans measure nothing, and the ranges alone say where the robot is: all poses along it become one place.
+    """
+    poses = poses.copy()
+    for width in WIDTHS:
+        information, gradient = range_factors(poses, ranges)
+        if walls is not None and rays is not None:
+            seen, slope = scan_factors(walls, poses, rays, width)
+            information, gradient = information + seen, gradient + slope
+        step = np.linalg.solve(information + POOR, gradient[:, :, None])[:, :, 0]
+        poses -= step / np.maximum(np.abs(step).max(axis=1, keepdims=True) / REACH, 1.0)
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    return poses
 
 
 def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypotheses:
     """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
 
+    The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
+    information I and the scan's H and gradient, and transferred to the state by its covariance with it.
+
     Parameters
     ----------
     rays : in the present frame of the base. fresh : 0..1, how far the scan's error is independent of the one before: walls
         are seen with the same cells' rounding until the robot has moved.
-
-    Notes
-    -----
-    The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
-    information I and the scan's H and gradient, and transferred to the state by its covariance with it.
     """
     if not len(bank):
         return bank
@@ -192,10 +206,9 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     prior[:, 2] += cross[:, LASER]
     information = np.linalg.inv(prior)
     start = bank.poses + np.multiply.outer(bank.mean[:, LASER], (0.0, 0.0, 1.0))
-    away = np.zeros_like(start)
-    hessian = np.zeros_like(prior)
-    for gate, width in GATES:
-        hessian, gradient = (fresh * part for part in scan_factors(walls, start + away, rays, gate, width))
+    away, hessian = np.zeros_like(start), np.zeros_like(prior)
+    for width in WIDTHS:
+        hessian, gradient = (fresh * part for part in scan_factors(walls, start + away, rays, width))
         gradient += np.einsum("hij,hj->hi", information, away)
         away -= np.linalg.solve(information + hessian, gradient[:, :, None])[:, :, 0]
     posterior = np.linalg.inv(information + hessian)
@@ -206,28 +219,70 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
+def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) -> tuple[Hypotheses, Floats, Floats, Floats]:
+    """Correct every hypothesis by one range, with its errors by anchor (slow), by place in the map and by direction.
+
+    How the pattern and the place's error change with the pose is left out of the Jacobian: 0.1 m per radian, 0.05 m per metre.
+
+    Parameters
+    ----------
+    tag : (2,) place of the tag at the range's time in the present frame of the base, m. share : of an independent range's
+        information that it has, 0..1; the likelihood is that of the whole.
+
+    Returns
+    -------
+    The hypotheses, and for each the weight (h,), 0..1, that the range got, its log-likelihood (h,), 0 = the likeliest, and
+    that of a range from anywhere (h,).
+    """
+    theta = bank.mean[:, 2]
+    lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
+    offset = bank.mean[:, :2] + lever - fact.place
+    distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, WALL_SIGMA**2))
+    columns = fact.anchor + np.array([FIRST_ANCHOR, (FIRST_ANCHOR + bank.mean.shape[1]) // 2])
+    waves = pattern_waves(np.arctan2(-offset[:, 1], -offset[:, 0]) - theta)
+    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, columns].sum(axis=1)
+    if fact.errors is not None:
+        shift += fact.errors.at(offset + fact.place)
+    error = fact.range - (1.0 + fact.scale) * distance - shift
+    jacobian = np.zeros(bank.mean.shape)
+    jacobian[:, PATTERN] = waves
+    unit = (1.0 + fact.scale) * offset / distance[:, None]
+    jacobian[:, :2] = unit
+    jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]
+    jacobian[:, columns] = 1.0
+    spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
+    own = np.einsum("hi,hi->h", jacobian, spread)
+    sigma = np.sqrt(own + fact.sigma**2)
+    core, density = mixture(error, sigma)
+    weight = core / density
+    gain = spread / (own + fact.sigma**2 / (share * np.maximum(weight, _UNUSED)))[:, None]
+    gain *= (weight > _UNUSED)[:, None]
+    mean = bank.mean + gain * error[:, None]
+    mean[:, 2] = se2.wrap_angle(mean[:, 2])
+    covariance = symmetric(bank.covariance - gain[:, :, None] * spread[:, None, :])
+    anywhere = np.log(sigma * np.sqrt(2.0 * np.pi) / ANYWHERE)
+    return Hypotheses(mean, covariance, bank.log_weight), weight, np.log(density), anywhere
+
+
 def reweighted(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
     """Return the hypotheses with weights changed by a log-likelihood (h,), the best one's being 0 again."""
     weight = bank.log_weight + log_likelihood
     return replace(bank, log_weight=weight - weight.max(initial=-np.inf) if len(weight) else weight)
 
 
-def mixture(bank: Hypotheses, which: int) -> tuple[Floats, Floats]:
+def mixed(bank: Hypotheses, which: int) -> tuple[Floats, Floats]:
     """Return the probability (h,) of each hypothesis and the covariance (3, 3) of all poses about one of them."""
     share = np.exp(bank.log_weight)
     share /= share.sum()
-    off = se2.between(np.zeros(3), bank.poses - bank.poses[which])
+    off = bank.poses - bank.poses[which]
+    off[:, 2] = se2.wrap_angle(off[:, 2])
     return share, np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
 
 
 def apart(one: Floats, others: Floats) -> Bools:
     """Return which poses (..., 3) are another place than poses (..., 3): half a metre or 0.3 rad away."""
     off = np.abs(others - one)
-    return (np.hypot(off[..., 0], off[..., 1]) > _SAME[0]) | (np.abs(se2.wrap_angle(off[..., 2])) > _SAME[1])
-
-
-_SAME = (0.5, 0.3)
-"""m and rad; hypotheses that are closer are one."""
+    return (np.hypot(off[..., 0], off[..., 1]) > SAME[0]) | (np.abs(se2.wrap_angle(off[..., 2])) > SAME[1])
 
 
 def pruned(bank: Hypotheses, most: int, least: float) -> Hypotheses:

@@ -20,7 +20,7 @@ from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from .known_map import KnownMap
 from .pose_estimator import LocalizerState, PoseEstimator
-from .range_update import RangeFacts
+from .range_model import RangeFacts
 from .sensing import LEAD, Range, Scan, Scanner, Waiting, scan_rays
 
 _PATIENCE = 0.5

@@ -16,16 +16,18 @@ from ..arrays import Floats
 from ..config import documented
 from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
-from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
+from .comparison import LOOK_BACK, Comparison, PlaceSearch
+from .hypotheses import Hypotheses
 from .known_map import KnownMap
-from .range_likelihood import MOMENTS, bias_effect, range_moments
-from .range_update import RangeFacts, ranged, repeated
-from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
-from .walls import PER_FACTOR, PER_RAY, Rays
+from .range_model import MOMENTS, RangeFacts, bias_effect, range_moments, repeated
+from .running_fit import FIT_LOST, FIT_SOUND, SUPPORT, full_agreement
+from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 _FRESH_WAY = 0.1
 """m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion."""
+_STILL = 1e-3
+"""m; a robot that has driven less stands."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
 _UNFELT = 0.1
@@ -36,8 +38,6 @@ _UNIT_WAY = 1.0
 """m driven between two comparisons of the map's unit with the sensors'."""
 _PROVEN = 3
 """Comparisons of the unit that a tracked pose must have passed, two metres of driving, for the map to count as right."""
-_KNOWN = 0.5
-"""Share of a scan's ends that must lie in known space for it to move a pose that was found."""
 _MOST, _FORGET = 40, -14.0
 """Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
@@ -83,13 +83,16 @@ class PoseEstimator:
     """
 
     def __init__(self, known: KnownMap, odometer: Odometer) -> None:
+        anchors = known.anchors
         self.known = known
         self.ends = np.zeros(2)
         """Of rays on walls, and in known space, while the pose was known."""
         self.work = 0
         """Operations on elements of arrays since the caller last set it to 0."""
+        self.tracks = False
+        """Whether one place is tracked, however vague the pose has become."""
         self._odometer = odometer
-        self._bank = hypotheses.none(len(known.anchors.ids))
+        self._bank = hypotheses.started(np.zeros((0, 3)), np.zeros((0, 3, 3)), anchors.bias_sigma)
         self._places = PlaceSearch(known)
         self._searched = Window()
         """Measurements of the running search."""
@@ -99,25 +102,19 @@ class PoseEstimator:
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
-        self._range_way = np.full(len(known.anchors.ids), -np.inf)
+        self._range_way = np.full(len(anchors.ids), -np.inf)
         """(a,) m, odometer at the last range to each anchor."""
         self._search_stamp = -np.inf
-        self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
         """Odometer and T_map_odom at the first of the searches that agree."""
         self._compared = 0
         """Comparisons of the unit that the map has passed, one after the other."""
-        self._running = full_agreement(len(known.anchors.ids))
+        self._running = full_agreement(len(anchors.ids))
         self._reason = "nothing has been measured yet"
-
-    @property
-    def tracks(self) -> bool:
-        """Whether one place is tracked, however vague the pose has become."""
-        return self._certain
 
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
-        self._bank = hypotheses.moved(self._bank, step, 0.0, self.known.anchors.slow_sigma)
+        self._bank = self._moved(step, 0.0)
         self.work += 4 * self._bank.covariance.size * self._bank.mean.shape[1]
         self._way += way_of(step)
 
@@ -126,21 +123,20 @@ class PoseEstimator:
 
         Measurements before and after it cannot be combined.
         """
-        self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma, self.known.anchors.slow_sigma)
+        self._bank = self._moved(np.zeros(3), sigma)
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
     def use_range(self, fact: RangeFacts, tag: Floats, stamp: float, then: Floats) -> None:
         """Take a range of the tag at a place (2,) of the base, m, at a time, s, at which the odometry had a pose (3,)."""
         self._window.add_range(WindowRange(fact, then, tag, self._way, stamp))
-        self._window.forget(self._way)
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
         driven = self._way - self._range_way[fact.anchor]
         share = 1.0 / float(repeated((fact.white / fact.sigma) ** 2, fact.length, driven))
         self._range_way[fact.anchor] = self._way
-        bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm, share)
+        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm, share)
         self.work += 8 * bank.covariance.size
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
@@ -148,39 +144,33 @@ class PoseEstimator:
 
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
-        turned = rays.moved(self._laser_turn())
-        doubted_since = self._running.matched if self._certain and self._running.in_doubt() else -np.inf
-        if self._window.wants_look(self._way, self._odometer.stamp, doubted_since) and len(rays.hit):
-            self._window.add_look(WindowLook(turned.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
-        walls = self.known.walls
-        if not len(self._bank) or walls is None or not len(rays.hit):
+        odometer, walls, turned = self._odometer, self.known.walls, rays.moved(self._laser_turn())
+        if walls is None or not len(rays.hit):
+            return
+        some = turned.spread(RAYS)
+        doubted_since = self._running.matched if self.tracks and self._running.in_doubt() else -np.inf
+        if self._window.wants_look(self._way, odometer.stamp, doubted_since):
+            self._window.add_look(WindowLook(some, odometer.pose.copy(), self._way, odometer.stamp))
+        if not len(self._bank):
             return
         driven, self._scan_way = self._way - self._scan_way, self._way
-        least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
-        before = self._bank
-        fresh = float(np.clip(driven / _FRESH_WAY, least, 1.0))
-        self._bank = hypotheses.matched(before, walls, rays, fresh)
-        some = turned.spread(RAYS)
-        found = walls.agreement(self._bank.poses, some)
-        self.work += len(before) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
-        if self._certain and driven <= 1e-3:
+        before, least = self._bank, _LEAST_FRESH if driven > _STILL else _STANDING_FRESH
+        self._bank, found = self._matched(before, walls, rays, some, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
+        if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
-            slack = hypotheses.moved(self._bank, np.zeros(3), _UNFELT, self.known.anchors.slow_sigma)
-            pushed = hypotheses.matched(slack, walls, rays, 1.0)
-            there = walls.agreement(pushed.poses, some)
-            self.work += hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit)
+            pushed, there = self._matched(self._moved(np.zeros(3), _UNFELT), walls, rays, some, 1.0)
             if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
-        if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
+        if self.tracks and (found.fit[0] < FIT_LOST or found.known[0] < 0.5 * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
             self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
-        if self._certain:
+        if self.tracks:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
-        self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), self._odometer.stamp)
+        self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), odometer.stamp)
 
     def search_or_check(self, *, free: bool) -> None:
         """Look whether the pose still holds; do some units of a search that is under way, or begin one where it is time for it.
@@ -189,12 +179,12 @@ class PoseEstimator:
         ----------
         free : no scan was used in this step: there is time to search, and to compare units. Every scan brings a free step.
         """
-        if self._certain and (why := self._doubted(free)):
-            self._lose(why)
-        elif not self._certain and self._running.jumped():
-            self._lose("the ranges do not fit what was measured before; was the robot carried?")
+        if self.tracks and (why := self._doubted(free)):
+            self._lose(why, self._running.agreed())
+        elif not self.tracks and self._running.jumped():
+            self._lose("the ranges do not fit what was measured before; was the robot carried?", self._running.agreed())
         odom = self._odometer.pose
-        if not self._certain and len(self._window.ranges) > 2 * self._searched_ranges:
+        if not self.tracks and len(self._window.ranges) > 2 * self._searched_ranges:
             # The new ones leave far fewer places to compare: sooner done than what is under way.
             self._places.drop()
             self._search_stamp, self._parts = -np.inf, 1
@@ -203,14 +193,14 @@ class PoseEstimator:
             self.work += done
             if compared is None:
                 return
-            if not self._certain:
+            if not self.tracks:
                 self._decide_by(compared)
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
-        elif free and (not self._certain or self._running.in_doubt()) and self._due():
+        elif free and (not self.tracks or self._running.in_doubt()) and self._due():
             # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
             # wrong place by chance.
-            self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
+            self._searched = self._window.since(self._running.matched) if self.tracks else self._window.newest(self._parts)
             self._searched_ranges = len(self._window.ranges)
             self._places.begin(self._searched, odom, self._way)
 
@@ -220,16 +210,26 @@ class PoseEstimator:
         stamp, odometry = self._odometer.stamp, wheels.copy()
         far = tuple(self.known.anchors.ids[k] for k in running.moved_anchors())
         if not len(bank):
-            nan = np.full((4, 3), np.nan)
-            return LocalizerState(stamp, nan[0], nan[1:], 0.0, odometry, True, self._reason, moved_anchors=far)
+            nothing = np.full_like(wheels, np.nan)
+            unknown = np.full((len(wheels), len(wheels)), np.nan)
+            return LocalizerState(stamp, nothing, unknown, 0.0, odometry, True, self._reason, moved_anchors=far)
         order = np.argsort(-bank.log_weight, kind="stable")
         best = int(order[0])
-        share, covariance = hypotheses.mixture(bank, best)
-        fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / verdict.RANGES_FOUND
-        quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
+        share, covariance = hypotheses.mixed(bank, best)
+        fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / SUPPORT
+        quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self.tracks else 0.5)
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
-        reason = verdict.vague(covariance) if self._certain else self._reason
+        reason = verdict.vague(covariance) if self.tracks else self._reason
         return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
+
+    def _moved(self, step: Floats, slack: float) -> Hypotheses:
+        return hypotheses.moved(self._bank, step, slack, self.known.anchors.slow_sigma)
+
+    def _matched(self, bank: Hypotheses, walls: Walls, rays: Rays, some: Rays, fresh: float) -> tuple[Hypotheses, Agreement]:
+        """Return hypotheses corrected by a scan, and how some of its rays, turned as the laser is, agree with the map there."""
+        bank = hypotheses.matched(bank, walls, rays, fresh)
+        self.work += len(bank) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
+        return bank, walls.agreement(bank.poses, some)
 
     def _laser_turn(self) -> Floats:
         """Return the pose (3,) of the base as the laser's stated mounting shows it, in its own frame; m, m, rad."""
@@ -238,7 +238,7 @@ class PoseEstimator:
         return np.array([0.0, 0.0, turn])
 
     def _sees(self) -> bool:
-        return self.known.walls is not None and bool(self._window.looks)
+        return bool(self._window.looks)
 
     def _due(self) -> bool:
         """Return whether it is time for another search, and record it."""
@@ -251,32 +251,25 @@ class PoseEstimator:
     def _doubted(self, free: bool) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
-        A pose that ranges support is rejected only where another place explains the later measurements better.
-
-        Parameters
-        ----------
-        free : there is time to compare units.
+        A pose that ranges support is rejected only where another place explains the later measurements better. Where there is
+        time, free, the map's unit is compared with that of the sensors by the last metres.
         """
-        if free and self._way - self._unit_way >= _UNIT_WAY:
-            self._unit_way, self._compared = self._way, self._compared + 1
-            if why := self._other_unit():
+        odom, way = self._odometer.pose, self._way
+        if free and way - self._unit_way >= _UNIT_WAY:
+            self._unit_way, self._compared = way, self._compared + 1
+            rays, ago = self._window.seen(odom, way, LOOK_BACK)
+            ranges, looks = self._window.ranges_since(odom, way), len(np.unique(ago))
+            if why := verdict.other_unit(self.known.walls, self._bank.poses[0], rays, looks, ranges, False):
                 self._compared = 0
                 return why
         if self._sees() and self._running.scans_contradict():
             return "" if self._running.ranges_vouch(self._odometer.stamp) else _SCANS_DIFFER
         return "the ranges do not fit the anchors any more" if self._running.ranges_contradict() else ""
 
-    def _other_unit(self) -> str:
-        """Return the reason why, by the last metres, the map's unit differs from that of the sensors; "" = it does not."""
-        odom, way = self._odometer.pose, self._way
-        rays, ago = self._window.seen(odom, way, LOOK_BACK)
-        ranges = self._window.ranges_since(odom, way)
-        return verdict.other_unit(self.known.walls, self._bank.poses[0], rays, len(np.unique(ago)), ranges, False)
-
-    def _lose(self, why: str, since: float | None = None) -> None:
-        """Begin again with the measurements since a time, s; None = since measurements last supported the pose."""
-        self._certain, self._confirmed, self._reason = False, None, why
-        self._window, self._parts = self._window.since(self._running.agreed() if since is None else since), 1
+    def _lose(self, why: str, since: float) -> None:
+        """Begin again with the measurements since a time, s."""
+        self.tracks, self._confirmed, self._reason = False, None, why
+        self._window, self._parts = self._window.since(since), 1
         self._places.drop()
         self._running.forget_anchors()
         self._search_stamp = -np.inf
@@ -290,7 +283,7 @@ class PoseEstimator:
         best, proven = int(np.argmax(self._bank.log_weight)), self._compared >= _PROVEN
         known, ranges = float(found.known[best]), found.ranges
         fitting = verdict.agreeing(self._bank.poses[best], ranges)
-        if known < (verdict.FEW_BESIDE if proven and fitting.anchors >= 3 else verdict.FEW_ENDS) and len(ranges):
+        if known < (verdict.FEW_BESIDE if proven and fitting.anchors > 2 else verdict.FEW_ENDS) and len(ranges):
             self.work += MOMENTS
             pose, covariance = range_moments(self._bank.poses[best], ranges)
             effect = bias_effect(pose[None], ranges, len(self.known.anchors.ids))
@@ -301,23 +294,27 @@ class PoseEstimator:
         undecided = verdict.undecided(self._bank, best, found.complete, certain)
         # Agreement from before the part that is used speaks of a place from which the robot was carried away.
         agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
-        fit = float(found.fit[best])
         # Rays that end beyond the map say nothing about it.
         rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
-        odds = verdict.map_odds(fit, known, rays, fitting, agreed)
+        odds = verdict.map_odds(float(found.fit[best]), known, rays, fitting, agreed)
+        nowhere = verdict.nowhere(odds, fitting)
         self._reason = (
             undecided
             or verdict.imprecise(self._bank.pose_covariances[best])
-            or verdict.nowhere(odds, fitting)
+            or nowhere
             or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
         )
         # That the robot was carried within the window is as unlikely as what counts as certain.
         if not self._reason and odds.total < certain + verdict.CERTAIN * (self._parts > 1):
             self._reason = "found; a little more driving will confirm it"
-        self._trim(bool(verdict.nowhere(odds, fitting)))
+        # Measurements that fit nowhere may be of two places, before and after the robot was carried: their newest half is
+        # tried, then their newest quarter. Once such a part is enough by itself, the rest is removed.
+        if self._parts > 1 and not self._reason:
+            self._window = self._searched
+        self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
-            self._certain = True
+            self.tracks = True
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
             self._running.restart(self._sees())
 
@@ -330,13 +327,3 @@ class PoseEstimator:
         if first is None or hypotheses.apart(pose, se2.compose(first[1], odom)[None])[0]:
             self._confirmed = first = (self._way, se2.compose(pose, se2.inverse(odom)))
         return self._way - first[0]
-
-    def _trim(self, nowhere: bool) -> None:
-        """Choose the part of the window for the next search.
-
-        Measurements that fit nowhere may be of two places, before and after the robot was carried: their newest half is tried,
-        then their newest quarter. Once such a part is enough by itself, the rest is removed.
-        """
-        if self._parts > 1 and not self._reason:
-            self._window = self._searched
-        self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1

@@ -5,28 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, Ints
+from .verdict import CERTAIN, LIKELY, RAY_ELSEWHERE
 
-FIT_SOUND = -0.3
-"""Mean log-likelihood of the last scans' rays from which nothing is doubtful."""
-FIT_LOST = -0.7
-"""The same, below which the pose is lost."""
-_RANGES_LOST = 0.25
-"""Mean weight of ranges below which the pose is lost."""
+FIT_SOUND, FIT_LOST = RAY_ELSEWHERE, 2.0 * RAY_ELSEWHERE
+"""Mean log-likelihoods of the last scans' rays: above the first, which other buildings do not reach, they support the pose; it
+is lost below the second."""
+SUPPORT, _CONTRADICTION = 0.5, 0.25
+"""Weights of a range, and mean weights of the last ones, that support the pose, being more likely than not, and that contradict
+it. The search for a lost robot begins with the measurements after the last one that supported the pose. A pose that ranges
+support and scans contradict is replaced only by a better one: rooms that are only partly in the map, and people around the
+robot, cause this."""
 _FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 """Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
-_MOST = 0.5
-"""Weight from which on a range supports the pose, mean weight from which on the last ones do, and share of the last scans in
-known space from which on their fit does: more likely than not. The search for a lost robot begins with the measurements after
-the last one that supported the pose. A pose that ranges support and scans contradict is replaced only by a better one: rooms
-that are only partly in the map, and people around the robot, cause this."""
 _RECENT = 5.0
 """s since the last range, in which ranges still support a pose."""
-_JUMPED = 6.0
-"""Log-likelihood, 400 : 1, by which the ranges must be likelier from anywhere than from the pose for it to be lost at once."""
-_DOUBTED = 3.0
-"""The same, 20 : 1, by which the rest of the map is searched for a better place."""
-_MOVED = (0.2, 20.0)
-"""Mean weight below which, after so many ranges, an anchor counts as moved."""
+_ENOUGH = 20
+"""Ranges of an anchor after which it may count as moved."""
 
 
 @dataclass(slots=True, eq=False)
@@ -76,7 +70,7 @@ class RunningFit:
         self.trust[anchor] += (_FORGETTING * (weight - self.trust[anchor, 0]), 1.0)
         self.ranges += _FORGETTING_RANGES * (weight - self.ranges)
         self.ranged = max(self.ranged, stamp)
-        if weight > _MOST:
+        if weight > SUPPORT:
             self.sound = max(self.sound, stamp)
 
     def add_scan(self, fit: float, informative: bool, stamp: float) -> None:
@@ -89,7 +83,7 @@ class RunningFit:
 
     def in_doubt(self) -> bool:
         """Return whether measurements fit worse than they should: people may be near, or the robot is elsewhere."""
-        return self.fit < FIT_SOUND or self._jump() > _DOUBTED
+        return self.fit < FIT_SOUND or self._jump() > LIKELY
 
     def scans_contradict(self) -> bool:
         """Return whether scans fit so badly that the robot is elsewhere."""
@@ -97,19 +91,19 @@ class RunningFit:
 
     def ranges_contradict(self) -> bool:
         """Return whether the ranges contradict the pose, and no scans support it."""
-        return (self.ranges < _RANGES_LOST or self.jumped()) and not (self.seen > _MOST and self.fit > FIT_SOUND)
+        return (self.ranges < _CONTRADICTION or self.jumped()) and not (self.seen > SUPPORT and self.fit > FIT_SOUND)
 
     def jumped(self) -> bool:
         """Return whether the ranges, which agreed, now contradict the pose all at once."""
-        return self._jump() > _JUMPED
+        return self._jump() > CERTAIN
 
     def _jump(self) -> float:
         """Return the log-likelihood by which ranges that agreed before contradict the pose."""
-        return -float(self.against.sum()) if self.before > _MOST else 0.0
+        return -float(self.against.sum()) if self.before > SUPPORT else 0.0
 
     def ranges_vouch(self, now: float) -> bool:
         """Return whether recent ranges support the pose."""
-        return self.ranges > _MOST and now - self.ranged < _RECENT
+        return self.ranges > SUPPORT and now - self.ranged < _RECENT
 
     def agreed(self) -> float:
         """Return until when, s, the measurements supported the pose: by chance some still do after a jump."""
@@ -117,7 +111,7 @@ class RunningFit:
 
     def moved_anchors(self) -> Ints:
         """Return the anchors that most ranges have long disagreed with."""
-        return np.flatnonzero((self.trust[:, 0] < _MOVED[0]) & (self.trust[:, 1] >= _MOVED[1]))
+        return np.flatnonzero((self.trust[:, 0] < _CONTRADICTION) & (self.trust[:, 1] >= _ENOUGH))
 
 
 def full_agreement(anchors: int) -> RunningFit:

@@ -16,13 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .range_likelihood import PER_RANGE, range_likelihood, refined_by_ranges
-from .verdict import FEW_BESIDE, FEW_ENDS
-from .walls import Rays, Walls
-from .window import Ranges
+from ..grid.occupancy_grid import FREE
+from .hypotheses import MATCHES, SAME, apart, refined
+from .range_model import PER_RANGE, Ranges, range_likelihood
+from .verdict import CERTAIN, FEW_BESIDE, FEW_ENDS
+from .walls import INDEPENDENT_RAYS, STRANGE, Rays, Walls
 
 CELL = 0.1
 """m; cell of the likelihood field."""
@@ -34,6 +36,28 @@ FARTHEST = 12.0
 """m; points farther away are not matched: 0.05 rad is there 0.6 m."""
 _MOST_FIELD = 3_000_000
 """Cells of the field (one byte, four levels); a larger map gets coarser ones."""
+_HEADINGS = 126
+"""Headings that are tried, 0.05 rad apart."""
+_POINTS = 72
+"""Points of the scans that are matched, no two in one cell and a half of the field."""
+_MOST_NODES = 60_000
+"""Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
+_DIVED = 64
+"""Best nodes of a level that are followed down for a lower bound of the best pose's score."""
+_RIVAL = 0.75
+"""Poses whose score is this share of the best one's are kept."""
+_MOST_RIVALS = 4096
+"""Poses that may be as good before the search is not complete."""
+MOST_PLACES = 32
+"""Poses that are returned."""
+_TOLERANCE, _GROSS = 4.0, 0.1
+"""Standard deviations by which a range may be off, and m by which ranges may be off on average beyond the best place's."""
+_MOST_CELLS = 20_000
+"""Places that are tried by ranges alone; a larger map gets coarser ones."""
+UNIT = 1_000_000
+"""Operations of a unit of work at most: 1 to 2 ms on one core."""
+_PER_POINT, _PER_PLACE, _PER_REFINED = 3, 10, 60 * MATCHES
+"""Operations for a point of a scan at a place, for a range to a place, and for a range in a refinement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,49 +77,33 @@ class Field:
     squares: Ints
     """(k, 2) row and column of the lowest cell of each of the coarsest squares in which a robot may stand."""
 
+    def centres(self, cells: NDArray[np.signedinteger], size: int = 1) -> Floats:
+        """Return the centres (n, 2) of squares, m, by row and column (n, 2) of their lowest cells."""
+        return np.asarray(self.origin + (cells[:, ::-1] + 0.5 * size) * self.cell)
+
 
 def field_of(walls: Walls) -> Field:
     """Return the likelihood field of walls."""
-    g = walls.geometry
+    g, top = walls.geometry, 2**LEVELS
     size = np.array([g.cols, g.rows]) * g.resolution
-    cell = max(CELL, float(np.sqrt((size[0] + 2 * FARTHEST) * (size[1] + 2 * FARTHEST) / _MOST_FIELD)))
-    margin = int(np.ceil(FARTHEST / cell)) + 2 ** (LEVELS + 1)
+    cell = max(CELL, float(np.sqrt(np.prod(size + 2 * FARTHEST) / _MOST_FIELD)))
+    margin = int(np.ceil(FARTHEST / cell)) + 2 * top
     wide, high = (np.ceil(size / cell).astype(int) + 2 * margin).tolist()
     origin = g.origin - margin * cell
     x, y = origin[0] + (np.arange(wide) + 0.5) * cell, origin[1] + (np.arange(high) + 0.5) * cell
     likelihood, free = np.empty((high, wide), np.uint8), np.empty((high, wide), bool)
     for row in range(high):
-        distance = np.minimum(walls.distances(x, np.full(wide, y[row])), 10.0)
-        likelihood[row] = np.rint(255.0 * np.exp(-0.5 * np.square(distance / max(_SPREAD, cell))))
-        free[row] = walls.state_at(x, np.full(wide, y[row])) == 0
-    levels = [likelihood]
-    for k in range(LEVELS):
-        below, reach = levels[-1], 2**k
-        wider = below.copy()
-        wider[:, :-reach] = np.maximum(below[:, :-reach], below[:, reach:])
-        higher = wider.copy()
-        higher[:-reach] = np.maximum(wider[:-reach], wider[reach:])
-        levels.append(higher)
-    return Field(cell, origin, tuple(levels), free, margin, _squares(free))
-
-
-def _squares(free: Bools) -> Ints:
-    top = 2**LEVELS
+        distance = walls.distances(x, np.full(wide, y[row]))
+        likelihood[row] = np.rint(_WHOLE * np.exp(-0.5 * np.square(distance / max(_SPREAD, cell))))
+        free[row] = walls.state_at(x, np.full(wide, y[row])) == FREE
+    above = [maximum_filter(likelihood, 2**k, origin=-(2 ** (k - 1)), mode="nearest") for k in range(1, LEVELS + 1)]
     rows, cols = (n // top for n in free.shape)
-    some = free[: rows * top, : cols * top].reshape(rows, top, cols, top).any(axis=(1, 3))
-    return np.argwhere(some).astype(np.intp) * top
+    some = free[: rows * top, : cols * top].reshape(rows, top, cols, top).any(axis=(1, -1))
+    return Field(cell, origin, (likelihood, *above), free, margin, np.argwhere(some).astype(np.intp) * top)
 
 
-_HEADING = 0.05
-"""rad; step of the heading."""
-_POINTS = 72
-"""Points of the scans that are matched."""
-_MOST_NODES = 60_000
-"""Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
-_RIVAL = 0.75
-"""Poses whose score is this share of the best one's are kept."""
-MOST_PLACES = 32
-"""Poses that are returned."""
+_WHOLE = float(np.iinfo(np.uint8).max)
+"""Likelihood of a cell in which a wall is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,10 +118,7 @@ class Places:
 
 Steps = Generator[int, None, Places]
 """A running search; it yields the operations of every unit of work and returns its result."""
-UNIT = 1_000_000
-"""Operations of a unit of work at most: 1 to 2 ms on one core."""
-_PER_POINT, _PER_PLACE = 3, 10
-"""Operations for a point of a scan at a place, and for a range to a place."""
+_UNDECIDED = Places(np.zeros((0, 3)), False)
 
 
 def units(count: int, each: int) -> Iterator[slice]:
@@ -137,20 +142,19 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
     anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
-    if field is not None and len(seen) >= (FEW_ENDS if anchors < 3 else FEW_BESIDE):
+    if field is not None and len(seen) >= (FEW_BESIDE if anchors > 2 else FEW_ENDS):
         found = yield from _by_scans(field, seen, float(rays.hit.mean()), ranges)
         if len(seen) >= FEW_ENDS and (len(found.poses) or not len(ranges)):
             return found
     if anchors < 2:
-        return Places(np.zeros((0, 3)), False)
+        return _UNDECIDED
     ranged = yield from _by_ranges(ranges, bounds)
     return Places(np.concatenate([found.poses, ranged.poses]), found.complete and ranged.complete)
 
 
 def _thinned(rays: Rays) -> Floats:
-    """Return points (p, 2) on walls, no two in one cell of the field, at most _POINTS of them."""
-    near = rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)
-    points = rays.ends[near]
+    """Return points (p, 2) on walls, at most _POINTS of them."""
+    points = rays.ends[rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)]
     _, first = np.unique(np.floor(points / (1.5 * CELL)).astype(np.intp), axis=0, return_index=True)
     chosen = np.sort(first)
     return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.intp))]] if len(chosen) else points[:0]
@@ -159,17 +163,17 @@ def _thinned(rays: Rays) -> Floats:
 def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
     """Match points (p, 2), of a share of all rays, by branch and bound where the ranges allow it."""
     top = 2**LEVELS
-    rows, cols = field.squares.T
-    centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
-    allowed = yield from _allowed(centre, 0.75 * top * field.cell, ranges)
-    rows, cols = rows[allowed], cols[allowed]
-    headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
-    if not len(rows):
-        return Places(np.zeros((0, 3)), False)
+    squares = field.squares[(yield from _allowed(field.centres(field.squares, top), top * field.cell, ranges))]
+    if not len(squares):
+        return _UNDECIDED
+    headings = np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False)
     offsets = _offsets(field, points, headings)
     yield _PER_PLACE * offsets.size
-    nodes = yield from _top_nodes(len(headings), rows, cols)
-    complete, least = True, 0.0
+    every = np.empty((_HEADINGS, len(squares), 3), dtype=np.int32)
+    for part in units(_HEADINGS, every[0].size):
+        every[part, :, 0], every[part, :, 1:] = np.arange(_HEADINGS)[part, None], squares
+        yield every[part].size
+    nodes, complete, least = every.reshape(-1, 3), True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
     for level in range(LEVELS, 0, -1):
         best, found = yield from _dive(field, level, offsets, nodes, scores)
@@ -178,19 +182,18 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
         if len(kept) > _MOST_NODES:
             complete, nodes, scores = False, best, found
             break
-        nodes = _children(nodes[kept], 2 ** (level - 1))
-        yield from _pause(len(nodes))
+        nodes = _children(nodes[kept], level - 1)
+        yield nodes.size
         scores = yield from _scored(field, level - 1, offsets, nodes)
     kept = np.flatnonzero(scores >= max(least, _RIVAL * scores.max(initial=0.0)))
-    yield from _pause(len(scores))
+    kept = kept[field.free[nodes[kept, 1], nodes[kept, 2]]]
+    yield len(scores)
     kept = kept[np.argsort(-scores[kept], kind="stable")]
-    yield from _pause(len(kept))
-    poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
-    inside = field.free[nodes[kept, 1], nodes[kept, 2]]
-    yield from _pause(len(kept))
+    yield nodes[kept].size
+    poses = np.column_stack([field.centres(nodes[kept, 1:]), se2.wrap_angle(headings[nodes[kept, 0]])])
     if not len(ranges):
-        return (yield from _distinct(poses[inside], complete))
-    return (yield from _likeliest(poses[inside], share * scores[kept[inside]], ranges, complete))
+        return (yield from _distinct(poses, complete))
+    return (yield from _likeliest(poses, share * scores[kept], ranges, complete))
 
 
 def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
@@ -198,43 +201,38 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
 
     Ranges distinguish places along a wall, which scans do not.
     """
-    tried, few = poses[:_MOST_RIVALS], _some(ranges)
-    weight = _PER_SCORE * scores[: len(tried)]
-    for part in units(len(tried), PER_RANGE * len(few)):
-        weight[part] += range_likelihood(tried[part], few, wider=0.5 * CELL)
-        yield PER_RANGE * len(few) * len(tried[part])
+    tried = poses[:_MOST_RIVALS]
+    # As many rays, each likelier on a wall than beside it, as count as independent.
+    weight = -INDEPENDENT_RAYS * np.log(STRANGE) * scores[: len(tried)]
+    weight += yield from _ranged(tried, ranges, 0.5 * CELL)
     order = np.argsort(-weight, kind="stable")
-    order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
+    order = order[weight[order] >= weight[order[:1]] - 2.0 * CERTAIN]
     return (yield from _distinct(tried[order], complete and len(tried) == len(poses)))
 
 
-def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[int, None, NDArray[np.int32]]:
-    """Return every heading with every square of the coarsest level, as nodes (n, 3): heading, row, column."""
-    nodes = np.empty((headings, len(rows), 3), dtype=np.int32)
-    at_once = max(1, _MANY // len(rows))
-    for start in range(0, headings, at_once):
-        part = nodes[start : start + at_once]
-        part[..., 0] = np.arange(start, start + len(part))[:, None]
-        part[..., 1], part[..., 2] = rows, cols
-        yield from _pause(part.size)
-    return nodes.reshape(-1, 3)
+def _ranged(poses: Floats, ranges: Ranges, wider: float) -> Generator[int, None, Floats]:
+    """Return the log-likelihoods (n,) of some of the ranges at poses (n, 3) of a grid, see range_likelihood."""
+    few, found = ranges.spread(), np.empty(len(poses))
+    for part in units(len(poses), PER_RANGE * len(few)):
+        found[part] = range_likelihood(poses[part], few, wider)
+        yield PER_RANGE * len(few) * len(found[part])
+    return found
 
 
 def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     """Return by how many cells of the flat field (h, p) each point lies from the robot's cell."""
-    laid = se2.rotate(headings[:, None], points[None])
-    cells = np.rint(laid / field.cell).astype(np.intp)
+    cells = np.rint(se2.rotate(headings[:, None], points[None]) / field.cell).astype(np.intp)
     return cells[..., 1] * field.free.shape[1] + cells[..., 0]
 
 
 def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -> Generator[int, None, Floats]:
-    """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
+    """Return the bounds (n,) of nodes (n, 3), heading, row, column: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
     for part in units(len(nodes), _PER_POINT * offsets.shape[1]):
         heading, row, col = nodes[part].T.astype(np.intp)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
-        scores[part] = values.sum(axis=1, dtype=np.intp) / (255.0 * offsets.shape[1])
+        scores[part] = values.sum(axis=1, dtype=np.intp) / (_WHOLE * offsets.shape[1])
         yield _PER_POINT * values.size
     return scores
 
@@ -242,116 +240,75 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
 def _dive(
     field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats
 ) -> Generator[int, None, tuple[NDArray[np.int32], Floats]]:
-    """Return good poses as nodes (n, 3), found by following the best ones down, and their scores (n,): the highest is a lower
-    bound of the best pose's.
-    """
+    """Return good poses as nodes (n, 3), found by following the best ones down, and their scores (n,)."""
     best, found = nodes[_highest(scores)], np.zeros(0)
-    yield from _pause(len(scores))
+    yield len(scores)
     for below in range(level - 1, -1, -1):
-        best = _children(best, 2**below)
+        best = _children(best, below)
         found = yield from _scored(field, below, offsets, best)
         order = _highest(found)
         best, found = best[order], found[order]
     return best, found
 
 
-def _pause(count: int) -> Generator[int, None, None]:
-    """Pause after work on so many nodes or poses, if that was a unit of work by itself."""
-    if count > _MANY:
-        yield count
-
-
-_MANY = 20_000
-"""Nodes or poses that take a millisecond or so to make, to compare or to sort."""
-
-
-def _highest(scores: Floats, count: int = 64) -> Ints:
+def _highest(scores: Floats) -> Ints:
     """Return the indices of the highest scores, the first of equal ones, best first; without sorting them all."""
-    least = np.partition(scores, -count)[-count] if len(scores) > count else -np.inf
+    least = np.partition(scores, -_DIVED)[-_DIVED] if len(scores) > _DIVED else -np.inf
     some = np.flatnonzero(scores >= least)
-    return some[np.argsort(-scores[some], kind="stable")[:count]]
+    return some[np.argsort(-scores[some], kind="stable")[:_DIVED]]
 
 
-def _children(nodes: NDArray[np.int32], half: int) -> NDArray[np.int32]:
-    """Return the four quarters of each node."""
-    shift = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]], dtype=np.int32)
-    return (nodes[:, None] + shift).reshape(-1, 3)
+def _children(nodes: NDArray[np.int32], level: int) -> NDArray[np.int32]:
+    """Return the four quarters, of a level, of each node."""
+    quarters = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]], dtype=np.int32)
+    return (nodes[:, None] + quarters * 2**level).reshape(-1, 3)
 
 
-def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[int, None, Bools]:
-    """Return where (n,) the robot may be by its ranges alone, for any heading, within a half width of a place, m.
+def _allowed(centres: Floats, size: float, ranges: Ranges) -> Generator[int, None, Bools]:
+    """Return in which squares (n,) of a size, m, the robot may be by its ranges alone, for any heading.
 
-    The tag was within |t| of its present place: a range disagrees if it is off by more than that, the cell and four sigmas.
-    NLOS makes ranges long: a place too near an anchor counts as half a disagreement. The best places and those with little more
-    are kept.
+    The tag was within |t| of its present place: a range disagrees if it is off by more than that, half the diagonal and four
+    sigmas. NLOS makes ranges long: a place too near an anchor counts as half a disagreement. The best places and those with
+    little more are kept.
     """
-    if not len(ranges) or not len(centre):
-        return np.ones(len(centre), bool)
-    cost, moved = np.zeros(len(centre)), np.hypot(*ranges.tags.T)
-    for part in units(len(ranges), _PER_PLACE * len(centre)):
-        some = ranges.rows(np.arange(len(ranges))[part])
-        for place, value, way, sigma in zip(some.places, some.values, moved[part], some.sigma, strict=True):
-            x, y = (centre - place).T
-            off = value - np.sqrt(x * x + y * y)
-            beyond = np.abs(off) - way - 1.5 * half - 4.0 * sigma
+    if not len(ranges) or not len(centres):
+        return np.ones(len(centres), bool)
+    cost = np.zeros(len(centres))
+    slack = np.hypot(*ranges.tags.T) + np.sqrt(0.5) * size + _TOLERANCE * ranges.sigma
+    for part in units(len(ranges), _PER_PLACE * len(centres)):
+        for place, value, most in zip(ranges.places[part], ranges.values[part], slack[part], strict=True):
+            off = value - np.hypot(*(centres - place).T)
             # A range that is one metre off counts like one that is ten metres off.
-            cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
-        yield _PER_PLACE * len(some) * len(centre)
-    return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
+            cost += np.clip(np.abs(off) - most, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
+        yield _PER_PLACE * len(slack[part]) * len(centres)
+    return np.asarray(cost <= cost.min() + _GROSS * len(ranges))
 
 
 def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Try places and headings by the ranges alone."""
-    step = max(0.4, float(np.sqrt(np.prod(bounds[1] - bounds[0]) / 20_000)))
-    axes = [np.arange(bounds[0][k], bounds[1][k] + step, step) for k in (0, 1)]
+    step = max(SAME[0], float(np.sqrt(np.prod(bounds[1] - bounds[0]) / _MOST_CELLS)))
+    axes = [np.arange(low, high + step, step) for low, high in zip(*bounds, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    cells = cells[(yield from _allowed(cells, 0.75 * step, ranges))]
-    headings = np.arange(0.0, 2.0 * np.pi - 0.05, 0.2)
+    cells = cells[(yield from _allowed(cells, step, ranges))]
+    headings = np.arange(0.0, 2.0 * np.pi, SAME[1])
     if len(cells) * len(headings) > _MOST_NODES:
-        return Places(np.zeros((0, 3)), False)
+        return _UNDECIDED
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
-    few, cost = _some(ranges), np.empty(len(poses))
-    for part in units(len(poses), PER_RANGE * len(few)):
-        cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
-        yield PER_RANGE * len(few) * len(cost[part])
-    order = np.flatnonzero(cost <= cost.min(initial=np.inf) + _RANGE_RIVAL)
-    order = order[np.argsort(cost[order], kind="stable")]
+    weight = yield from _ranged(poses, ranges, np.sqrt(0.5) * step)
+    order = np.flatnonzero(weight >= weight.max(initial=-np.inf) - 2.0 * CERTAIN)
+    order = order[np.argsort(-weight[order], kind="stable")]
     tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
     for part in units(len(tried), _PER_REFINED * len(ranges)):
-        tried[part] = refined_by_ranges(tried[part], ranges)
+        tried[part] = refined(tried[part], ranges)
         yield _PER_REFINED * len(tried[part]) * len(ranges)
     return (yield from _distinct(tried, 0 < len(order) <= _MOST_RIVALS))
 
 
-def _some(ranges: Ranges) -> Ranges:
-    """Return forty of the ranges, for the time that all would take."""
-    return ranges.rows(np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.intp)))
-
-
-_PER_SCORE = 30.0
-"""Log-likelihood by which a score of 1 is better than one of 0: of fifteen rays, each about ten times likelier on a wall."""
-_MOST_RIVALS = 4096
-"""Poses that may be as good before the search is not complete."""
-_PER_REFINED = 8 * 60
-"""Operations for a range in eight iterations of a refinement."""
-_RANGE_RIVAL = 12.0
-"""Log-likelihood by which a place may be worse than the best one before it is refined."""
-
-
 def _distinct(poses: Floats, complete: bool) -> Steps:
     """Return the first of poses (n, 3), best first, that are not near an earlier one."""
-    kept, done = np.zeros((0, 3)), 0
-    left = poses
+    kept, left = np.zeros((0, 3)), poses
     while len(left) and len(kept) < MOST_PLACES:
         kept = np.concatenate([kept, left[:1]])
-        done += len(left)
-        x, y, turn = (left - left[0]).T
-        left = left[(np.hypot(x, y) > _SAME[0]) | (np.abs(se2.wrap_angle(turn)) > _SAME[1])]
-        if done > _MANY:
-            yield _PER_PLACE * done
-            done = 0
+        yield _PER_PLACE * len(left)
+        left = left[apart(left[0], left)]
     return Places(kept, complete and not len(left))
-
-
-_SAME = (0.4, 0.2)
-"""m and rad; poses that are closer are one place, closer than hypotheses.apart: they are not refined yet."""

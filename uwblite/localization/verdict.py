@@ -1,45 +1,52 @@
-"""Whether a start is certain: what must have been measured, and how much likelier it must be than every other place."""
+"""Whether a start is certain: what must have been measured, and how much likelier it must be than every other place.
 
-from dataclasses import dataclass
+A map in another unit still looks like the place: near every wall the pose follows the wall. But from the right place all
+distances are too long, or too short, by the same factor. So the pose is matched once more together with two scales, one of the
+lidar's (or the radio's) distances and one of the motion between the measurements, which belongs to the wheels and absorbs their
+error.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats
 from . import hypotheses
-from .hypotheses import Hypotheses
-from .range_likelihood import range_errors, series, shared_likelihood
-from .scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
+from .hypotheses import BIAS_SIGMA, INDEPENDENT, WALL_SIGMA, WIDTHS, Hypotheses
+from .range_model import Ranges, cauchy, range_errors, series, shared_likelihood
 from .walls import Rays, Walls
-from .window import Ranges
 
-CERTAIN = 6.0
-"""Log-likelihood by which a place must be better than any other: 400 : 1."""
-_CERTAIN_AGAIN = 4.6
-"""The same in a map that is the right one, as a pose was tracked in it: 100 : 1."""
-SIGMA_FOUND = (0.25, 0.1)
+CERTAIN, _CERTAIN_AGAIN, LIKELY = (float(np.log(odds)) for odds in (400.0, 100.0, 20.0))
+"""Log-likelihoods: of a certain place; of one in a map that is the right one, as a pose was tracked in it; of a likely one."""
+_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less certain is not found yet."""
 _VAGUE = (0.4, 0.25)
 """m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
-ELSEWHERE = (-0.35, -1.2)
-"""Log-likelihood of a ray, and of an independent range, at the best place of a building that is not the map's. In 770 searches
-in three of them the odds against that were never 400 : 1; in the right building they are after 0.7 to 1.4 m (median)."""
-_ELSEWHERE_ALONE = -0.25
-"""Of a ray where no ranges confine the places: rooms that are alike in part reach -0.3."""
-RANGES_FOUND, RANGES_ALONE = 0.6, 0.8
-"""Share of the ranges that agree in the right place; and least share where they are alone: 0.9 to 1 in the right place, with
-anchors of another building 0.75 to 0.8."""
+RAY_ELSEWHERE, _RAY_ALONE, _RANGE_ELSEWHERE = -0.35, -0.25, -1.35
+"""Log-likelihoods of a ray, of one where no ranges confine the places, and of an independent range, at the best place of a
+building that is not the map's: rooms are alike in part."""
+_ALONE = 0.8
+"""Least share of ranges that agree where they are alone: 0.9 to 1 in the right place, 0.75 to 0.8 with anchors of another
+building."""
 FEW_ENDS, FEW_BESIDE = 12, 4
 """Least number of rays' ends in known space for a scan to count; the second beside ranges to three anchors."""
-ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
-"""Least number of rays' ends, or of ranges, for a comparison of units."""
-_AGREED = 3.0
-"""Log-likelihood, 20 : 1, of a metre of driving over which all searches found the same place: in another building the best
-place leaps. By scans or ranges alone, with nothing independent beside them, it is all that counts: two metres."""
-_UNIT_KNOWN = 0.7
-"""Standard deviation of the map's unit, as a share of what data sheets allow, from which another one would have been noticed; a
-start also needs the unit itself to be within that."""
-_UNIT_CLEAR = 0.01
-"""The same by scans, from which on ranges do not reject a found pose: two of four anchors may have been moved."""
+_ENOUGH_RANGES = 6
+"""Least number of ranges that decide alone, or about units."""
+_AGREES = 3.0
+"""Standard deviations up to which a range agrees."""
+_LIMITS = {"lidar": 0.03, "radio": 0.05}
+"""Relative errors of distances: data sheets of lidars allow 1 to 3 %; for radios, the delay by walls is added."""
+_SURE = 4.0
+"""Standard deviations from which a scale error is certain."""
+_KNOWN = 0.7
+"""Standard deviation of the map's unit, as a share of that limit, from which another one would have been noticed; a start also
+needs the unit itself to be within the limit."""
+_PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.3])
+"""Standard deviations of pose, motion and distances; m, m, rad, 1, 1."""
+_NO_SCALE = 1e-6
+"""That of distances in the unit of the map."""
+_ITERATIONS = 6
 
 
 def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> str:
@@ -50,25 +57,17 @@ def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> st
     complete : the search left no place out. certain : log-likelihood by which it must be better than any other.
     """
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+    count = 1 + int((rivals > -certain).sum())
     if not complete:
         return "too many places are as likely; drive on"
-    if rivals.max(initial=-np.inf) > -certain:
-        count = 1 + int((rivals > -certain).sum())
-        return f"{count} places are as likely; drive on, around a corner or past another anchor"
-    return ""
+    return f"{count} places are as likely; drive on, around a corner or past another anchor" if count > 1 else ""
 
 
 def imprecise(covariance: Floats) -> str:
     """Return why the only place is not found yet, by its covariance (3, 3), m and rad; "" = it is known well enough."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if max(sigma[0], sigma[1]) <= SIGMA_FOUND[0] and sigma[2] <= SIGMA_FOUND[1]:
-        return ""
-    return "place or heading is not sure yet; drive on"
-
-
-def needed(fitting: "RangeFit", proven: bool) -> float:
-    """Return the log-likelihood of certainty; proven : the map is the right one, as a pose was tracked in it."""
-    return _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
+    known = sigma[:2].max() <= _FOUND[0] and sigma[2] <= _FOUND[1]
+    return "" if known else "place or heading is not sure yet; drive on"
 
 
 def vague(covariance: Floats) -> str:
@@ -79,72 +78,13 @@ def vague(covariance: Floats) -> str:
     return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
 
 
-@dataclass(frozen=True, slots=True)
-class MapOdds:
-    """By how much likelier the measurements are at a place of the map than in another building, log-likelihoods."""
-
-    scans: float
-    ranges: float
-    agreed: float
-    """m driven over which all searches found it and no other place."""
-    alone: bool
-    """There are scans or ranges alone."""
-
-    @property
-    def total(self) -> float:
-        measured = self.scans + self.ranges
-        return _AGREED * self.agreed + (min(measured, 0.0) if self.alone else measured)
-
-
-def map_odds(fit: float, ends: float, rays: float, fitting: "RangeFit", agreed: float) -> MapOdds:
-    """Return the odds of a place.
-
-    Parameters
-    ----------
-    fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
-    fitting : how the ranges agree. agreed : m driven over which searches agree.
-    """
-    ranges = fitting.likelihood - fitting.independent * ELSEWHERE[1]
-    sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
-    scans = rays * (fit - (ELSEWHERE[0] if ranged else _ELSEWHERE_ALONE)) if sees else 0.0
-    return MapOdds(scans, ranges, agreed, not (sees and ranged))
-
-
-def nowhere(odds: MapOdds, fitting: "RangeFit") -> str:
-    """Return the reason why even the best place is likelier to be in another building; "" = it is not.
-
-    What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike, and a robot may be
-    where the walls are not mapped.
-    """
-    blind = odds.alone and fitting.enough and fitting.share < RANGES_ALONE
-    against = odds.total < 0.0 or min(odds.scans, odds.ranges) < -CERTAIN
-    if blind or (against and odds.ranges < odds.scans):
-        return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
-    return "the scans fit the walls nowhere well; is this the right map?" if against else ""
-
-
-def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges: Ranges, start: bool) -> str:
-    """Return how the distances of the map differ from the sensors' about a pose (3,); "" = they do not.
-
-    Parameters
-    ----------
-    rays : of the last metres, in the present frame of the base. looks : scans that they are of.
-    start : the place is not known yet.
-    """
-    compared = []
-    if walls is not None and int(rays.hit.sum()) >= ENOUGH_ENDS:
-        compared.append(("lidar", scan_scale(walls, pose, rays, looks), SCAN_LIMIT))
-    if len(ranges) >= ENOUGH_RANGES:
-        compared.append(("radio", range_scale(pose, ranges), RANGE_LIMIT))
-    for name, scale, limit in compared:
-        if scale.off(limit):
-            return f"distances in the map are {1.0 + scale.error:.2f} times those of the {name}; is this the right map?"
-        if not start and scale.sigma < _UNIT_CLEAR:
-            break
-    sigma, error, limit = min(((s.sigma, abs(s.error), limit) for _, s, limit in compared), default=(0.0, 0.0, 0.0))
-    if start and (sigma > _UNIT_KNOWN * limit or error > limit):
-        return "whether the map has the sensors' unit is not known yet; drive on"
-    return ""
+def too_little(rays: Rays, ranges: Ranges) -> str:
+    """Return why no place is found at all."""
+    if not len(rays.hit) and not len(ranges):
+        return "no range to an anchor of the map and no scan has come in"
+    if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
+        return "only one of the map's anchors is in reach; two or more are needed, or a lidar"
+    return "too many places are as likely; drive on"
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,24 +101,170 @@ class RangeFit:
     likelihood: float
     """Their log-likelihood, as of so many; 0 = all as expected."""
 
-    @property
-    def enough(self) -> bool:
-        """Whether those that agree, to two anchors or more, are as many as ranges alone need."""
-        return self.anchors >= 2 and self.share * self.count >= ENOUGH_RANGES
-
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
+    """Return how ranges agree with a pose (3,)."""
     if not len(ranges):
         return RangeFit(0, 0.0, 0, 0.0, 0.0)
-    agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
+    agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= _AGREES * ranges.sigma
     anchors = len(np.unique(ranges.anchor[agree]))
     independent, likelihood = float(series(ranges).share.sum()), float(shared_likelihood(pose[None], ranges)[0])
     return RangeFit(len(ranges), float(agree.mean()), anchors, independent, likelihood)
 
 
-def too_little(rays: Rays, ranges: Ranges) -> str:
-    if not len(rays.hit) and not len(ranges):
-        return "no range to an anchor of the map and no scan has come in"
-    if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
-        return "only one of the map's anchors is in reach; two or more are needed, or a lidar"
-    return "too many places are as likely; drive on"
+def needed(fitting: RangeFit, proven: bool) -> float:
+    """Return the log-likelihood of certainty; proven : the map is the right one, as a pose was tracked in it."""
+    return _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
+
+
+@dataclass(frozen=True, slots=True)
+class MapOdds:
+    """By how much likelier the measurements are at a place of the map than in another building, log-likelihoods."""
+
+    scans: float
+    ranges: float
+    agreed: float
+    """m driven over which all searches found it and no other place. In another building the best place leaps: each counts
+    LIKELY, and by scans or ranges alone, with nothing independent beside them, it is all that counts."""
+    alone: bool
+    """There are scans or ranges alone."""
+
+    @property
+    def total(self) -> float:
+        """Of all together."""
+        measured = self.scans + self.ranges
+        return LIKELY * self.agreed + (min(measured, 0.0) if self.alone else measured)
+
+
+def map_odds(fit: float, ends: float, rays: float, fitting: RangeFit, agreed: float) -> MapOdds:
+    """Return the odds of a place.
+
+    Parameters
+    ----------
+    fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
+    fitting : how the ranges agree. agreed : m driven over which searches agree.
+    """
+    sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
+    scans = rays * (fit - (RAY_ELSEWHERE if ranged else _RAY_ALONE)) if sees else 0.0
+    return MapOdds(scans, fitting.likelihood - fitting.independent * _RANGE_ELSEWHERE, agreed, not (sees and ranged))
+
+
+def nowhere(odds: MapOdds, fitting: RangeFit) -> str:
+    """Return the reason why even the best place is likelier to be in another building; "" = it is not.
+
+    What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike, and a robot may be
+    where the walls are not mapped.
+    """
+    enough = fitting.anchors >= 2 and fitting.share * fitting.count >= _ENOUGH_RANGES
+    blind = odds.alone and enough and fitting.share < _ALONE
+    against = odds.total < 0.0 or min(odds.scans, odds.ranges) < -CERTAIN
+    if blind or (against and odds.ranges < odds.scans):
+        return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
+    return "the scans fit the walls nowhere well; is this the right map?" if against else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Relative difference of the map's distances from those of a sensor."""
+
+    sensor: str
+    error: float
+    """Relative, 1."""
+    sigma: float
+    """Its standard deviation, 1."""
+    gain: float = np.inf
+    """Log-likelihood by which it explains the measurements better than an error of 0 does."""
+
+    @property
+    def limit(self) -> float:
+        """Relative error that a sound sensor may have."""
+        return _LIMITS[self.sensor]
+
+    @property
+    def off(self) -> bool:
+        """Whether map and sensor are in different units for certain."""
+        return abs(self.error) > max(self.limit, _SURE * self.sigma) and self.gain > 0.5 * _SURE**2
+
+
+def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges: Ranges, start: bool) -> str:
+    """Return how the distances of the map differ from the sensors' about a pose (3,); "" = they do not.
+
+    The surer of lidar and radio decides: of four anchors two may have been moved.
+
+    Parameters
+    ----------
+    rays : of the last metres, in the present frame of the base. looks : scans that they are of.
+    start : the place is not known yet.
+    """
+    scales = []
+    if walls is not None and int(rays.hit.sum()) >= FEW_ENDS:
+        scales.append(scan_scale(walls, pose, rays, looks))
+    if len(ranges) >= _ENOUGH_RANGES:
+        scales.append(range_scale(pose, ranges))
+    if not scales:
+        return ""
+    surer = min(scales, key=lambda scale: scale.sigma / scale.limit)
+    if surer.off:
+        return f"distances in the map are {1.0 + surer.error:.2f} times those of the {surer.sensor}; is this the right map?"
+    if start and (surer.sigma > _KNOWN * surer.limit or abs(surer.error) > surer.limit):
+        return "whether the map has the sensors' unit is not known yet; drive on"
+    return ""
+
+
+def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
+    """Match the rays of several scans with pose, motion scale and distance scale free.
+
+    Along a single wall every scale fits, with a pose that is moved accordingly; the match then ends at an arbitrary scale, and
+    its standard deviation does not show that. So a scale that is off is compared with a match in the map's own unit.
+
+    Parameters
+    ----------
+    pose : (3,) about which they match. rays : in the present frame of the base. looks : scans they are of.
+    """
+    error, sigma, whole = _matched(walls, pose, rays, looks, _PRIOR)
+    found = Scale("lidar", error, sigma)
+    if not found.off:
+        return found
+    return replace(found, gain=whole - _matched(walls, pose, rays, looks, np.append(_PRIOR[:-1], _NO_SCALE))[-1])
+
+
+def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: Floats) -> tuple[float, float, float]:
+    """Return the scale of the distances, its standard deviation, and the log-likelihood, with the priors' part."""
+    x, information = np.zeros_like(prior), np.diag(1.0 / np.square(prior))
+    start, beam = np.append(pose, (0.0, 0.0)), rays.ends - rays.origins
+    hessian, scaled = information, rays
+    for width in WIDTHS:
+        h, _, g, weight = walls.factors((start + x)[None, :-2], scaled, width, (rays.origins, beam))
+        share = min(INDEPENDENT * looks / max(float(weight[0]), 1.0), 1.0) / WALL_SIGMA**2
+        hessian = information + share * h[0]
+        x = x - np.linalg.solve(hessian, share * g[0] + information @ x)
+        origins = rays.origins * (1.0 + x[-2])
+        scaled = Rays(origins + beam * (1.0 + x[-1]), origins, rays.hit)
+    agreement = float(walls.agreement((start + x)[None, :-2], scaled).log_likelihood[0])
+    value = min(len(rays.hit), INDEPENDENT * looks) * agreement - 0.5 * float(x @ information @ x)
+    return float(x[-1]), float(np.sqrt(np.linalg.inv(hessian)[-1, -1])), value
+
+
+def range_scale(pose: Floats, ranges: Ranges) -> Scale:
+    """Fit pose, way, distances and one constant error per anchor to the ranges.
+
+    Gauss-Newton with Cauchy kernels, on the ranges and on the anchors' errors: an anchor that was moved by metres explains its
+    own ranges, and does not look like another unit; errors that all anchors share do.
+    """
+    names, anchor = np.unique(ranges.anchor, return_inverse=True)
+    own, first = np.eye(len(names))[anchor], len(_PRIOR)
+    prior = 1.0 / np.square(np.append(_PRIOR, np.full(len(names), BIAS_SIGMA)))
+    x, hessian = np.zeros(len(prior)), np.diag(prior)
+    for _ in range(_ITERATIONS):
+        way, distance = 1.0 + x[first - 2 : first]
+        now = replace(ranges, tags=ranges.tags * way, values=ranges.values * distance - own @ x[first:])
+        moved = pose + x[: len(pose)]
+        error, by_pose = (v[0] for v in range_errors(moved[None], now))
+        lever = se2.rotate(moved[2], ranges.tags)
+        along = (by_pose[:, :2] * lever).sum(axis=1)
+        jacobian = np.column_stack([by_pose, along, -ranges.values, own])
+        weight = cauchy(error, ranges.sigma) / ranges.sigma**2
+        information = np.diag(prior * np.append(np.ones(first), cauchy(x[first:], BIAS_SIGMA)))
+        hessian = information + (jacobian * weight[:, None]).T @ jacobian
+        x = x - np.linalg.solve(hessian, information @ x - jacobian.T @ (weight * error))
+    return Scale("radio", float(x[first - 1]), float(np.sqrt(np.linalg.inv(hessian)[first - 1, first - 1])))

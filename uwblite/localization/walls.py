@@ -6,40 +6,58 @@ lower the likelihood of a pose, but do not move it. Points in unknown space do n
 """
 
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import Bools, Floats, Table
 from ..grid.geometry import GridGeometry
-from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from ..lidar.point_cloud import Lines, estimate_normals, make_tree
+
+_Cell = TypeVar("_Cell", np.int8, np.signedinteger[Any])
 
 PER_RAY, PER_FACTOR = 140, 45
 """Operations on elements of arrays for the agreement of a ray with the map at a pose, and for its quadratic form."""
 REACH = 0.5
 """m; largest distance of a neighbouring wall."""
-_NORMAL_RADIUS = 0.2
-"""m; neighbourhood of a wall's line: four cells of 0.05 m."""
+UNIFORM_VARIANCE = 1.0 / 12.0
+"""Of a uniform distribution of width 1."""
+_NORMAL_RADIUS, _LEAST_CELLS = 0.2, 3.0
+"""m, neighbourhood of a wall's line, and its least radius in cells."""
+_STRAIGHT = 0.6
+"""Least linearity of a line through single cells."""
 _BEHIND = 0.013
 """m; the surface behind the first occupied cells' centres. A cell before it is occupied where more than a third of the rays
 that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
+_SMOOTH, _ONE_SIDE = 1.5, 0.1
+"""Cells, smoothing of free space, and its slope per cell from which on it lies to one side; at a thick wall it is 0.27."""
 _MOST_CELLS = 4_000_000
 """Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
+_ON_WALL, _FINE = 0.1, 0.05
+"""m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
+STRANGE = 0.1
+"""Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
+INDEPENDENT_RAYS = 15.0
+"""Rays per metre of driving that count as independent when places are compared."""
+_LOOKS, _BEFORE = np.linspace(0.0, 1.0, 11)[1:], 0.3
+"""Places along a ray, as shares of its length, at which it is tested for passing a wall, up to so far before its end, m: beyond
+that it may be the wall on which the ray ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays(Table):
-    """Thinned rays of a scan in the frame of the base."""
+    """Thinned rays (p,) of a scan in the frame of the base."""
 
     ends: Floats
     """(p, 2) m; for a ray without a reading, the place up to which there is no wall."""
     origins: Floats
     """(p, 2) m, of the laser at each ray."""
     hit: Bools
-    """(p,) whether the ray ended on something."""
+    """Whether the ray ended on something."""
 
     def moved(self, pose: Floats) -> "Rays":
         """Return the rays in the frame in which the base has this pose (3,)."""
@@ -55,15 +73,15 @@ class Agreement:
     """How scans agree with the map at poses (h,)."""
 
     log_likelihood: Floats
-    """(h,) mean over the rays; 0 = all agree with the map."""
+    """Mean over the rays; 0 = all agree with the map."""
     fit: Floats
-    """(h,) the same over the rays that do not end in unknown space."""
+    """The same over the rays that do not end in unknown space."""
     on_wall: Floats
-    """(h,) share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
+    """Share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
     known: Floats
-    """(h,) ends in known space."""
+    """Ends in known space."""
     met: Floats
-    """(h,) rays that end in known space or pass a wall: those that distinguish one place from another."""
+    """Rays that end in known space or pass a wall: those that distinguish one place from another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +92,7 @@ class Walls:
     states: NDArray[np.int8]
     """(rows, cols) FREE, OCCUPIED or UNKNOWN."""
     points: Floats
-    """(n, 2) m, on the walls' lines."""
+    """(n, 2) m, on the walls' lines; without any wall one that `nearest` does not name."""
     normals: Floats
     """(n, 2) unit, towards the free side; 0 where there is no line."""
     one_sided: Bools
@@ -95,42 +113,29 @@ class Walls:
         """m; by how much farther from the surface the cells of a coarse map lie than those of a fine one."""
         return float(np.sqrt(max(self.geometry.resolution**2 - _FINE**2, 0.0)))
 
-    @property
-    def _on_wall(self) -> float:
-        return float(np.hypot(_ON_WALL, self.rounding))
-
     def state_at(self, x: Floats, y: Floats) -> NDArray[np.int8]:
         """Return the states (...) of the cells at places (...), m; UNKNOWN outside."""
         g = self.geometry
-        col, row = _cells(x, g.origin[0], g.resolution), _cells(y, g.origin[1], g.resolution)
-        inside = (row >= 0) & (row < g.rows) & (col >= 0) & (col < g.cols)
-        flat = np.where(inside, row * g.cols + col, 0)
-        return np.where(inside, self.states.reshape(-1).take(flat), np.int8(-1))
+        return _looked_up(self.states, (y - g.origin[1]) / g.resolution, (x - g.origin[0]) / g.resolution)
 
-    def nearest_at(self, x: Floats, y: Floats) -> Ints:
+    def nearest_at(self, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
         """Return the nearest wall points (...) of places (...), m; -1 where none is within reach."""
-        wide, high = self.nearest.shape
-        i, j = _cells(x, self.origin[0], self.cell), _cells(y, self.origin[1], self.cell)
-        inside = (i >= 0) & (i < wide) & (j >= 0) & (j < high)
-        flat = np.where(inside, i * high + j, 0)
-        return np.where(inside, self.nearest.reshape(-1).take(flat), -1) if self.nearest.size else np.full(np.shape(x), -1)
+        return _looked_up(self.nearest, (x - self.origin[0]) / self.cell, (y - self.origin[1]) / self.cell)
 
     def distances(self, x: Floats, y: Floats) -> Floats:
         """Return the distances (...) of places (...) to the nearest wall point, m; inf beyond reach."""
         near = self.nearest_at(x, y)
-        if not len(self.points):
-            return np.full(np.shape(x), np.inf)
         q = self.points[near]
         return np.where(near >= 0, np.hypot(x - q[..., 0], y - q[..., 1]), np.inf)
 
     def factors(
-        self, poses: Floats, rays: Rays, gate: float, scale: float, rates: tuple[Floats, ...] = ()
+        self, poses: Floats, rays: Rays, scale: float, rates: tuple[Floats, ...] = ()
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the quadratic form of the point-to-line distances about poses (h, 3).
 
         Parameters
         ----------
-        gate : m; ends farther from a wall do not count. scale : m, width of the Geman-McClure kernel on the distance.
+        scale : m, width of the Geman-McClure kernel on the distance.
         rates : (p, 2) each; how the ends move with k further unknowns, frame of the rays.
 
         Returns
@@ -139,23 +144,18 @@ class Walls:
         spurious (h, 3, 3) : the part of the pose's by the scatter of the normals alone, see lidar.degeneracy.
         gradient (h, 3 + k) : sum of w J^T r. weight (h,) : sum of w.
         """
-        c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
-        px, py = rays.ends[rays.hit].T
-        rx, ry = c * px - s * py, s * px + c * py
+        ends = rays.ends[rays.hit]
+        rx, ry = _turned(poses, ends)
         x, y = rx + poses[:, :1], ry + poses[:, 1:2]
         near = self.nearest_at(x, y)
-        if not len(self.points):
-            n, h = 3 + len(rates), len(poses)
-            return np.zeros((h, n, n)), np.zeros((h, 3, 3)), np.zeros((h, n)), np.zeros(h)
         nx, ny = (self.normals[:, k].take(near) for k in (0, 1))
         dx, dy = x - self.points[:, 0].take(near), y - self.points[:, 1].take(near)
-        ox, oy = rays.origins[rays.hit].T - rays.ends[rays.hit].T
-        facing = nx * (c * ox - s * oy) + ny * (s * ox + c * oy)
-        good = (near >= 0) & (dx * dx + dy * dy <= gate * gate) & (nx * nx + ny * ny > 0.5)
-        good &= (facing > 0.0) | ~self.one_sided.take(near)
+        ox, oy = _turned(poses, rays.origins[rays.hit] - ends)
+        good = (near >= 0) & (nx * nx + ny * ny > 0.5)
+        good &= (nx * ox + ny * oy > 0.0) | ~self.one_sided.take(near)
         r = nx * dx + ny * dy
         w = good / np.square(1.0 + np.square(r / scale))
-        more = [nx * (c * u - s * v) + ny * (s * u + c * v) for u, v in (rate[rays.hit].T for rate in rates)]
+        more = [nx * u + ny * v for u, v in (_turned(poses, rate[rays.hit]) for rate in rates)]
         jacobian = np.stack([nx, ny, ny * rx - nx * ry, *more], axis=1)
         weighted = jacobian * w[:, None]
         # The tangent (-ny, nx) replaces the normal.
@@ -164,56 +164,54 @@ class Walls:
         return weighted @ jacobian.transpose(0, 2, 1), spurious, np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
 
     def agreement(self, poses: Floats, rays: Rays) -> Agreement:
-        """Return how rays agree with the map at poses (h, 3).
+        """Return how rays (p,), p > 0, agree with the map at poses (h, 3).
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
         a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
         return there, to the power of a half: what is dark to one ray is dark to its neighbours.
         """
-        c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
-
-        def laid(points: Floats) -> tuple[Floats, Floats]:
-            px, py = points.T
-            return c * px - s * py + poses[:, :1], s * px + c * py + poses[:, 1:2]
-
-        x, y = laid(rays.ends)
-        on_wall = np.exp(-0.5 * np.square(np.minimum(self.distances(x, y), 10.0) / self._on_wall))
-        value = np.log(_STRANGE + (1.0 - _STRANGE) * on_wall)
-        unknown = (self.state_at(x, y) < 0) & (on_wall < 0.5)
-        value = np.where(unknown, 0.5 * np.log(_STRANGE), value)
-        value = np.where(rays.hit, value, 0.0)
-        ox, oy = laid(rays.origins)
+        (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
+        on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
+        strange = float(np.log(STRANGE))
+        unknown = (self.state_at(x, y) == UNKNOWN) & (on_wall < 0.5)
+        value = np.where(unknown, 0.5 * strange, np.log(STRANGE + (1.0 - STRANGE) * on_wall))
         along, across = x - ox, y - oy
-        # Up to 0.3 m before the end: beyond that it may be the wall on which the ray ends.
-        t = _LOOKS[:, None, None] * np.maximum(1.0 - 0.3 / np.maximum(np.hypot(along, across), 0.3), 0.0)
+        t = _LOOKS[:, None, None] * np.maximum(1.0 - _BEFORE / np.maximum(np.hypot(along, across), _BEFORE), 0.0)
         passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
-        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(self.missing)), value)
-        ends = rays.hit & ~unknown
+        missed = np.where(passed, 0.5 * np.log(self.missing), 0.0)
+        value = np.where(rays.hit, np.where(passed, strange, value), missed)
+        ends, judged = rays.hit & ~unknown, ~unknown | ~rays.hit | passed
         known = ends.sum(axis=1).astype(np.float64)
-        share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
-        if not x.shape[1]:
-            return Agreement(np.zeros(len(poses)), np.zeros(len(poses)), share, known, known)
-        judged = ~unknown | ~rays.hit | passed
+        share = (ends & (on_wall >= 0.5)).sum(axis=1) / np.maximum(known, 1.0)
         fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
         return Agreement(value.mean(axis=1), fit, share, known, (ends | passed).sum(axis=1).astype(np.float64))
 
 
-_ON_WALL, _FINE = 0.1, 0.05
-"""m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
-_STRANGE = 0.1
-"""Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
-_LOOKS = np.arange(1, 11) / 10.0
-"""Places along a ray, as shares of its length, at which it is tested for passing a wall."""
+def _turned(poses: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Return x and y (h, p) of points (p, 2) turned by the headings of poses (h, 3)."""
+    c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+    px, py = points.T
+    return c * px - s * py, s * px + c * py
+
+
+def _looked_up(table: NDArray[_Cell], i: Floats, j: Floats) -> NDArray[_Cell]:
+    """Return the entries (...) of a table in the cells with these coordinates (...), -1 outside."""
+    rows, cols = table.shape
+    row, col = np.floor(i).astype(np.intp), np.floor(j).astype(np.intp)
+    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    return np.where(inside, table.reshape(-1).take(np.where(inside, row * cols + col, 0)), table.dtype.type(-1))
 
 
 def walls_of(grid: OccupancyGrid) -> Walls:
     """Return the walls of a grid."""
-    states = grid.states()
-    occupied = _surface(grid.geometry, states)
-    if not len(occupied):
-        empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
-        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), 1.0, none)
-    resolution = grid.geometry.resolution
+    states, resolution = grid.states(), grid.geometry.resolution
+    missing = float(np.clip(grid.missing_share, STRANGE, 1.0)) if np.isfinite(grid.missing_share) else STRANGE
+    # Rays clear the cells in front of a wall and noise fills those behind: the mean of all cells lies 2 to 4 cm behind it.
+    row, col = np.nonzero((states == OCCUPIED) & binary_dilation(states == FREE))
+    if not len(row):
+        none, nowhere, nothing = np.zeros(1), np.zeros((1, 2)), np.full((1, 1), -1)
+        return Walls(grid.geometry, states, nowhere, nowhere, none > 0.0, none, 1.0, nowhere[0], missing, nothing)
+    occupied = grid.geometry.centre_of(row, col)
     sides = _free_side(grid.geometry, states, occupied)
     lines = _lines(occupied, sides, resolution)
     normals = lines.normals * np.where((lines.normals * sides).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
@@ -221,7 +219,6 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     points = lines.centers - _BEHIND * normals * one_sided[:, None]
     cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
     origin, nearest = _nearest(points, cell)
-    missing = float(np.clip(grid.missing_share, _STRANGE, 1.0)) if np.isfinite(grid.missing_share) else _STRANGE
     return Walls(grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest)
 
 
@@ -229,27 +226,22 @@ def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats)
     """Return the direction (n, 2) in which free space lies from points (n, 2); 0 where it lies on either side alike."""
     free = (states == FREE).astype(np.float64)
     row, col = geometry.cell_of(points)
-    slope = np.stack([gaussian_filter(free, 1.5, order)[row, col] for order in ((0, 1), (1, 0))], axis=1)
+    slope = np.stack([gaussian_filter(free, _SMOOTH, order)[row, col] for order in ((0, 1), (1, 0))], axis=1)
     return slope / np.maximum(np.hypot(*slope.T), _ONE_SIDE)[:, None]
 
 
 def _lines(points: Floats, sides: Floats, resolution: float) -> Lines:
     """Fit a line to each cell's neighbours on its own side of the wall, a thin one having two surfaces; resolution in m."""
-    radius = max(_NORMAL_RADIUS, 3.0 * resolution)
+    radius = max(_NORMAL_RADIUS, _LEAST_CELLS * resolution)
     lines = estimate_normals(points, make_tree(np.column_stack([points, radius * sides])), radius)
     straight = lines.linearity >= _STRAIGHT
     normals = np.where(straight[:, None], lines.normals, 0.0)
     centers = np.where(straight[:, None], lines.centers, points)
     # A few cells in a row seem to have no scatter at all: that of their rounding is certain.
-    rounded = resolution**2 / 12.0 / np.maximum(lines.neighbours * lines.along, resolution**2 / 12.0)
+    scatter = resolution**2 * UNIFORM_VARIANCE
+    rounded = scatter / np.maximum(lines.neighbours * lines.along, scatter)
     variance = np.where(straight, np.maximum(lines.normal_variance, rounded), 0.0)
     return replace(lines, centers=centers, normals=normals, normal_variance=variance)
-
-
-_STRAIGHT = 0.6
-"""Least linearity of a line through single cells."""
-_ONE_SIDE = 0.1
-"""Slope of the smoothed free space, per cell, from which on it lies to one side; at the surface of a thick wall it is 0.27."""
 
 
 def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
@@ -260,23 +252,3 @@ def _nearest(points: Floats, cell: float) -> tuple[Floats, NDArray[np.int32]]:
     holder[tuple(((points - origin) / cell).astype(np.intp).T)] = np.arange(len(points))
     distance, (x, y) = distance_transform_edt(holder < 0, sampling=cell, return_indices=True)
     return origin, np.where(distance <= REACH, holder[x, y], np.int32(-1))
-
-
-def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
-    """Return the centres (n, 2) of the occupied cells that border on free space, m.
-
-    Rays clear the cells in front of a wall and noise fills those behind: the mean of all cells lies 2 to 4 cm behind the
-    surface.
-    """
-    near = np.zeros(states.shape, dtype=bool)
-    free = states == FREE
-    near[1:] |= free[:-1]
-    near[:-1] |= free[1:]
-    near[:, 1:] |= free[:, :-1]
-    near[:, :-1] |= free[:, 1:]
-    row, col = np.nonzero((states == OCCUPIED) & near)
-    return geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
-
-
-def _cells(values: Floats, origin: float, size: float) -> Ints:
-    return np.floor((values - origin) * (1.0 / size)).astype(np.intp)

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table, concatenated
-from .hypotheses import BIAS_SIGMA
-from .range_update import RangeFacts
+from ..arrays import Floats, concatenated
+from .hypotheses import BIAS_SIGMA, WALL_SIGMA
+from .range_model import DRIFT, RangeFacts, Ranges
 from .walls import Rays
 
 LENGTH = 10.0
@@ -20,8 +20,8 @@ _TURNING = 1.0
 """m of driving that count for a turn by one radian."""
 _LOOK_EVERY, _RANGE_EVERY = 0.4, 0.25
 """m driven between the scans, and between the ranges to one anchor, that are kept."""
-_ALIKE = 3
-"""Ranges to one anchor that a standing robot keeps."""
+_ALIKE, _LATEST = 3, 64
+"""Ranges to one anchor that a standing robot keeps, of so many latest ones to all anchors."""
 _STANDING, _LOOK_AGAIN = 0.05, 1.0
 """m driven, below which a scan replaces the last one, and s after which it does: people who hid the walls move on."""
 RAYS = 48
@@ -56,31 +56,6 @@ class WindowLook:
     """s."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Ranges(Table):
-    """The window's ranges as arrays."""
-
-    anchor: Ints
-    """(m,)."""
-    places: Floats
-    """(m, 2) of the anchors, m."""
-    tags: Floats
-    """(m, 2) of the tag, in the present frame of the base, m."""
-    values: Floats
-    """(m,) horizontal distances, m."""
-    sigma: Floats
-    """(m,) m; including the drift since then."""
-    way: Floats
-    """(m,) odometer at each, m; ascending."""
-    white: Floats
-    """(m,) m; the part of it that is new in every range."""
-    length: Floats
-    """(m,) correlation length of the rest, m."""
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-
 @dataclass(slots=True)
 class Window:
     """Measurements of the last metres (mutable)."""
@@ -101,23 +76,20 @@ class Window:
         """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
         return way - min([way, *(r.way for r in self.ranges[:1]), *(k.way for k in self.looks[:1])])
 
-    def forget(self, way: float) -> None:
-        """Remove measurements from more than LENGTH before, m by the odometer."""
-        self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
-        self.looks = [k for k in self.looks if way - k.way <= LENGTH]
-
     def add_range(self, entry: WindowRange) -> None:
-        """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""
-        own = [r for r in self.ranges[-64:] if r.fact.anchor == entry.fact.anchor]
+        """Keep a range, unless the robot has hardly moved since the last few to the same anchor; forget what is too old."""
+        own = [r for r in self.ranges[-_LATEST:] if r.fact.anchor == entry.fact.anchor]
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
+        self.ranges = [r for r in self.ranges if entry.way - r.way <= LENGTH]
+        self.looks = [k for k in self.looks if entry.way - k.way <= LENGTH]
 
     def wants_look(self, way: float, stamp: float, after: float = -np.inf) -> bool:
-        """Return whether a scan is wanted.
+        """Return whether a scan is wanted, at the odometer's way, m, and a time, s.
 
         Parameters
         ----------
-        way : the odometer at the scan, m. stamp : its time, s. after : s; one that is newer than that is wanted.
+        after : s; one that is newer than that is wanted.
         """
         if not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after:
             return True
@@ -142,19 +114,15 @@ class Window:
     def ranges_since(self, odom: Floats, way: float) -> Ranges:
         """Return the ranges, with the tag's places in the present frame of the base."""
         rows = self.ranges
-        then, tag = np.array([r.odom for r in rows]).reshape(-1, 3), np.array([r.tag for r in rows]).reshape(-1, 2)
+        facts = [(f.range / (1.0 + f.scale), f.square, f.sigma, f.white, f.length) for f in (r.fact for r in rows)]
+        measured, square, sigma, white, length = np.array(facts).reshape(-1, 5).T
+        anchor, ways = np.array([r.fact.anchor for r in rows], dtype=np.intp), np.array([r.way for r in rows])
+        places, tag = (np.array(v).reshape(-1, 2) for v in ([r.fact.place for r in rows], [r.tag for r in rows]))
+        then = np.array([r.odom for r in rows]).reshape(-1, len(odom))
         tags = se2.transform(se2.between(odom, then), tag)
-        ago = np.array([way - r.way for r in rows])
-        measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
-        level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
-        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + BIAS_SIGMA**2 + (DRIFT * ago) ** 2)
-        anchor = np.array([r.fact.anchor for r in rows], dtype=np.intp)
-        noise = np.array([(r.fact.white, r.fact.length) for r in rows]).reshape(-1, 2).T
-        return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma, way - ago, *noise)
-
-
-DRIFT = 0.03
-"""m of drift per metre driven: scale and heading of wheels that are not calibrated."""
+        level = np.sqrt(np.maximum(measured**2 - square, WALL_SIGMA**2))
+        sigma = np.sqrt(sigma**2 + BIAS_SIGMA**2 + (DRIFT * (way - ways)) ** 2)
+        return Ranges(anchor, places, tags, level, sigma, ways, white, length)
 
 
 def way_of(step: Floats) -> float:

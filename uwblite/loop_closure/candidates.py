@@ -1,11 +1,15 @@
 """Candidates for loop closures: pairs of sub-maps that may overlap by the graph's covariance.
 
-Where the graph's own covariance of two sub-maps is small, they are candidates if they should share surfaces; where
-it is large, if they may share surfaces.
+Where the covariance of two sub-maps is small, they are candidates if they should share surfaces; where it is large, if they
+may. Where any pair is uncertain by many metres, stretches of tens of metres are compared first: a search narrower than the
+uncertainty may miss the true place, and a search over all of it finds many places at which one sub-map of a corridor fits, but
+one only at which doors and pillars match as well as walls (net_overlap). The likeliest pairs come first: each closed loop
+makes the others more certain.
 """
 
 from collections.abc import Set
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,9 +17,35 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
+from ..lidar import submaps
 from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps
 from .closures import Closures, LoopClosureConfig
+
+Tried = set[tuple[int, int, bool]]
+"""Target, source, and whether they were searched, of pairs that were tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class CandidatePolicy:
+    """Which pairs are worth a match."""
+
+    sigmas: ClassVar[float] = 3.0
+    """Standard deviations of a guess within which the true place is looked for."""
+    shared: ClassVar[float] = 0.25
+    """Least share of its surface that the smaller of two sub-maps should have in common with the other."""
+    cells: ClassVar[int] = 5
+    """Surface of a sub-map, in cells, up to which it shows no place."""
+    length: ClassVar[float] = 30.0
+    """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays
+    within the gate of the final matching. Each begins in the middle of the one before."""
+    wider: ClassVar[float] = 2.0
+    """Factor on the standard deviations of a chain of steps: a bias that following steps share adds up along the way, and the
+    covariance contains none (twice the stated heading in a hospital)."""
+    never: ClassVar[float] = 1e-4
+    """Probability of an overlap up to which stretches are not tried; the covariance may be too small, but not by so much."""
+    at_once: ClassVar[int] = 40
+    """Pairs of stretches tried before the graph is solved again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,24 +61,20 @@ class Candidates(Table):
     covariance: Floats
     """(c, 3, 3) of the guess."""
     spread: Floats
-    """(c,) 3 sigma of its position, m."""
+    """(c,) m, of its position: half-width of a search."""
     constrained: bool = True
     """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
     long: bool = False
     """The sub-maps are long stretches, of which a part may overlap."""
 
-    def renumbered(self, target: Ints, source: Ints) -> "Candidates":
-        """Return them with other numbers of sub-maps."""
-        return replace(self, target=target, source=source)
-
-    def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
-        """Return (target, source, searched) of each, as a record of the pairs tried."""
+    def names(self, config: LoopClosureConfig) -> Tried:
+        """Return them as a record of the pairs tried."""
         doubtful = self.spread > config.direct
-        return {(int(a), int(b), bool(d)) for a, b, d in zip(self.target, self.source, doubtful, strict=True)}
+        return set(zip(self.target.tolist(), self.source.tolist(), doubtful.tolist(), strict=True))
 
 
 def propose(
-    graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
+    graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: Tried,
     missed: set[tuple[int, int]], constrained: bool, config: LoopClosureConfig, beyond: float = -1.0,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
@@ -57,17 +83,15 @@ def propose(
     ----------
     graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
     recording : (k,) recording of each keyframe.
-    tried : (target, source, searched) of earlier rounds; not proposed again.
-    constrained : ranges constrain the trajectory.
-    beyond : pairs whose 3 sigma are no larger, m, are left out; so are those of which a search would see a part only.
+    tried : in earlier rounds; not proposed again.
     missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
+    constrained : ranges constrain the trajectory.
+    beyond : pairs that are no more uncertain, m, are left out.
     """
-    reference = submaps.reference
+    reference, rules = submaps.reference, CandidatePolicy
     poses = graph.poses[reference]
     a, b, distance = _near(poses, recording[reference], config)
-    if not len(a):
-        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), constrained)
-    covariance = marginals.relative(reference[a], reference[b])
+    guess, covariance = se2.between(poses[a], poses[b]), marginals.relative(reference[a], reference[b])
     astray = _among(np.stack([a, b]), missed)
     covariance[astray] += np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     spread = _spread(covariance)
@@ -76,15 +100,13 @@ def propose(
     size = np.maximum(np.diff(seen.indptr), 1)
     expected = common / np.minimum(size[a], size[b])
     doubtful = spread > config.direct
-    guess = se2.between(poses[a], poses[b])
     worth = np.where(doubtful & ~astray, overlap_probability(guess, covariance, config.reach), expected)
     near = distance < config.reach + np.minimum(spread, config.search_limit)
-    possible = np.where(doubtful, near & (worth > 0.0), expected > 0.25) & (size[a] > 5) & (size[b] > 5)
-    possible &= (spread > beyond) & (spread <= config.search_limit)
-    fresh = ~_among(np.stack([a, b, doubtful]), tried)
-    kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
-    a, b = a[kept], b[kept]
-    return Candidates(a, b, guess[kept], covariance[kept], spread[kept], constrained)
+    possible = np.where(doubtful, near & (worth > 0.0), expected > rules.shared)
+    possible &= (np.minimum(size[a], size[b]) > rules.cells) & (spread > beyond) & (spread <= config.search_limit)
+    possible &= ~_among(np.stack([a, b, doubtful]), tried)
+    kept = _best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
+    return Candidates(a[kept], b[kept], guess[kept], covariance[kept], spread[kept], constrained)
 
 
 def overlap_probability(guess: Floats, covariance: Floats, reach: float) -> Floats:
@@ -105,14 +127,6 @@ def _among(columns: Ints, names: Set[tuple[int, ...]]) -> Bools:
     return np.isin(places @ columns, places @ named)
 
 
-def uncertain(
-    graph: Graph, marginals: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig, beyond: float
-) -> bool:
-    """Return whether any two reference keyframes (s,) so near that they may be tried have 3 sigma beyond a limit, m."""
-    a, b, _ = _near(graph.poses[reference], recording[reference], config)
-    return bool(len(a) and _spread(marginals.relative(reference[a], reference[b])).max() > beyond)
-
-
 def _near(poses: Floats, recording: Ints, config: LoopClosureConfig) -> tuple[Ints, Ints, Floats]:
     """Return pairs (p,), (p,) of poses (s, 3) that may be tried, and their distances, m; neighbours in time may not."""
     a, b = np.triu_indices(len(poses), 1)
@@ -122,8 +136,8 @@ def _near(poses: Floats, recording: Ints, config: LoopClosureConfig) -> tuple[In
 
 
 def _spread(covariance: Floats) -> Floats:
-    """Return 3 sigma (p,) of places in the direction in which it is largest, m, by covariances (p, 3, 3)."""
-    return 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
+    """Return how far (p,), m, places may be off in the direction in which they are least certain."""
+    return CandidatePolicy.sigmas * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
 
 
 def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
@@ -138,9 +152,61 @@ def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
 
 def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -> set[tuple[int, int]]:
     """Return (target, source) of candidates that were matched from the graph's guess and shared too few points."""
-    direct = candidates.spread <= config.direct
-    return {
-        (int(a), int(b))
-        for a, b, d, records in zip(candidates.target, candidates.source, direct, found.candidates, strict=True)
-        if d and records.overlap < config.overlap
-    }
+    few = np.array([record.overlap < config.overlap for record in found.candidates], dtype=bool)
+    few &= candidates.spread <= config.direct
+    return set(zip(candidates.target[few].tolist(), candidates.source[few].tolist(), strict=True))
+
+
+def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return first keyframe (s,), one past the last (s,) and reference (s,) of stretches, each overlapping the next by half.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m. recording : (k,).
+    """
+    first, last = submaps.cut(path, recording, CandidatePolicy.length / 2.0)
+    goes_on = recording[first[1:]] == recording[first[:-1]]
+    last[:-1] = np.where(goes_on, last[1:], last[:-1])
+    return first, last, (first + last - 1) // 2
+
+
+def _of_stretches(config: LoopClosureConfig) -> LoopClosureConfig:
+    return replace(config, reach=CandidatePolicy.length / 2.0, search_limit=np.inf)
+
+
+def any_uncertain(
+    graph: Graph, covariance: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig
+) -> bool:
+    """Return whether any stretches, or sub-maps, that may overlap are too uncertain for a search of sub-maps.
+
+    Parameters
+    ----------
+    reference : (s,) keyframes in the middle of each. recording : (k,).
+    """
+    a, b, _ = _near(graph.poses[reference], recording[reference], _of_stretches(config))
+    return bool(_spread(covariance.relative(reference[a], reference[b])).max(initial=0.0) > config.search_limit)
+
+
+def uncertain_pairs(
+    graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: Tried, constrained: bool,
+    config: LoopClosureConfig, beyond: float,
+) -> Candidates:
+    """Return pairs of stretches that may overlap and are more uncertain than a limit, m, the likeliest first; see propose."""
+    wide = _of_stretches(config)
+    found = replace(propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, beyond), long=True)
+    chance = overlap_probability(found.guess, found.covariance, wide.reach)
+    order = np.argsort(-chance, kind="stable")
+    return found.rows(order[chance[order] > CandidatePolicy.never])
+
+
+def first_of(candidates: Candidates) -> Candidates:
+    """Return the candidates that are tried before the graph is solved again, as uncertain as a chain of steps may be."""
+    first = candidates.rows(slice(0, CandidatePolicy.at_once))
+    wider = 1.0 if candidates.constrained else CandidatePolicy.wider
+    return replace(first, covariance=wider**2 * first.covariance, spread=wider * first.spread)
+
+
+def likely(candidates: Candidates) -> Candidates:
+    """Return the candidates whose stretches overlap within one standard deviation."""
+    reach = CandidatePolicy.length / 2.0 + candidates.spread / CandidatePolicy.sigmas
+    return candidates.rows(np.flatnonzero(np.hypot(candidates.guess[:, 0], candidates.guess[:, 1]) < reach))

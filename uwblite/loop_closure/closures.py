@@ -23,8 +23,6 @@ class LoopClosureConfig:
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4
     """Most rounds of searching and solving; ends early when a round finds nothing new."""
-    enough: ClassVar[float] = 5.0
-    """Closures per sub-map, on average, after which no further round is made."""
     direct: ClassVar[float] = 0.5
     """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
     reach: float = setting(6.0, advanced=True)
@@ -52,10 +50,10 @@ class LoopClosureConfig:
     overlap and no range constrains the trajectory: the wheels may have slipped. Such pairs are searched once more."""
     slip_angle: ClassVar[float] = 0.2
     """The same for the heading, rad."""
-    consistency: ClassVar[float] = 16.0
-    """Largest squared Mahalanobis distance between match and graph, and of an accepted match in the second optimisation (3
-    degrees of freedom; 16 = 0.1 %). Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong
-    far beyond its covariance, and only the second counts."""
+    agrees: ClassVar[float] = 4.0
+    """Standard deviations within which measurements of a pose agree; of its three directions together, by the Mahalanobis
+    distance, 0.1 % are farther off. Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong far
+    beyond its covariance, and matches need to agree with the second optimisation alone."""
     points: ClassVar[int] = 250
     """Points looked up per pair."""
     match_sigma: ClassVar[float] = 0.03

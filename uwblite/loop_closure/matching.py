@@ -3,7 +3,7 @@
 Candidates are matched in batches, each with the sub-maps it needs: by one process or by several, with the same result.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated, renumbered
+from ..arrays import Bools, Floats, Ints, concatenated
 from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
@@ -22,23 +22,28 @@ from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import match, pair_points
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import violates_free_space
-from .candidates import Candidates
+from .candidates import CandidatePolicy, Candidates
 from .closures import LoopClosureConfig
-from .parallel import in_order
+from .parallel import batches, in_order
 
 
 @dataclass(frozen=True, slots=True)
 class MatchingPolicy:
     """Search for the places of candidates."""
 
-    at_once: ClassVar[int] = 32
-    """Candidates of a batch."""
+    cell: ClassVar[float] = 0.1
+    reach: ClassVar[float] = 0.5
+    """m, of the rasters in which nearest points are looked up."""
+    least_turn: ClassVar[float] = 0.1
+    """Least half-width of a search, rad."""
     many_places: ClassVar[int] = 20
     """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
     many_points: ClassVar[int] = 1000
     """Points of each of two long stretches that are compared at every place."""
     same_place: ClassVar[float] = 0.3
     """Matches nearer to each other than this, m and rad, are one place."""
+    finer: ClassVar[float] = 1.5
+    """Factor by which the headings of a wide search are closer."""
     extent: ClassVar[float] = 0.95
     """Share of the points of a cloud that its extent contains: those that are far are few."""
 
@@ -48,23 +53,22 @@ class ClosureMatches:
     """How candidates (c,) fit."""
 
     best: Aligned
-    """Best match of each; the guess where no place was found."""
+    """The guess where no place was found."""
     found: Bools
-    """(c,) a place was found."""
+    """A place was found."""
     second: Floats
-    """(c,) ratio of the matches at the second-best place to those at the best."""
+    """Ratio of the matches at the second-best place to those at the best."""
     through: Floats
-    """(c,) share of its points that would stand in free space."""
+    """Share of its points that would stand in free space."""
     net: Floats
-    """(c,) m, net matching surface, see net_overlap; inf where no wide search was made."""
+    """m, net matching surface, see net_overlap; inf where no wide search was made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Some candidates and all data for matching them."""
+    """Some candidates, by the numbers of the sub-maps of the batch."""
 
     candidates: Candidates
-    """Numbers of sub-maps are those of the batch."""
     clouds: Clouds
     spacing: float
     free: Sequence[FreeSpace] | None
@@ -83,48 +87,43 @@ def fit(
     ----------
     free : observed free space of each sub-map; None = not tested.
     """
-    total, done, parts = len(candidates.target), 0, []
-    for part, spent in in_order(_fit, _batches(candidates, submaps, config, search_config, free), executor):
+    tasks = (
+        _Batch(
+            replace(candidates.rows(rows), target=target, source=source), replace(submaps.clouds.chosen(used), work=Work()),
+            submaps.spacing, None if free is None else [free[k] for k in used.tolist()], config, search_config,
+        )
+        for rows, used, target, source in batches(candidates.target, candidates.source)
+    )
+    done, parts = 0, []
+    for part, spent in in_order(_fit, tasks, executor):
         parts.append(part)
         submaps.clouds.work.update(spent)
         done += len(part.found)
         if progress is not None:
-            progress(done, total)
+            progress(done, len(candidates.target))
     return concatenated(parts)
-
-
-def _batches(
-    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
-    free: Sequence[FreeSpace] | None,
-) -> Iterator[_Batch]:
-    for first in range(0, len(candidates.target), MatchingPolicy.at_once):
-        part = candidates.rows(slice(first, first + MatchingPolicy.at_once))
-        used, target, source = renumbered(part.target, part.source)
-        spaces = None if free is None else [free[k] for k in used.tolist()]
-        clouds = replace(submaps.clouds.chosen(used), work=Work())
-        yield _Batch(part.renumbered(target, source), clouds, submaps.spacing, spaces, config, search_config)
 
 
 def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     """Fit one batch, and return the work of that; runs in a worker."""
     candidates, clouds, config = batch.candidates, batch.clouds, batch.config
-    raster = rasterize(clouds, 0.1, 0.5)
+    rules, gate = MatchingPolicy, config.gate
+    raster = rasterize(clouds, rules.cell, rules.reach)
     row, guess = _guesses(batch)
-    points = pair_points(clouds, candidates.source[row], config.points)
-    tries = align_pairs(clouds, raster, candidates.target[row], guess, points, 0.5, config.gate)
-    wide = np.full(len(candidates.target), candidates.long)
-    score, some = tries.share, np.flatnonzero(wide[row])
-    target, source = candidates.target[row[some]], candidates.source[row[some]]
-    poses = tries.pose[some]
-    many, gate = MatchingPolicy.many_points, config.gate
-    score[some] = net_overlap(clouds, raster, batch.free, target, source, poses, many, gate, batch.spacing)
+    target, source = candidates.target[row], candidates.source[row]
+    points = pair_points(clouds, source, config.points)
+    tries = align_pairs(clouds, raster, target, guess, points, rules.reach, gate)
+    score = tries.share
+    if candidates.long:
+        score = net_overlap(clouds, raster, batch.free, target, source, tries.pose, rules.many_points, gate, batch.spacing)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
     net = np.full(len(place), np.inf)
-    net[wide & found] = score[place[wide & found]]
+    if candidates.long:
+        net[found] = score[place[found]]
     pose[found] = tries.pose[place[found]]
     points = pair_points(clouds, candidates.source, config.points)
-    factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
+    factors = match(clouds, raster, candidates.target, pose, points, gate, gate / 2.0)
     best = Aligned(pose, factors)
     through = _free_space_violations(batch, best, _promising(best, net, config))
     return ClosureMatches(best, found, second, through, net), clouds.work
@@ -138,13 +137,13 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
-            half_width = float(candidates.spread[k])
             search_config, places = batch.search, config.places
             if candidates.long:
                 search_config, places = _coarse(batch.search), MatchingPolicy.many_places
-            turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
+            turn = CandidatePolicy.sigmas * np.sqrt(candidates.covariance[k, 2, 2])
+            turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
             target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
-            centre, half_widths = _window(poses[0], half_width, turn, target, source)
+            centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
             poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
@@ -167,9 +166,11 @@ def _window(
 
 
 def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
-    """Return the settings of a wide search: twice the cells, finer headings for long clouds, and many places."""
-    twice = replace(config, resolution=2.0 * config.resolution, spread=2.0 * config.spread)
-    return replace(twice, angle_step=config.angle_step / 1.5, candidates=MatchingPolicy.many_places)
+    """Return the settings of a wide search: larger cells, finer headings for long clouds, and many places."""
+    return replace(
+        config, resolution=2.0 * config.resolution, spread=2.0 * config.spread,
+        angle_step=config.angle_step / MatchingPolicy.finer, candidates=MatchingPolicy.many_places,
+    )
 
 
 def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tuple[Ints, Floats]:
@@ -186,12 +187,12 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     apart = se2.between(pose[best[row]], pose)
     other = (np.hypot(apart[:, 0], apart[:, 1]) > MatchingPolicy.same_place) | (np.abs(apart[:, 2]) > MatchingPolicy.same_place)
     np.maximum.at(second, row[other], share[other])
-    second[tried] /= np.maximum(share[best[tried]], 1e-9)
+    second[tried] /= np.maximum(share[best[tried]], np.finfo(np.float64).tiny)
     return best, second
 
 
 def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
-    """Return one sub-map's cloud ready for the search; its normals point to the side of the laser."""
+    """Return a sub-map's cloud ready for the search; its normals point to the side of the laser."""
     if k not in prepared:
         points, normals = clouds.cloud(k)
         prepared[k] = make_cloud(points, points + normals, work=clouds.work)

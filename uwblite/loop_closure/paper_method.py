@@ -1,18 +1,17 @@
 """Loop closures by the paper's method: ICP between sub-maps that overlap after the first optimisation.
 
 One registration per pair, from the graph's guess; a pair is accepted when the fitness score, the mean squared distance
-of the source's points to the target, is below a threshold. There is no search, no test of uniqueness and no test of
-consistency among closures; the other modules of ``loop_closure`` add these.
+of the source's points to the target, is below a threshold.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, renumbered
+from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..lidar.clouds import Clouds
 from ..lidar.point_cloud import make_tree
@@ -20,14 +19,12 @@ from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
 from .closures import Closures, LoopClosureConfig, collected
-from .parallel import in_order
+from .parallel import batches, in_order
 
 _CELL = 0.5
 """m, edge of squares; the overlap of two sub-maps is the share of the smaller one's squares in which both have points."""
 _LEAST_SHARED = 0.25
 """Least such share of a candidate."""
-_AT_ONCE = 32
-"""Pairs of a batch."""
 
 
 def find(
@@ -38,16 +35,17 @@ def find(
 
     Parameters
     ----------
-    graph : poses that place the sub-maps.
     recording : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
-    config : its partners bound the candidates per sub-map. icp : outlier distance, iterations and fitness.
-    executor : any concurrent.futures executor; the result does not depend on it.
+    config : its partners bound the candidates per sub-map. executor : the result does not depend on it.
     """
     target, source = candidates(graph.poses, submaps, recording, config.partners)
     i, j = submaps.reference[target], submaps.reference[source]
     guess = se2.between(graph.poses[i], graph.poses[j])
     results: list[Registration] = []
-    for part in in_order(_align, _batches(submaps.clouds, target, source, guess, icp), executor):
+    tasks = (
+        _Batch(submaps.clouds.chosen(used), a, b, guess[rows], icp) for rows, used, a, b in batches(target, source)
+    )
+    for part in in_order(_align, tasks, executor):
         results += part
         if progress is not None:
             progress(len(results), len(target))
@@ -61,8 +59,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
 
     Parameters
     ----------
-    poses : (k, 3) of the keyframes. recording : (k,).
-    limit : most partners per sub-map, best overlap first.
+    poses, recording : of the keyframes. limit : most partners per sub-map, best overlap first.
     """
     shared = _shared(poses[submaps.reference], submaps)
     a, b = np.triu_indices(len(submaps), 1)
@@ -95,20 +92,11 @@ def _shared(poses: Floats, submaps: Submaps) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Some pairs of sub-maps and their clouds."""
-
     clouds: Clouds
     target: Ints
     source: Ints
     guess: Floats
     icp: IcpConfig
-
-
-def _batches(clouds: Clouds, target: Ints, source: Ints, guess: Floats, icp: IcpConfig) -> Iterator[_Batch]:
-    for first in range(0, len(target), _AT_ONCE):
-        rows = slice(first, first + _AT_ONCE)
-        used, own_target, own_source = renumbered(target[rows], source[rows])
-        yield _Batch(clouds.chosen(used), own_target, own_source, guess[rows], icp)
 
 
 def _align(batch: _Batch) -> list[Registration]:

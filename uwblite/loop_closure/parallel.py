@@ -1,22 +1,28 @@
-"""Work spread over processes, or done in this one: the results come in the order of the tasks either way.
+"""Pairs of sub-maps in batches, spread over processes or done in this one: the results come in the order of the tasks.
 
-The division into tasks does not depend on the number of workers; so neither does any result.
+The division into batches does not depend on the number of workers; so neither does any result.
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from typing import TypeVar
 
+from ..arrays import Ints, renumbered
+
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
+_AT_ONCE = 32
+"""Pairs of a batch."""
+
+
+def batches(target: Ints, source: Ints) -> Iterator[tuple[slice, Ints, Ints, Ints]]:
+    """Yield the rows of some pairs at a time, the sub-maps of these, and their numbers among them of targets and sources."""
+    for first in range(0, len(target), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        yield rows, *renumbered(target[rows], source[rows])
+
 
 def in_order(work: Callable[[Task], Answer], tasks: Iterable[Task], executor: Executor | None = None) -> Iterator[Answer]:
-    """Yield work(task) for every task.
-
-    Parameters
-    ----------
-    work : a function of a module, so that it can be sent to another process.
-    executor : any concurrent.futures executor; None = in this process, one task at a time.
-    """
+    """Yield work(task) for every task; work is a function of a module, so that it can be sent to another process."""
     yield from map(work, tasks) if executor is None else executor.map(work, list(tasks))

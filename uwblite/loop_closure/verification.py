@@ -1,9 +1,8 @@
 """Loop closures: which sub-maps show the same place, and the edges that follow for their poses.
 
-Candidates are sub-maps that may overlap by the graph's poses and their marginal covariance. Where the covariance
-is small, matching starts from the graph's guess; where it is large, a correlative search over the whole uncertainty
-comes first. A match then has to explain enough points, closely enough, agree with the graph's own uncertainty, be the
-only good one, violate no free space, and finally agree with all other closures in the second optimisation.
+Where the covariance of two sub-maps is small, matching starts from the graph's guess; where it is large, a correlative search
+over the whole uncertainty comes first. A match then has to explain enough points, closely enough, agree with the graph's own
+uncertainty, be the only good one, violate no free space, and finally agree with all other closures in the second optimisation.
 Every candidate is kept, with the reason for its outcome.
 """
 
@@ -21,14 +20,22 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
 from ..lidar.free_space import FreeSpace
-from ..lidar.pair_alignment import Aligned
 from ..lidar.scan_matching import measured
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
-from . import slid_stretches
+from . import chain_breaks
 from .candidates import Candidates
 from .closures import Closures, LoopClosureConfig, collected, no_closures
 from .matching import ClosureMatches, fit
+
+_SINGULAR = 1e-9
+"""Share of the largest eigenvalue of an information up to which another one is none."""
+_ROUGH = 1e-4
+"""Relative decrease of chi2 that ends a search with one scale of the kernel."""
+_TIGHTER = 3.0
+"""Ratio of each scale of that kernel to the next, and the scale of that of what remains, standard deviations."""
+_SLID = 3
+"""Most searches for shifted stretches: without the closures that moved one, another may show."""
 
 
 def find(
@@ -36,21 +43,24 @@ def find(
     progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
     executor: Executor | None = None,
 ) -> Closures:
-    """Match candidates and verify each on its own.
+    """Match candidates and verify each on its own; accepted ones become edges between the sub-maps' keyframes.
 
     Parameters
     ----------
     free : see visibility.observed_free_space; None = free-space violations are not tested.
-    executor : any concurrent.futures executor; the result does not depend on it.
+    executor : the result does not depend on it.
     """
     if not len(candidates.target):
         return no_closures()
     fits = fit(candidates, submaps, config, search_config, free, progress, executor)
-    result = fits.best
-    variance = np.full(len(result.pose), config.match_sigma**2 * config.correlation)
-    z, sqrt_information = measured(result.factors, result.pose, variance)
-    verdicts = _judge(candidates, fits, z, sqrt_information, config)
-    return _collect(candidates, submaps, result, z, sqrt_information, verdicts)
+    best = fits.best
+    variance = np.full(len(best.pose), config.match_sigma**2 * config.correlation)
+    z, root = measured(best.factors, best.pose, variance)
+    i, j = (submaps.reference[number].tolist() for number in (candidates.target, candidates.source))
+    columns = z, np.swapaxes(root, 1, 2) @ root, best.rms.tolist(), best.share.tolist()
+    verdicts = _judge(candidates, fits, z, root, config)
+    rows = zip(i, j, *columns, verdicts, strict=True)
+    return collected([LoopClosure(*row, *verdict) for *row, verdict in rows], root)
 
 
 def _judge(
@@ -60,15 +70,15 @@ def _judge(
     result, searched = fits.best, candidates.spread > config.direct
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
-    seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    seen = np.linalg.pinv(information, rcond=_SINGULAR, hermitian=True)
     # Only directions that the match measures are compared: project the error onto them.
     onto = seen @ information
     visible = np.einsum("eij,ej->ei", onto, error)
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
-    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
+    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=_SINGULAR, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
     share, rms = result.share, result.rms
-    most = config.consistency if candidates.constrained else np.inf
+    most = config.agrees**2 if candidates.constrained else np.inf
     verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
         least = config.overlap_after_search if searched[k] else config.overlap
@@ -97,21 +107,6 @@ def _judge(
     return verdicts
 
 
-def _collect(
-    candidates: Candidates, submaps: Submaps, result: Aligned, z: Floats, sqrt_information: Floats,
-    verdicts: list[tuple[str, str]],
-) -> Closures:
-    """Return every candidate with its outcome, and the accepted ones as edges between the sub-maps' keyframes."""
-    i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
-    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
-    share, rms = result.share, result.rms
-    records = [
-        LoopClosure(int(i[k]), int(j[k]), z[k], information[k], float(rms[k]), float(share[k]), outcome, reason)
-        for k, (outcome, reason) in enumerate(verdicts)
-    ]
-    return collected(records, sqrt_information)
-
-
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
     """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those that disagree.
 
@@ -121,7 +116,7 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
     """
     solved, left = _tightened(graph, closures, config, solver)
     for _ in range(_SLID):
-        by = slid_stretches.moved_by(left.edges, solved)
+        by = chain_breaks.moved_by(left.edges, solved)
         if not by.any():
             break
         reasons = [f"the odometry would have to jump by {jump:.1f} m and back again" for jump in by]
@@ -129,28 +124,21 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
     return solved, left
 
 
-_SLID = 3
-"""Most searches for shifted stretches: without the closures that moved one, another may show."""
-
 
 def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
-    """Solve the graph with closures under a kernel that tightens; drop those that disagree."""
     if not len(closures.edges):
         return graph, closures
-    quick = replace(solver, relative_decrease=1e-4)
+    quick = replace(solver, relative_decrease=_ROUGH)
     worst = float(np.linalg.norm(closures.edges.residuals(graph), axis=1).max())
     # The first scale contains every closure: one that ends a long drift would else be rejected before it has any weight.
-    steps = int(np.ceil(np.log(max(worst / _LAST, 1.0)) / np.log(_TIGHTER)))
-    scales = [_LAST * _TIGHTER**k for k in range(steps, -1, -1)]
+    steps = int(np.ceil(np.log(max(worst / config.agrees, 1.0)) / np.log(_TIGHTER)))
+    scales = [config.agrees * _TIGHTER**k for k in range(steps, -1, -1)]
     solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
-    kept = squared < config.consistency
+    kept = squared < config.agrees**2
     reasons = [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared]
     left = closures.without(kept, "contradicts-closures", reasons)
-    return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", 3.0)))
+    return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", _TIGHTER)))
 
-
-_LAST, _TIGHTER = 4.0, 3.0
-"""Last scale of the kernel, standard deviations, and the ratio of each to the next."""

@@ -1,8 +1,4 @@
-"""Ranges and rays attached to keyframes.
-
-They are measured between keyframes; the odometry since the keyframe becomes their lever arm, so they need no poses of their
-own, and none is discarded.
-"""
+"""Ranges and rays attached to keyframes: the odometry since the keyframe is their lever arm."""
 
 from dataclasses import dataclass
 
@@ -16,7 +12,7 @@ from .keyframes import KeyframeConfig, Keyframes, velocity_at
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttachedRanges:
-    """Ranges seen from keyframes: the lever arm carries the motion since the keyframe."""
+    """Ranges seen from keyframes."""
 
     keyframe: Ints
     """(m,) keyframe at or before the range."""
@@ -63,8 +59,7 @@ class ScanPoints(Table):
 def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframes, mounting: SensorMounting) -> AttachedRanges:
     """Tie each range to the keyframe at or before it; ranges outside the odometry's time keep the nearest end's pose.
 
-    The offset of a further tag from the first one is added to the lever arm, as if the base were shifted so that the first tag
-    is at the place of the further one.
+    The offset of a further tag from the first one is added to the lever arm, as if the base were shifted by it.
     """
     keyframe = np.clip(np.searchsorted(keyframes.stamps, log_ranges.stamps, "right") - 1, 0, len(keyframes) - 1)
     base = odometry.at(log_ranges.stamps)
@@ -133,8 +128,7 @@ def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints,
 def beam_origins(first: Floats, sweep: Floats, scan: Ints, fraction: Floats, mounting: SensorMounting) -> Floats:
     """Return the pose (p, 3) of the laser at each ray: base pose at the sweep's start, moved by a fraction of the sweep.
 
-    Within one sweep (0.1 s) the motion is taken as linear in x, y and theta; the error is below
-    v omega t^2 / 8, 0.1 mm for a robot turning at 0.5 rad/s at 0.2 m/s.
+    The motion is taken as linear in x, y and theta: over 0.1 s the error is below v omega t^2 / 8, some 0.1 mm.
     """
     moved = sweep[scan] * fraction[:, None]
     shift = moved[:, :2] + se2.rotate(moved[:, 2], mounting.T_base_laser[:2])

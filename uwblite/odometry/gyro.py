@@ -14,14 +14,15 @@ from ..arrays import Bools, Floats
 from ..findings import Fact
 from ..graph.calibration import CalibrationConfig
 from ..sensor_log import Gyro, Odometry, SensorLog
+from .odometer import FASTEST
 from .wheels import OdometryNoiseConfig
 
 GAP = 0.25
 """s between two gyro readings from which on the turn of the wheels is used instead."""
-STANDING = (0.002, 0.002)
+STANDING = 0.002
 """m and rad of the wheels in one second below which the robot stands: ticks and noise of the wheels."""
-LEAST_STANDING = 3
-"""Seconds of standing from which the gyro's bias is taken from them alone."""
+LEAST_RESTS = 6
+"""Windows of standing, which overlap by half, from which the gyro's bias is taken from them alone."""
 WINDOW = 5.0
 """s over which the turns of gyro and wheels are compared where the robot never stands."""
 LEFT_OF_BIAS = 0.003
@@ -36,8 +37,8 @@ one robot. Slipping wheels do not reach it."""
 READINGS = {
     1.0: "",
     -1.0: "it turns against the wheels, and is turned over (a sensor upside down, or one that counts clockwise)",
-    np.pi / 180.0: "it counts degrees",
-    -np.pi / 180.0: "it counts degrees, and turns against the wheels",
+    np.radians(1.0): "it counts degrees",
+    -np.radians(1.0): "it counts degrees, and turns against the wheels",
 }
 """Factor that converts a heading to radians counter-clockwise -> the reason."""
 SLIP = 3.0
@@ -49,10 +50,7 @@ PER_TURN, PER_METRE = 0.005, 0.001
 def settings(
     log: SensorLog, calibration: CalibrationConfig, noise: OdometryNoiseConfig
 ) -> tuple[CalibrationConfig, OdometryNoiseConfig]:
-    """Return the priors and the noise of the odometry, with those of a gyro's heading where the recording has one.
-
-    Values that the user switched off (0) stay off, and values that were set smaller stay.
-    """
+    """Return priors and noise of odometry, with those of a gyro's heading where there is one; what is off, or less, stays."""
     if log.gyro is None:
         return calibration, noise
     bias = max(calibration.heading_rate, LEFT_OF_BIAS) if calibration.heading_rate else 0.0
@@ -63,14 +61,11 @@ def settings(
 
 
 def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
-    """Return the recording with the gyro's heading, corrected by its bias, in its odometry; and a remark.
+    """Return the recording with the gyro's heading, corrected by its bias, in its odometry; and a fact.
 
-    A heading with the wrong sign or in degrees is recognised by the wheels and corrected; one that is not correlated with their
-    turns is not used.
-
-    Each step of the wheels keeps its length; its direction turns by half of the difference of both headings (the chord of
-    an arc). The bias is the gyro's turn rate while the wheels stand, else the median difference to that of the wheels;
-    the remaining bias is estimated with the map (``heading_rate``).
+    A heading with the wrong sign or in degrees is recognised by the wheels; one that is not correlated with their turns is not
+    used. Each step of the wheels keeps its length; its direction turns by half of the difference of both headings (the chord of
+    an arc). The bias that remains is estimated with the map (``heading_rate``).
     """
     gyro, odometry = log.gyro, log.odometry
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:
@@ -86,13 +81,14 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     bias, standing = bias_of(gyro, odometry)
     heading = np.interp(odometry.stamps, gyro.stamps, gyro.heading) - bias * (odometry.stamps - odometry.stamps[0])
     turn = np.where(covered, np.diff(heading), steps[:, 2])
-    shift = se2.rotate(0.5 * (turn - steps[:, 2]), steps[:, :2])
-    theta = odometry.poses[0, 2] + np.concatenate([[0.0], np.cumsum(turn)])
-    along = np.cumsum(se2.rotate(theta[:-1], shift), axis=0)
-    xy = odometry.poses[0, :2] + np.concatenate([np.zeros((1, 2)), along])
-    poses = np.column_stack([xy, se2.wrap_angle(theta)])
+    poses = se2.chain(odometry.poses[0], _turned(steps, turn))
     fact = Fact.of("gyro", used=float(covered.mean()), bias=bias, rests=standing, why=why)
     return replace(log, odometry=Odometry(odometry.stamps, poses)), [fact]
+
+
+def _turned(steps: Floats, turn: Floats) -> Floats:
+    """Return steps (..., 3) that turn by other angles (...): each keeps the length of its arc."""
+    return np.concatenate([se2.rotate(0.5 * (turn - steps[..., 2]), steps[..., :2]), np.asarray(turn)[..., None]], axis=-1)
 
 
 def _covered(gyro: Gyro, stamps: Floats) -> Bools:
@@ -107,8 +103,8 @@ def _covered(gyro: Gyro, stamps: Floats) -> Bools:
 def bias_of(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
     """Return the gyro's bias, rad/s, and whether it was measured while the robot stood."""
     turned, by_wheels, way = _changes(gyro, odometry, 1.0)
-    rests = (way < STANDING[0]) & (np.abs(by_wheels) < STANDING[1])
-    if rests.sum() >= 2 * LEAST_STANDING:
+    rests = np.maximum(way, np.abs(by_wheels)) < STANDING
+    if rests.sum() >= LEAST_RESTS:
         return float(np.median(turned[rests])), True
     turned, by_wheels, _ = _changes(gyro, odometry, WINDOW)
     return (float(np.median(turned - by_wheels)) / WINDOW if len(turned) else 0.0), False
@@ -148,10 +144,8 @@ def _changes(gyro: Gyro, odometry: Odometry, span: float) -> tuple[Floats, Float
 
 _SECONDS = 60.0
 """s; length of the time that is compared."""
-_LEAST, _EVERY = 15.0, 5.0
-"""s from which the gyro is tested, and between two tests: three windows of the comparison."""
-_FASTEST = 5.0
-"""rad/s; a faster turn is not real: the gyro's heading was reset."""
+_LEAST = 15.0
+"""s from which the gyro is tested, as often as a window is long."""
 
 
 class GyroTurns:
@@ -176,10 +170,7 @@ class GyroTurns:
                 self._forget(stamp - _SECONDS)
 
     def turned(self, stamp: float, pose: Floats) -> Floats:
-        """Return a pose (3,) of the wheels with the gyro's turns since the beginning instead of theirs; m, m, rad.
-
-        A pose that is not newer than the one before is returned as it is.
-        """
+        """Return a pose (3,) of wheels with the gyro's turns instead; as it is unless newer than the one before."""
         before = self._wheels[-1] if self._wheels else None
         if not np.isfinite(pose).all() or not np.isfinite(stamp) or (before is not None and stamp <= before[0]):
             return pose
@@ -188,17 +179,15 @@ class GyroTurns:
             # A robot without gyro; only the last pose is needed until there is one.
             self._wheels, self._pose = self._wheels[-1:], pose
             return pose
-        if stamp - self._judged >= _EVERY:
+        if stamp - self._judged >= WINDOW:
             self._judge(stamp)
         heading, last = self._at(stamp), self._heading
         self._heading = heading
         step, elapsed = se2.between(before[1], pose), stamp - before[0]
-        turn = float(step[2])
         if self._factor and heading is not None and last is not None:
             change = self._factor * (heading - last) - self._bias * elapsed
-            turn = change if abs(change) < _FASTEST * elapsed else turn
-        shift = se2.rotate(0.5 * (turn - step[2]), step[:2])
-        self._pose = se2.compose(self._pose, np.array([*shift, turn]))
+            step = _turned(step, np.array(change)) if abs(change) < FASTEST * elapsed else step
+        self._pose = se2.compose(self._pose, step)
         return self._pose
 
     def _at(self, stamp: float) -> float | None:

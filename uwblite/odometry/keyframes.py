@@ -39,8 +39,7 @@ _SPACING, _SCANS = 0.3, 2
 """Usual distance between keyframes, m, and scans of a cloud."""
 _LONG, _WIDER, _FINE = 800.0, 1.5, 500
 """Path from which on keyframes are farther apart, m, in proportion to it; how many times as far at most; and beams with which
-one scan is a cloud there. Whoever drives far in a building sees its walls again and again, and noise averages out over the
-visits: what is left of the error hardly depends on how many clouds there are (docs/lab/performance.md)."""
+one scan is a cloud there: walls are seen again and again, and noise averages out (docs/lab/performance.md)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +80,9 @@ def select(
 
     Parameters
     ----------
-    odometry : n >= 1 samples.
-    breaks : steps that were not measured; a keyframe stands on either side of each.
-    scans : keyframes are then at times of scans, for at no other time does the lidar measure a pose: what the
-        odometry measures between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.
-
-    Returns
-    -------
-    Keyframes, k >= 1.
+    odometry : n >= 1 samples. breaks : steps that were not measured; a keyframe stands on either side of each.
+    scans : keyframes are then at times of scans, at which alone the lidar measures a pose: errors of the odometry and of both
+        clocks stay edges of the graph and bend no cloud.
     """
     moments, sample, seen = _moments(odometry, scans)
     _, path, turned = _travelled(odometry, moments, sample)
@@ -99,10 +93,8 @@ def select(
     chosen = _advance(np.stack(ways), seen)
     if breaks is not None and len(breaks.stamps):
         broken = _broken_steps(odometry.stamps, breaks)
-        own = (
-            np.searchsorted(moments, odometry.stamps[broken]),
-            np.searchsorted(moments, odometry.stamps[broken + 1], "right") - 1,
-        )
+        before, behind = odometry.stamps[broken], odometry.stamps[broken + 1]
+        own = np.searchsorted(moments, before), np.searchsorted(moments, behind, "right") - 1
         chosen = np.union1d(chosen, np.concatenate(own))
     return _keyframes(odometry, moments[chosen], sample[chosen], breaks)
 
@@ -134,11 +126,8 @@ def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
 
 
 def _slack(stamps: Floats, odometry: Floats, breaks: OdometryBreaks | None) -> Floats:
-    """Return the standard deviation (k-1, 3) that breaks of an odometry with stamps (n,) add to the steps between keyframes.
-
-    A step gets the uncertainty of every break that overlaps it in time.
-    """
-    variance = np.zeros((max(len(stamps) - 1, 0), 3))
+    """Return the standard deviation (k-1, 3) that breaks of an odometry with stamps (n,) add to the steps that they overlap."""
+    variance = np.zeros((len(stamps) - 1, 3))
     if breaks is None or not len(variance) or len(odometry) < 2:
         return variance
     broken = _broken_steps(odometry, breaks)
@@ -155,12 +144,7 @@ def _sample(odometry: Odometry, stamps: Floats) -> Ints:
 
 
 def _travelled(odometry: Odometry, moments: Floats, sample: Ints) -> tuple[Floats, Floats, Floats]:
-    """Return signed distance, distance and turning since the beginning at moments (m,); m, m, rad.
-
-    Parameters
-    ----------
-    sample : (m,) the last odometry sample before each.
-    """
+    """Return signed distance, distance and turning until moments (m,), m, m, rad; sample (m,) is the last one before each."""
     steps = odometry.steps
     forward = np.where(steps[:, 0] >= 0, 1.0, -1.0) * np.hypot(steps[:, 0], steps[:, 1])
     span = np.append(np.diff(odometry.stamps), 0.0)[sample]
@@ -173,14 +157,12 @@ def _travelled(odometry: Odometry, moments: Floats, sample: Ints) -> tuple[Float
 
 
 def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints, Bools]:
-    """Return the moments (m,) at which a keyframe may be, s, the last odometry sample before each, and whether it is
-    preferred: moments of scans."""
+    """Return the moments (m,) at which a keyframe may be, s, the last odometry sample before each, and which are of scans."""
     stamps = odometry.stamps
     if scans is None:
         return stamps, np.arange(len(stamps)), np.ones(len(stamps), dtype=bool)
     middle = scans.middles
-    at_scans = np.unique(middle[(middle > stamps[0]) & (middle < stamps[-1])])
-    at_scans = np.setdiff1d(at_scans, stamps, assume_unique=False)
+    at_scans = np.setdiff1d(middle[(middle > stamps[0]) & (middle < stamps[-1])], stamps)
     moments = np.concatenate([stamps, at_scans])
     order = np.argsort(moments, kind="stable")
     sample = np.concatenate([np.arange(len(stamps)), _sample(odometry, at_scans)])
@@ -188,13 +170,9 @@ def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints
 
 
 def _advance(ways: Floats, preferred: Bools) -> Ints:
-    """Return moments as far apart as possible with at most 1 of each measure (w, m) between neighbours, if there are such.
-
-    Preferred moments are chosen first; others only where the next preferred one is farther than _GAP.
-    """
-    chosen = [0]
-    last = ways.shape[1] - 1
-    stops = np.flatnonzero(preferred)
+    """Return moments as far apart as possible with at most 1 of each measure (w, m) between neighbours, if there are such:
+    preferred ones, others only where the next preferred one is farther than _GAP."""
+    chosen, last, stops = [0], ways.shape[1] - 1, np.flatnonzero(preferred)
     if len(stops) and stops[0] < last and ways[:2, stops[0]].max() > _AT_REST:
         chosen.append(int(stops[0]))
     while chosen[-1] < last:
@@ -213,8 +191,7 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
 
 
 _AT_REST = 0.05
-"""Keyframe distances or angles up to which the first scan is one of the first pose: the wheels' error is small there.
-After a longer distance the cloud would have an error relative to its pose that the graph does not model."""
+"""Keyframe distances or angles up to which the first scan is one of the first pose: the wheels' error is small there."""
 _GAP = 10.0
 """Keyframe distances, angles or durations without any scan after which keyframes are set without scans."""
 _STANDING = 0.1
@@ -229,17 +206,16 @@ def _reached(ways: Floats, here: int, most: float) -> int:
 _WINDOW = (0.0, 0.1)
 """Time before and after a stamp over which the velocity is a mean, s: two readings of a base at 20 Hz."""
 _BESIDE_SCANS = (0.1, 0.3)
-"""The same at keyframes, s. Odometry within a shorter time also places the second scan of a cloud: its noise, both in the cloud
-and in the velocity, would look like an offset of the lidar's clock."""
+"""The same at keyframes, s: odometry within a shorter time also places the second scan of a cloud, and noise in both would look
+like an offset of the lidar's clock."""
 
 
 def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] = _WINDOW) -> Floats:
     """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s."""
     near, far = window
     moments = np.clip(stamps + np.array([[-far], [-near], [near], [far]]), odometry.stamps[0], odometry.stamps[-1])
-    poses = [odometry.at(moment) for moment in moments]
-    motion = se2.log(se2.between(poses[0], poses[1])) + se2.log(se2.between(poses[2], poses[3]))
-    span = (moments[1] - moments[0] + moments[3] - moments[2])[:, None]
+    begin, end = moments[::2], moments[1::2]
+    motion, span = se2.log(se2.between(odometry.at(begin), odometry.at(end))).sum(axis=0), (end - begin).sum(axis=0)[:, None]
     return np.where(span > 0, motion / np.where(span > 0, span, 1.0), 0.0)
 
 
@@ -259,8 +235,7 @@ def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, st
     at, ends = _error_ways(odometry, query), _error_ways(odometry, keyframes.stamps)
     whole = np.diff(ends, axis=0)[left]
     fraction = np.where(whole > 0.0, np.clip((at - ends[left]) / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0), 0.0)
-    dense = se2.compose(poses[left], se2.compose(since, se2.exp(fraction * missed[left])))
-    return dense
+    return se2.compose(poses[left], se2.compose(since, se2.exp(fraction * missed[left])))
 
 
 def _error_ways(odometry: Odometry, stamps: Floats) -> Floats:

@@ -7,8 +7,10 @@ from ..arrays import Floats
 
 _SECONDS = 30.0
 """s that are kept: more than the largest delay of a sensor's message."""
-_FASTEST = 5.0
-"""m/s and rad/s; a faster step is not real: the base's counters were reset."""
+FASTEST = 5.0
+"""m/s and rad/s; a faster step is not real: the base's counters, or the gyro's heading, were reset."""
+_ROOM = 64
+"""Poses for which there is memory at least."""
 _LEAST_STEP = 0.5
 """m and rad; a smaller step is no jump, however short its time."""
 
@@ -17,8 +19,7 @@ class Odometer:
     """A trajectory of the last seconds: poses are added at its end and removed at its beginning."""
 
     def __init__(self) -> None:
-        self._stamps = np.zeros(64)
-        self._poses = np.zeros((64, 3))
+        self._stamps, self._poses = np.zeros(_ROOM), np.zeros((_ROOM, 3))
         self._begin = self._end = 0
         self.jumps = 0
         """Number of impossible steps; they count as standing still."""
@@ -43,21 +44,18 @@ class Odometer:
 
         A jump goes into the trajectory, with what was there before moved along: what is relative to the last pose stays there.
         """
-        if not np.isfinite(stamp) or not np.isfinite(pose).all():
+        if not np.isfinite([stamp, *pose]).all() or stamp <= self.stamp:
             self.late += 1
             return None
         if not len(self):
             self._append(stamp, pose)
             return None
-        if stamp <= self.stamp:
-            self.late += 1
-            return None
         step = se2.between(self.pose, pose)
-        if np.abs(step).max() > max(_LEAST_STEP, _FASTEST * (stamp - self.stamp)):
+        if np.abs(step).max() > max(_LEAST_STEP, FASTEST * (stamp - self.stamp)):
             self.jumps += 1
             kept = slice(self._begin, self._end)
             self._poses[kept] = se2.compose(pose, se2.between(self.pose, self._poses[kept]))
-            step = np.zeros(3)
+            step = np.zeros_like(step)
         self._append(stamp, pose)
         return step
 
@@ -78,11 +76,10 @@ class Odometer:
         self._end += 1
 
     def _shift(self) -> None:
-        """Make room: remove old poses, and where that is not enough, allocate more memory."""
+        """Remove old poses, and allocate as much memory again as the others take."""
         recent = int(np.searchsorted(self._stamps[: self._end], self.stamp - _SECONDS))
         first = max(self._begin, min(recent, self._end - 2))
-        stamps, poses = self._stamps[first : self._end].copy(), self._poses[first : self._end].copy()
-        room = max(64, 2 * len(stamps))
-        self._stamps, self._poses = np.zeros(room), np.zeros((room, 3))
-        self._stamps[: len(stamps)], self._poses[: len(stamps)] = stamps, poses
+        stamps, poses = self._stamps[first : self._end], self._poses[first : self._end]
+        spare = max(_ROOM - len(stamps), len(stamps))
+        self._stamps, self._poses = np.pad(stamps, (0, spare)), np.pad(poses, ((0, spare), (0, 0)))
         self._begin, self._end = 0, len(stamps)

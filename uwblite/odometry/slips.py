@@ -1,9 +1,7 @@
 """Slips of the wheels as a hidden state of the odometry: sound or slipping, for a while.
 
-A slip lasts for seconds, over many steps, in every direction at once. So the evidence of one step, for or against a slip,
-tells of its neighbours, too: the posterior of each step follows from that of all by the forward-backward algorithm of a
-two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989). And wheels that spin count the same
-false motion all the while: see FalseMotions.
+A slip lasts for seconds, over many steps: the posterior of each step follows from the evidence of all by the forward-backward
+algorithm of a two-state Markov chain (L. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 1989).
 """
 
 from dataclasses import dataclass, replace
@@ -22,6 +20,8 @@ SPEED, TURN_RATE = 0.5, 0.5
 people walk. They count at most all of their motion too much."""
 STEADY = 10.0
 """Time over which the false motion of a slip changes, s: while wheels spin, the robot's speed is as commanded."""
+_SHARE = LASTS / (EVERY + LASTS)
+"""Of time, during which wheels slip."""
 _HARDLY = 1e-3
 """Probability of a slip below which a step tells nothing of its neighbours' slips."""
 
@@ -33,18 +33,14 @@ def slip_sigma(wheels: OdometryEdges) -> Floats:
 
 
 def lost_sigma(wheels: OdometryEdges) -> Floats:
-    """Return the standard deviation (e, 3) of steps over which messages are lost or the robot is carried, m, m, rad.
-
-    The stamps need not show it: what was lost may be as long as a slip.
-    """
+    """Return the standard deviation (e, 3) of steps over which messages are lost, as long as a slip, or a robot is carried."""
     return _uncounted(wheels, np.full(len(wheels), LASTS))
 
 
 def _uncounted(wheels: OdometryEdges, lasts: Floats) -> Floats:
     """Return the standard deviation (e, 3) of steps whose wheels miss what happens in some time (e,), s, or count too much."""
-    way, turned = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]), np.abs(wheels.motion[:, 2])
-    place = way + SPEED * lasts
-    return np.stack([place, place, turned + TURN_RATE * lasts], axis=1)
+    place = np.hypot(wheels.motion[:, 0], wheels.motion[:, 1]) + SPEED * lasts
+    return np.stack([place, place, np.abs(wheels.motion[:, 2]) + TURN_RATE * lasts], axis=1)
 
 
 def covariance_of(wheels: OdometryEdges, graph: Graph) -> Floats:
@@ -75,12 +71,11 @@ def posterior(log_odds: Floats, duration: Floats) -> SlipChain:
     log_odds : (e,) log of the likelihood of what was measured over each step if they slip, by that if they do not; 0 where
         nothing was. duration : (e,) s.
     """
-    share = LASTS / (EVERY + LASTS)
     settled = -np.expm1(-duration * (1.0 / EVERY + 1.0 / LASTS))
-    starts, ends = share * settled, (1.0 - share) * settled
+    starts, ends = _SHARE * settled, (1.0 - _SHARE) * settled
     likelihood = np.exp(np.stack([np.minimum(-log_odds, 0.0), np.minimum(log_odds, 0.0)], axis=1))
     steps = np.stack([np.stack([1.0 - starts, starts], axis=1), np.stack([ends, 1.0 - ends], axis=1)], axis=1)
-    stationary = np.array([1.0 - share, share])
+    stationary = np.array([1.0 - _SHARE, _SHARE])
     forward, backward = np.empty((len(log_odds), 2)), np.ones((len(log_odds), 2))
     before = stationary
     for k in range(len(log_odds)):
@@ -93,7 +88,7 @@ def posterior(log_odds: Floats, duration: Floats) -> SlipChain:
     # From either state of the step before to a slip, and from a slip to either state of the step after.
     into = np.concatenate([stationary[None], forward])[:-1] * steps[:, :, 1]
     out = (steps[:, 1] * likelihood * backward)[1:]
-    after = np.append(out[:, 1] / out.sum(axis=1), 1.0 - share)[: len(log_odds)]
+    after = np.append(out[:, 1] / out.sum(axis=1), 1.0 - _SHARE)[: len(log_odds)]
     both = forward * backward
     return SlipChain(*(np.asarray(each) for each in (both[:, 1] / both.sum(axis=1), into[:, 1] / into.sum(axis=1), after)))
 
@@ -107,15 +102,16 @@ class FalseMotions:
     matrix: Floats
     """(e, 3, 3) information matrix."""
 
+    @property
+    def _prior(self) -> Floats:
+        """(1, 3, 3) information matrix before anything was measured."""
+        return np.eye(self.vector.shape[1])[None]
+
     def by_neighbours(self, chain: SlipChain, duration: Floats) -> "FalseMotions":
-        """Return what the other steps of a slip tell of its motion over each of its steps, the prior included.
+        """Return what the other steps of a slip tell of its motion over each of its steps (e,), s, the prior included.
 
-        Wheels count the same false motion for as long as they slip: a stationary Gauss-Markov process, which steps on either
-        side that belong to the same slip show as well. So a slip of ten steps pays for its unknown motion once.
-
-        Parameters
-        ----------
-        duration : (e,) s.
+        Wheels count the same false motion for as long as they slip, a stationary Gauss-Markov process: so a slip of ten steps
+        pays for its unknown motion once.
         """
         near = np.maximum(chain.probability, np.append(chain.probability[1:], 0.0)) > _HARDLY
         vector, matrix = self._predicted(chain.before, duration, near)
@@ -123,42 +119,46 @@ class FalseMotions:
         near = np.maximum(chain.probability, np.append(0.0, chain.probability[:-1])) > _HARDLY
         after, others = back._predicted(chain.after[::-1], duration[::-1], near[::-1])
         # Both sides hold the prior.
-        return FalseMotions(vector + after[::-1], matrix + others[::-1] - np.eye(3))
+        return FalseMotions(vector + after[::-1], matrix + others[::-1] - self._prior)
 
     def _predicted(self, same: Floats, duration: Floats, near: Bools) -> tuple[Floats, Floats]:
-        """Return the information vector (e, 3) and matrix (e, 3, 3) of the false motion over each step by the steps before it.
-
-        Parameters
-        ----------
-        same : (e,) probability that the step before each belongs to the same slip. near : (e,) steps that may be in a slip.
-        """
-        vectors, matrices = np.zeros_like(self.vector), np.tile(np.eye(3), (len(self.vector), 1, 1))
+        """Return the information vector (e, 3) and matrix (e, 3, 3) of the false motion over each step by the steps before it,
+        which are of the same slip with a probability (e,); near : (e,) steps that may be in a slip."""
+        vectors, prior = np.zeros_like(self.vector), self._prior[0]
+        matrices = np.tile(prior, (len(vectors), 1, 1))
         keeps = same * np.exp(-0.5 * (duration + np.roll(duration, 1)) / STEADY)
         for k in np.flatnonzero(near[:-1]).tolist():
             covariance, kept = np.linalg.inv(matrices[k] + self.matrix[k]), keeps[k + 1]
             mean = covariance @ (vectors[k] + self.vector[k])
-            matrices[k + 1] = np.linalg.inv(kept**2 * covariance + (1.0 - kept**2) * np.eye(3))
+            matrices[k + 1] = np.linalg.inv(kept**2 * covariance + (1.0 - kept**2) * prior)
             vectors[k + 1] = matrices[k + 1] @ (kept * mean)
         return vectors, matrices
 
     def log_marginal(self, prior: "FalseMotions") -> Floats:
         """Return by how much the log evidence (e,) of a slip is greater under a prior than under that of a lone step."""
-        alone = FalseMotions(np.zeros_like(self.vector), np.broadcast_to(np.eye(3), self.matrix.shape))
+        alone = FalseMotions(np.zeros_like(self.vector), np.broadcast_to(self._prior, self.matrix.shape))
         return np.asarray(self._log_marginal(prior) - self._log_marginal(alone))
 
     def _log_marginal(self, prior: "FalseMotions") -> Floats:
         """Return the log marginal likelihood (e,) under a prior, but for what does not depend on it."""
         vector, matrix = self.vector + prior.vector, self.matrix + prior.matrix
-        squared = np.einsum("ei,ei->e", vector, np.linalg.solve(matrix, vector[..., None])[..., 0])
-        known = np.einsum("ei,ei->e", prior.vector, np.linalg.solve(prior.matrix, prior.vector[..., None])[..., 0])
-        return np.asarray(0.5 * (squared - known + np.linalg.slogdet(prior.matrix)[1] - np.linalg.slogdet(matrix)[1]))
+        squared = _squared(vector, matrix) - _squared(prior.vector, prior.matrix)
+        return np.asarray(0.5 * (squared + np.linalg.slogdet(prior.matrix)[1] - np.linalg.slogdet(matrix)[1]))
+
+
+def _squared(vector: Floats, matrix: Floats) -> Floats:
+    """Return v^T M^-1 v (e,) of vectors (e, 3) and matrices (e, 3, 3)."""
+    return np.asarray(np.einsum("ei,ei->e", vector, np.linalg.solve(matrix, vector[..., None])[..., 0]))
+
+
+def _diagonal(values: Floats) -> Floats:
+    return values[:, :, None] * np.eye(values.shape[1])
 
 
 def log_densities(wheels: OdometryEdges, graph: Graph) -> Floats:
     """Return the logarithm of the density (e,) of each step at a graph's poses, sound or slipping with their shares of time."""
-    share = LASTS / (EVERY + LASTS)
     sound, slipping = _of_either(wheels, graph)
-    return np.asarray(np.logaddexp(np.log(1.0 - share) + sound, np.log(share) + slipping))
+    return np.asarray(np.logaddexp(np.log(1.0 - _SHARE) + sound, np.log(_SHARE) + slipping))
 
 
 def slipped(wheels: OdometryEdges, graph: Graph) -> Floats:
@@ -170,16 +170,11 @@ def slipped(wheels: OdometryEdges, graph: Graph) -> Floats:
 def _of_either(wheels: OdometryEdges, graph: Graph) -> tuple[Floats, Floats]:
     """Return the logarithm of the density (e,) of each step, sound and slipping."""
     sound = covariance_of(wheels, graph)
-    slipping = sound + slip_sigma(wheels)[:, :, None] ** 2 * np.eye(3)
+    slipping = sound + _diagonal(slip_sigma(wheels) ** 2)
     off = se2.between(graph.poses[wheels.i], graph.poses[wheels.j]) - wheels.corrected(graph)
     off[:, 2] = se2.wrap_angle(off[:, 2])
-    return _log_normal(off, sound), _log_normal(off, slipping)
-
-
-def _log_normal(off: Floats, covariance: Floats) -> Floats:
-    """Return the logarithm of the normal density (e,) of errors (e, 3) with covariances (e, 3, 3)."""
-    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance, off[..., None])[..., 0])
-    return np.asarray(-0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * covariance)[1]))
+    sound, slipping = (-0.5 * (_squared(off, c) + np.linalg.slogdet(2.0 * np.pi * c)[1]) for c in (sound, slipping))
+    return sound, slipping
 
 
 def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
@@ -187,7 +182,7 @@ def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2
     slips = 1.0 / (slip_sigma(wheels) ** 2 + 1.0 / sound)
     diagonal = np.sqrt((1.0 - probability[:, None]) * sound + probability[:, None] * slips)
-    return replace(wheels, sqrt_information=diagonal[:, :, None] * np.eye(3), slips=None)
+    return replace(wheels, sqrt_information=_diagonal(diagonal), slips=None)
 
 
 def expected(wheels: OdometryEdges) -> OdometryEdges:

@@ -1,9 +1,4 @@
-"""Odometry edges, their noise and the scale of their turns, from the settings and from the recording.
-
-In least squares over all poses, a single turn that the wheels missed, or a stretch with a clock offset between lidar and
-wheels, has a squared influence and changes the scale of all turns. The median over steps of the ratio of the turns by lidar and
-by wheels is not affected.
-"""
+"""Odometry edges, their noise and the scale of their turns, from the settings and from the recording."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +15,10 @@ from ..graph.robust import Kernel
 from ..sensor_log import Odometry
 from .keyframes import Keyframes
 
-_STEPS = Kernel("cauchy", 5.0)
+_ENOUGH = 40
+"""Least number of steps from which a noise or a scale is learnt."""
+_LEAST_FACTOR = 0.1
+"""Least factor on a standard deviation of wheels, and the inverse of the largest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,26 +33,23 @@ class OdometryNoiseConfig:
     """Standard deviation of heading after one radian of turning, rad; grows with the square root of the angle."""
     standing: float = 0.0005
     """Standard deviation of position (m) and heading (rad) of a robot that stands."""
-    kernel: Kernel = setting(_STEPS, advanced=True)
+    kernel: Kernel = setting(Kernel("cauchy", 5.0), advanced=True)
     """Robust kernel: a step that slipped must not bend the rest; none = squared errors (the paper)."""
 
 
 def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
     """Return the edges between consecutive keyframes of one recording."""
     n = len(keyframes) - 1
-    slack = keyframes.slack
-    along, across = (np.sqrt(config.standing**2 + config.distance**2 * keyframes.path + slack[:, k] ** 2) for k in (0, 1))
-    turning = config.heading_per_turn**2 * keyframes.turned
-    heading = np.sqrt(config.standing**2 + config.heading_per_metre**2 * keyframes.path + turning + slack[:, 2] ** 2)
-    sqrt_information = np.zeros((n, 3, 3))
-    sqrt_information[:, 0, 0], sqrt_information[:, 1, 1], sqrt_information[:, 2, 2] = 1.0 / along, 1.0 / across, 1.0 / heading
+    by_path = np.array([config.distance, config.distance, config.heading_per_metre]) ** 2 * keyframes.path[:, None]
+    by_turn = np.array([0.0, 0.0, config.heading_per_turn]) ** 2 * keyframes.turned[:, None]
+    variance = config.standing**2 + by_path + by_turn + keyframes.slack**2
     return OdometryEdges(
         np.arange(n),
         np.arange(1, n + 1),
         keyframes.motion,
         keyframes.length,
         drift_time(keyframes),
-        sqrt_information,
+        variance[:, None] ** -0.5 * np.eye(variance.shape[1]),
         odometry_indices(calibration, n),
         kernel=config.kernel,
     )
@@ -85,10 +80,9 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
     steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count, nor
-        those that it measures much worse than the wheels do, where these differ by much more; where fewer than 20 steps
-        measure one better, its noise stays.
+        those that it measures much worse than the wheels do, where these differ by much more.
     """
-    if len(steps) < _ENOUGH_STEPS:
+    if len(steps) < _ENOUGH:
         return wheels
     own = np.searchsorted(wheels.i, steps.i)
     off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
@@ -98,11 +92,74 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
     in_wheels = wheels.end_sqrt_information[own]
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
-    well, factor = seen & (sigma < _MUCH_WORSE), np.ones(3)
-    for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH_STEPS):
+    well, factor = seen & (sigma < _MUCH_WORSE), np.ones(off.shape[1])
+    for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH):
         by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
         factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
+
+
+_MUCH_WORSE, _ALIKE = 6.0, 2.0
+"""Ratio of a measured step's standard deviation to that of the wheels, from which on their difference may show its errors; it
+does where the noise by all steps is so many times that by the better ones."""
+
+
+def _growing(off: Floats, step: Ints) -> float:
+    """Return the robust standard deviation of differences (m,) of steps (m,) by how it grows with the way.
+
+    Errors of wheels add up. That of one cloud's pose, or of its stamp, is in the steps before and after it with opposite signs.
+    So the sum over n following steps has n times the variance of the wheels or more, and the least quotient of all n is the
+    nearest to it (the slope of a variogram, without its nugget).
+    """
+    begins = np.flatnonzero(np.diff(step, prepend=-2) != 1)
+    place = np.arange(len(step)) - np.repeat(begins, np.diff(np.append(begins, len(step))))
+    least = spread(off)
+    for n in _SUMS:
+        number = np.cumsum(place % n == 0) - 1
+        sums = np.bincount(number, off)[np.bincount(number) == n]
+        if len(sums) >= _ENOUGH // 2:
+            least = min(least, spread(sums) / np.sqrt(n))
+    return float(least)
+
+
+_SUMS = (2, 4, 8)
+"""Numbers of following steps whose differences are summed: up to two metres, over which errors of the floor are alike."""
+
+
+def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> OdometryEdges:
+    """Return the wheels with the noise that their residuals show at poses that a lidar determines.
+
+    A patch of floor causes the same error in all steps on it, so that errors of sums of steps grow faster than with the square
+    root of the distance: the greater of both variances counts. Poses err too, and follow the wheels by their weight: an error
+    with variance w, assumed as 1, and a measurement with variance v leave a residual with (w + v) / (1 + v)^2.
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses, in the order of the poses.
+    certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by measurements other than the wheels.
+    """
+    if len(wheels) < _SUMS[-1]:
+        return wheels
+    frame, covariance = se2.rotation(graph.poses[:, 2]), np.linalg.inv(certainty + _UNKNOWN * np.eye(certainty.shape[1]))
+    of_pose = np.einsum("nia,nij,nja->na", frame, covariance, frame)
+    root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
+    ends, roots = (np.pad(np.cumsum(v, axis=0), ((1, 0), (0, 0))) for v in (wheels.residuals(graph), root))
+    variances = np.full((2, root.shape[1]), np.nan)
+    for variance, n in zip(variances, (1, _SUMS[-1]), strict=True):
+        # Windows that cross the boundary of two recordings are excluded.
+        first = np.flatnonzero(wheels.j[n - 1 :] - wheels.i[: len(wheels) - n + 1] == n)
+        summed, mean = (ends[first + n] - ends[first]) / np.sqrt(n), (roots[first + n] - roots[first]) / n
+        added = (of_pose[wheels.i[first]] + of_pose[wheels.j[first + n - 1]]) * mean**2 / n
+        good = added < 1.0  # known better than by the wheels
+        for k in np.flatnonzero(good.sum(axis=0) >= _ENOUGH):
+            own = added[good[:, k], k]
+            variance[k] = spread(summed[good[:, k], k] * (1.0 + own)) ** 2 - np.median(own)
+    factor = np.sqrt(np.clip(variances.max(axis=0), _LEAST_FACTOR**2, _LEAST_FACTOR**-2))
+    return replace(wheels, sqrt_information=wheels.sqrt_information / np.where(np.isnan(factor), 1.0, factor))
+
+
+_UNKNOWN = 1e-3
+"""Information of a pose that nothing measures, 1/m^2 and 1/rad^2."""
 
 
 def variance_factors(graph: Graph, wheels: OdometryEdges, sound: Floats, before: Floats) -> Floats:
@@ -121,6 +178,10 @@ def variance_factors(graph: Graph, wheels: OdometryEdges, sound: Floats, before:
     return np.asarray(np.clip(found, _LEAST_FACTOR**2, _LEAST_FACTOR**-2))
 
 
+_ASSUMED_COUNTS = 4.0
+"""Standard deviations that are assumed are right but for a factor of 1.4, as those learnt from four steps are."""
+
+
 def redundancy(graph: Graph, wheels: OdometryEdges, sound: Floats) -> Floats:
     """Return how many (3,) of the steps along, across and in heading all other measurements of a graph show as well.
 
@@ -128,90 +189,28 @@ def redundancy(graph: Graph, wheels: OdometryEdges, sound: Floats) -> Floats:
     Hutchinson, A stochastic estimator of the trace, 1989).
     """
     phase = np.outer(np.arange(1, _PROBES + 1), np.arange(len(wheels)) ** 2) * _GOLDEN
-    shifts = np.einsum("ke,e,cd->cked", np.where(phase % 1.0 < 0.5, -1.0, 1.0), np.sqrt(sound), np.eye(3))
-    shifts = shifts.reshape(-1, len(wheels), 3)
-    return np.asarray(np.mean(added_unknown(graph, wheels, shifts)[1].reshape(3, -1) ** -2.0, axis=1))
+    directions = wheels.motion.shape[1]
+    shifts = np.einsum("ke,e,cd->cked", np.where(phase % 1.0 < 0.5, -1.0, 1.0), np.sqrt(sound), np.eye(directions))
+    unknown = added_unknown(graph, wheels, shifts.reshape(-1, *shifts.shape[2:]))[1]
+    return np.asarray(np.mean(unknown.reshape(directions, -1) ** -2.0, axis=1))
 
 
 _PROBES = 8
 """Vectors of signs."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Rate at which the frequency of the first chirp grows: no ratio is farther from all fractions."""
-_ASSUMED_COUNTS = 4.0
-"""Standard deviations that are assumed are right but for a factor of 1.4, as those learnt from four steps are."""
-_LEAST_FACTOR = 0.1
-"""Least factor on a standard deviation of wheels, and the inverse of the largest."""
-
-
-def _growing(off: Floats, step: Ints) -> float:
-    """Return the robust standard deviation of differences (m,) of steps (m,) by how it grows with the way.
-
-    Errors of wheels add up. An error of one cloud's pose, or of the stamp at which it was taken, is in the steps before and
-    after it with opposite signs. So the sum over n following steps has n times the variance of the wheels or more, and the
-    least quotient of all n is the nearest to it (the slope of a variogram, without its nugget).
-    """
-    begins = np.flatnonzero(np.diff(step, prepend=-2) != 1)
-    place = np.arange(len(step)) - np.repeat(begins, np.diff(np.append(begins, len(step))))
-    least = spread(off)
-    for n in _SUMS:
-        number = np.cumsum(place % n == 0) - 1
-        sums = np.bincount(number, off)[np.bincount(number) == n]
-        if len(sums) >= _ENOUGH_STEPS:
-            least = min(least, spread(sums) / np.sqrt(n))
-    return float(least)
-
-
-_SUMS = (2, 4, 8)
-"""Numbers of following steps whose differences are summed: up to two metres."""
-_ENOUGH_STEPS = 20
-"""Least number of measured steps from which the noise of the wheels is learnt."""
-_MUCH_WORSE, _ALIKE = 6.0, 2.0
-"""Ratio of a measured step's standard deviation to that of the wheels as assumed, from which on their difference may show the
-step's errors: along a wall that ends beyond the lidar's reach, or past a few trees, steps are off by decimetres. It does
-where the differences of all steps are larger by the second factor than those of the better ones."""
-
-
-def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
-    """Give wheels that count nothing over a step the noise of the distance that the lidar clearly measures there.
-
-    An odometry that stands still while the robot drives would otherwise have a standing robot's noise of half a millimetre:
-    even a robust kernel would not reject such a step.
-
-    Parameters
-    ----------
-    wheels : edges between neighbouring poses, in the order of the poses. steps : see reestimate_wheel_noise.
-    """
-    own, counted = np.searchsorted(wheels.i, steps.i), wheels.corrected(graph)
-    variance, way = 1.0 / np.einsum("eii->ei", wheels.sqrt_information) ** 2, _way(counted)
-    missed, moving, root = np.zeros(len(wheels)), way > _MOVING, steps.sqrt_information
-    off = root @ se2.between(steps.T_i_j, counted[own])[:, :, None]
-    scatter = np.eye(3) + root * variance[own, None, :] @ np.swapaxes(root, 1, 2)
-    stood = ~moving[own] & (np.sum(off * np.linalg.solve(scatter, off), axis=(1, 2)) > _CERTAIN**2)
-    missed[own[stood]] = _way(steps.T_i_j[stood])
-    if not stood.any() or not moving.any():
-        return wheels
-    least = missed[:, None] * np.median(variance[moving] / way[moving, None], axis=0)
-    factor = np.sqrt(np.maximum(least / variance, 1.0))
-    return replace(wheels, sqrt_information=wheels.sqrt_information / factor[:, None])
-
-
-def _way(motion: Floats) -> Floats:
-    """Return the distance plus the turn of motions (e, 3), m + rad."""
-    return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + np.abs(motion[:, 2]))
-
-
-_CERTAIN = 5.0
-"""Standard deviations of their difference from which on a measured step clearly contradicts the wheels."""
-_MOVING = 0.05
-"""m + rad; over shorter steps wheels may count nothing, and do not show how noise grows with the distance."""
 
 
 _TURNING = 0.1
 """rad; steps that turn by less, on average of lidar and wheels, do not show a ratio."""
-_ENOUGH = 40
-"""Least number of turning steps that show a scale."""
 _STRETCHES = 4
 """Parts of a recording, equal in turning steps, whose scales are compared."""
+_SIGMAS = 5.0
+"""Standard deviations beyond which scales differ."""
+_SAME, _DIFFERENT = 0.05, 0.25
+"""Difference of scales that floors and tyres explain, and one between stretches that no floor explains."""
+_SOON = 4
+"""Steps from one turning step to the next of the same turn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,19 +236,11 @@ class TurnScale:
         return bool(np.ptp(self.stretches) > max(_SIGMAS * self.stretch_sigma, _DIFFERENT))
 
 
-_SIGMAS = 5.0
-"""Standard deviations beyond which scales differ."""
-_SAME = 0.05
-"""Difference of scales that floors, tyres and the noise of the wheels explain."""
-_DIFFERENT = 0.25
-"""Difference between stretches that no floor explains."""
-
-
 def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[int, TurnScale]:
     """Return the scale of turns by the position of its ``heading_scale`` in the calibration block.
 
-    The ratio of two noisy turns is taken as the direction of the vector (wheels, lidar), whose weighted median over the
-    steps favours neither; weights are the lengths. Recordings with fewer than 40 turning steps are left out.
+    A single turn that the wheels missed would have a squared influence in least squares. The ratio of two noisy turns is the
+    direction of the vector (wheels, lidar), whose weighted median over the steps favours neither.
 
     Parameters
     ----------
@@ -266,7 +257,10 @@ def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[i
     for index in np.unique(of_recording[clear & (of_recording >= 0)]).tolist():
         own = clear & (of_recording == index)
         if own.sum() >= _ENOUGH:
-            found[index] = _scale(lidar[own], turned[own], _turns(row[own], turned[own] + lidar[own]))
+            # Steps soon after each other that turn the same way are of one turn.
+            side = np.sign(turned[own] + lidar[own])
+            other = (np.diff(row[own]) > _SOON) | (side[1:] != side[:-1])
+            found[index] = _scale(lidar[own], turned[own], np.concatenate([[0], np.cumsum(other)]))
     return found
 
 
@@ -281,26 +275,9 @@ def _neighbours(wheels: OdometryEdges, steps: ScanEdges) -> tuple[Ints, Floats]:
     return row[same][order], turned[same][order]
 
 
-def _turns(row: Ints, turned: Floats) -> Ints:
-    """Return which turn each step (s,) belongs to: steps soon after each other that turn the same way are of one.
-
-    Parameters
-    ----------
-    row : (s,) of the odometry's edges, increasing. turned : (s,) its sign is the step's way of turning.
-    """
-    other = (np.diff(row) > _SOON) | (np.sign(turned[1:]) != np.sign(turned[:-1]))
-    return np.concatenate([[0], np.cumsum(other)])
-
-
-_SOON = 4
-"""Steps from one turning step to the next of the same turn."""
-
-
 def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     """Return the scale of turning steps (s,) in the order of time; turn : (s,) increasing number of each one's turn."""
-    weight = np.hypot(lidar, wheels)
-    direction = np.arctan2(lidar, wheels)
-    centre = 0.25 * np.pi
+    weight, direction, centre = np.hypot(lidar, wheels), np.arctan2(lidar, wheels), np.arctan(1.0)
     for _ in range(2):
         # Left and right turns give one direction, known up to half a turn.
         direction = centre + se2.wrap_angle(2.0 * (direction - centre)) / 2.0
@@ -310,18 +287,16 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     steepness = 1.0 + np.tan(centre) ** 2
     count = _independent(direction - centre, weight, turn)
     by_steps = steepness * MEDIAN_TO_MEAN * spread_about_median(direction) / np.sqrt(count)
-    by_stretches = steepness * float(np.std(centres, ddof=1)) / np.sqrt(_STRETCHES)
-    scales = np.tan(centres) - 1.0
-    return TurnScale(
-        float(np.tan(centre)) - 1.0, float(max(by_steps, by_stretches)), scales, float(by_steps * np.sqrt(_STRETCHES))
-    )
+    by_stretches = steepness * np.std(centres, ddof=1) / np.sqrt(_STRETCHES)
+    value, sigma, stretch_sigma = np.tan(centre) - 1.0, max(by_steps, by_stretches), by_steps * np.sqrt(_STRETCHES)
+    return TurnScale(float(value), float(sigma), np.tan(centres) - 1.0, float(stretch_sigma))
 
 
 def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
     """Return the effective number of independent steps of weighted ones (s,) whose errors are partly correlated within a turn.
 
-    Tyres slip, and floors give way, for as long as a turn lasts. The correlation of neighbouring steps of one turn is taken
-    from how often their errors have the same sign: of normal values with correlation r it is 1/2 + arcsin(r) / pi.
+    The correlation of neighbouring steps of one turn is taken from how often their errors have the same sign: of normal values
+    with correlation r it is 1/2 + arcsin(r) / pi.
     """
     same = np.sign(error[1:] * error[:-1])[turn[1:] == turn[:-1]]
     alike = float(np.sin(0.5 * np.pi * np.clip(same.mean(), 0.0, 1.0))) if len(same) else 0.0

@@ -19,10 +19,9 @@ from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain
 from ..sensor_log.sensors import place_name, radio_name
-from .broken_steps import BreakPolicy, without_moves_of_path
+from .broken_steps import BreakPolicy, RadioTrack, radio_tracks, without_moves_of_path
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors
-from .radio_tracks import RadioTrack, radio_tracks
 
 
 def decide_places(estimate: Estimate, task: Task) -> Estimate:
@@ -126,7 +125,7 @@ def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], sta
         number, way = int(recording[first]), first - last - 1
         name, next_name = names[place[last]], names[place[first]]
         distance = float(np.hypot(*(positions[first] - positions[last])))
-        figures: dict[str, Any] = {"anchor": name, "distance": round(distance, 4), "recording": number + 1, "new_id": next_name}
+        figures: dict[str, Any] = {"anchor": name, "distance": distance, "recording": number + 1, "new_id": next_name}
         if recording[last] == number:
             start = task.recordings.each[number].log.odometry.stamps[0]
             between = [*(float(stamps[row] - start) for row in (last + 1, first)), way]

@@ -1,4 +1,4 @@
-"""Broken steps of the path: the rival of anchors that move together.
+"""Ranges of each radio along the path, and broken steps of it: the rival of anchors that move together.
 
 Sound anchors seem to move where the path is torn: from a broken step on, one rigid motion of the path explains the ranges to
 all anchors, and no anchor was moved. So moves that begin together compete with such a step, which the closures to other visits
@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 from .. import se2
 from ..arrays import Floats, Ints
 from ..findings import Fact
-from ..radio.place_evidence import Explanation, MovePolicy, intervals_of
-from ..radio.place_intervals import explain
+from ..radio.place_evidence import Explanation, MovePolicy, PlaceModel, Track, intervals_of
+from ..radio.range_noise import short_term_sigma
+from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
-from .radio_tracks import RadioTrack, radio_tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class BreakPolicy:
     """Standard deviation of the error of such a step, m and rad."""
     turns: ClassVar[int] = 8
     """Headings from which the error of the step is sought."""
-    rounds: ClassVar[int] = 4
+    rounds: ClassVar[int] = MovePolicy.laps
     """Most solutions of a path that ranges hold; two are usual."""
     near: ClassVar[int] = 3
     """Ranges by which the time of a change may be off."""
@@ -43,11 +43,67 @@ class BreakPolicy:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RadioTrack:
+    """One radio's ranges."""
+
+    name: str
+    numbers: tuple[int, ...]
+    """Of the graph's anchors that are its places, the first one first."""
+    rows: Ints
+    """(m,) of the estimate's ranges, in the order of recordings and of time."""
+    chosen: Ints
+    """Those of them (indices into rows) of which the track is."""
+    pose: Ints
+    """Keyframe of each range of the track."""
+    model: PlaceModel
+    """Of the track."""
+
+    @property
+    def track(self) -> Track:
+        """The ranges that are explained."""
+        return self.model.track
+
+    def inside(self, begin: int, end: int) -> Ints:
+        """Return which ranges of the track are from keyframes begin <= k < end."""
+        return np.flatnonzero((self.pose >= begin) & (self.pose < end))
+
+
+def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
+    """Return the radios that have a place, with their ranges along the estimate's path."""
+    ranges, ids, config = estimate.ranges, estimate.anchor_ids, task.config
+    assert ranges is not None
+    # Prior knowledge of the user refers to anchors by their present numbers.
+    tied = bool(task.constraints.anchors or task.constraints.distances)
+    names = [name if tied or radio_name(name) not in ids else radio_name(name) for name in ids]
+    recording, positions = task.recordings.of_keyframe[ranges.pose], ranges.tag_positions(estimate.graph.poses)
+    used = ranges.alive & estimate.placed[ranges.anchor]
+    values = np.append(estimate.graph.calibration.values, 0.0)[ranges.calibration]
+    level = replace(ranges, ranges=ranges.corrected / (1.0 + values[:, 0]), late=np.zeros(0)).planar_ranges()
+    of_each, true = ranges.anchor + len(ids) * recording, ranges.corrected / (1.0 + values[:, 0])
+    sigma = short_term_sigma(ranges.stamps[used], of_each[used], true[used], config.ranges)
+    radios = []
+    for name in dict.fromkeys(names):
+        numbers = tuple(k for k, other in enumerate(names) if other == name)
+        rows = np.flatnonzero(used & np.isin(ranges.anchor, numbers))
+        rows = rows[np.lexsort((ranges.stamps[rows], recording[rows]))]
+        if not len(rows):
+            continue
+        chosen = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MovePolicy.most_ranges)).round().astype(np.intp))
+        sample = rows[chosen]
+        unknown = ranges.calibration[sample[0], 2] >= 0
+        height = float(np.sqrt(max(values[sample[0], 2], 0.0)))
+        heights = (height, *(h for h in (0.0, *MovePolicy.heights) if h != height)) if unknown else (0.0,)
+        track = Track(positions[sample], level[sample], recording[sample], sigma, heights)
+        model = PlaceModel(track, config.trilateration, config.ranges)
+        radios.append(RadioTrack(name, numbers, rows, chosen, ranges.pose[sample], model))
+    return radios
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Change:
     """A radio's change to another place within a recording."""
 
     radio: int
-    """Number of it."""
     interval: Ints
     """Rows of its track at the new place, until the next change."""
     before: int
@@ -61,7 +117,6 @@ class _Change:
 
 
 def _changes(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> Iterator[_Change]:
-    """Yield all changes of place within recordings."""
     for number, (radio, each) in enumerate(zip(radios, found, strict=True)):
         for one, other in pairwise(intervals_of(each.place)):
             if radio.track.recording[one[-1]] == radio.track.recording[other[0]]:
@@ -70,7 +125,7 @@ def _changes(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> Iter
 
 
 def _groups(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> list[list[_Change]]:
-    """Return changes that may be at the same time together, each group with all that may be at the time of its first one."""
+    """Return changes within recordings, each group with all that may be at the time of its first one."""
     groups, changes = list[list[_Change]](), list(_changes(radios, found))
     for change in changes:
         if not any(change.with_other(other) for group in groups for other in group):
@@ -85,30 +140,11 @@ def without_moves_of_path(
     broken steps."""
     kept, broken = list(found), list[BrokenStep]()
     for group in _groups(radios, found):
-        rival = BrokenStep(estimate, task, radios, kept, [c for c in _changes(radios, kept) if group[0].with_other(c)])
-        if rival.moves and rival.gain() + rival.log_prior() > 0.0:
+        moves = [change for change in _changes(radios, kept) if group[0].with_other(change)]
+        if moves and (rival := BrokenStep(estimate, task, radios, kept, moves)).gain() + rival.log_prior() > 0.0:
             kept = rival.found
             broken.append(rival)
     return kept, broken
-
-
-def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
-    """Return broken steps that explain ranges beside anchors that move together, the best one of each such time, with its gain.
-
-    Parameters
-    ----------
-    suspects : keyframes before which a step may be broken as well: the ranges show its time by when they reach an anchor, and
-        where they say nothing against anchors that stand still, it may still be broken.
-    """
-    radios, best = radio_tracks(estimate, task), list[tuple[float, BrokenStep]]()
-    found = [explain(radio.model) for radio in radios]
-    for group in _groups(radios, found) or [[]]:
-        tried = [BrokenStep(estimate, task, radios, found, group)] if group else []
-        end = tried[0].end if tried else len(estimate.graph.poses)
-        tried += [BrokenStep(estimate, task, radios, found, group, int(k)) for k in suspects if k < end]
-        gains = [step.gain() for step in tried]
-        best += [(max(gains), tried[int(np.argmax(gains))])] if tried else []
-    return best
 
 
 class BrokenStep:
@@ -116,11 +152,10 @@ class BrokenStep:
 
     def __init__(
         self, estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation],
-        moves: Sequence[_Change], begin: int | None = None,
+        moves: Sequence[_Change],
     ) -> None:
         self.estimate, self.radios, self.moves, self.found, self.before = estimate, radios, moves, list(found), list(found)
-        heard, end = self._extent(task) if moves else (0, len(estimate.graph.poses))
-        begin = heard if begin is None else begin
+        begin, end = self._extent(task)
         self.recording = task.recordings.each[int(task.recordings.of_keyframe[begin])]
         self.begin = max(begin, self.recording.rows.start + 1)
         self.end = min(end, self.recording.rows.stop)
@@ -137,9 +172,7 @@ class BrokenStep:
 
     def _extent(self, task: Task) -> tuple[int, int]:
         """Return the first keyframe of the longest move, and the one at which it ends or the recording does."""
-        first = max(self.moves, key=lambda move: len(move.interval), default=None)
-        if first is None:
-            return 0, len(self.estimate.graph.poses)
+        first = max(self.moves, key=lambda move: len(move.interval))
         radio, last = self.radios[first.radio], int(first.interval[-1])
         recording = radio.track.recording
         more = last + 1 < len(radio.pose) and recording[last + 1] == recording[last]
@@ -170,29 +203,13 @@ class BrokenStep:
         poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
         return poses
 
-    def places(self, anchors: Floats) -> Floats:
-        """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
-        assert self.estimate.ranges is not None
-        anchors = anchors.copy()
-        for radio, each in zip(self.radios, self.found, strict=True):
-            of = self.estimate.ranges.anchor[radio.rows[radio.chosen]]
-            for number in radio.numbers:
-                own = each.place[(of == number) & (each.place >= 0)]
-                anchors[number] = each.places[np.bincount(own).argmax()] if len(own) else anchors[number]
-        return anchors
-
     def _displacement(self) -> Floats:
         """Return the motion (3,) of the stretch in the map."""
         origin = self.estimate.graph.poses[self.begin - 1]
         return np.asarray(se2.compose(se2.compose(origin, self.motion), se2.inverse(origin)))
 
     def _evidence(self, radios: Sequence[int], worth: Sequence[Floats]) -> float:
-        """Return the evidence of the ranges of some radios along the path with the stretch moved, places at their likeliest.
-
-        Parameters
-        ----------
-        worth : of the ranges of each radio (m,) with the moves, see PlaceModel.
-        """
+        """Return the evidence of some radios' ranges, of a worth (m,) each, with the stretch moved and places likeliest."""
         moved = self._displacement()
         for k in radios:
             radio = self.radios[k]
@@ -202,8 +219,7 @@ class BrokenStep:
         return sum(self.found[k].evidence for k in radios)
 
     def _fitted(self) -> tuple[Floats, float]:
-        """Return the error (3,) of the step that explains the stretch's ranges best, and the logarithm of what share of its
-        prior the ranges leave."""
+        """Return the step's error (3,) that explains the stretch's ranges best, and the log of the share of its prior left."""
         home = se2.inverse(self.estimate.graph.poses[self.begin - 1])
         parts = []
         for radio, each in zip(self.radios, self.found, strict=True):
@@ -224,17 +240,17 @@ class BrokenStep:
         starts = [*np.column_stack([np.zeros((len(angles), 2)), angles]), *self._motions_of_anchors(home)]
         tried = [least_squares(errors, start, loss="cauchy", f_scale=BreakPolicy.loss) for start in starts]
         done = min(tried, key=lambda each: float(each.cost))
-        spread = -0.5 * np.linalg.slogdet(done.jac.T @ done.jac)[1] - 3.0 * np.log(BreakPolicy.size)
+        spread = -0.5 * np.linalg.slogdet(done.jac.T @ done.jac)[1] - len(done.x) * np.log(BreakPolicy.size)
         return np.asarray(done.x), float(spread)
 
     def _motions_of_anchors(self, home: Floats) -> list[Floats]:
         """Return motions (3,) of the stretch that would move the anchors of the moves back to where they were."""
-        moved = [(self.before[m.radio].places, m.before, int(self.before[m.radio].place[m.interval[0]])) for m in self.moves]
-        if not moved:
-            return []
+        places = [self.before[move.radio].places for move in self.moves]
+        former = [move.before for move in self.moves]
+        later = [int(self.before[move.radio].place[move.interval[0]]) for move in self.moves]
         here, there = (
-            se2.transform(home, np.array(points))
-            for points in ([at[one] for at, one, _ in moved], [at[other] for at, _, other in moved])
+            se2.transform(home, np.array([of[k] for of, k in zip(places, numbers, strict=True)]))
+            for numbers in (former, later)
         )
         shift = np.append((here - there).mean(axis=0), 0.0)
         return [shift, se2.align(there, here)] if len(here) > 1 else [shift]

@@ -1,14 +1,15 @@
-"""Checks of calibration values against what is known of them otherwise.
+"""Calibration values against what is known of them otherwise.
 
 The scale of turns, which must be one constant that no single wrong turn changes; the point about which the robot turns; the
-unit of the odometry, of which ranges, times of flight, may show another one; and the offset of the lidar's clock, which must be
-the same in all parts of a recording.
+unit of the odometry; and the offset of the lidar's clock, which must be the same in all parts of a recording.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+from scipy.special import softmax
 
 from ..arrays import Floats
 from ..errors import SolverError
@@ -23,6 +24,31 @@ from ..sensor_log import SensorLog
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .recordings import Recording
+
+_OTHER_UNIT = 0.12
+"""Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
+_TOLERANCE = 0.004
+"""Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
+_PARTS = 8
+"""Parts of a recording whose offsets are compared."""
+_LEAST = 20
+"""Least number of keyframes in a part."""
+
+
+@dataclass(frozen=True, slots=True)
+class TurningPolicy:
+    """Offsets of a lidar from the place that is given, and whether wheels that slip in turns cause them."""
+
+    small: ClassVar[float] = 0.01
+    """m; a mounting, or the origin of a base, is not known better than this."""
+    by_tape: ClassVar[float] = 0.03
+    """Standard deviation of a mounting that is given and right, m."""
+    significant: ClassVar[float] = 3.0
+    """Standard deviations from which an offset of the lidar is significant."""
+    wrong_frame: ClassVar[float] = 0.1
+    """Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
+    slips: ClassVar[float] = 0.5
+    """Prior odds of a robot that slips in turns against one that does not."""
 
 
 def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
@@ -48,49 +74,34 @@ def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
 def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
     """Let the robot turn about another point than the base's origin, where the lidar seems to be mounted off its place.
 
-    Wheels that slip in turns (skid steering) have exactly the same residuals as a lidar mounted elsewhere: a base whose origin
-    is shifted has the same scans and the same wheels. So the offset h that the lidar has without slip is split by the prior
-    probabilities: p that the robot slips, 1 - p that the lidar's given mounting is wrong. Priors N(0, p h^2) of the slip
-    and N(0, (1 - p) h^2) of the mounting give mean p h and variance p (1 - p) h^2, those of the two alternatives. Where no
-    mounting is given, the base's origin is the point about which it turns.
+    Wheels that slip in turns (skid steering) have exactly the same residuals as a lidar mounted elsewhere. So the offset h that
+    the lidar has without slip is split by the probability p that the robot slips: priors N(0, p h^2) of the slip and
+    N(0, (1 - p) h^2) of the mounting give mean p h and variance p (1 - p) h^2, those of the two alternatives. Where no mounting
+    is given, the base's origin is the point about which it turns.
     """
-    graph, config = estimate.graph, task.config.calibration
+    graph, config, policy = estimate.graph, task.config.calibration, TurningPolicy
     at, slips = graph.calibration.index("laser_x"), graph.calibration.of_kinds(TURNING)
     offset = graph.calibration.get("laser_x")
     given = all(np.any(r.log.mounting.T_base_laser != 0.0) for r in task.recordings.each if r.has_scans)
-    if not given or not slips.any() or abs(offset) < _SMALL or graph.fixed_calibration[at]:
+    if not given or not slips.any() or abs(offset) < policy.small or graph.fixed_calibration[at]:
         return estimate
-    if abs(offset) < _SIGNIFICANT * marginals(estimate.problem).covariances.calibration[at]:
+    if abs(offset) < policy.significant * marginals(estimate.problem).covariances.calibration[at]:
         return estimate
-    widths = (config.sideways_per_turn, min(_BY_TAPE, config.laser_offset), config.laser_offset)
-    slip, right, other = (np.exp(-0.5 * (offset / width) ** 2) / width for width in widths)
-    share = float(_SLIPS * slip / max(_SLIPS * slip + (1.0 - _WRONG_FRAME) * right + _WRONG_FRAME * other, _NEVER))
+    widths = np.array([config.sideways_per_turn, min(policy.by_tape, config.laser_offset), config.laser_offset])
+    odds = np.array([policy.slips, 1.0 - policy.wrong_frame, policy.wrong_frame])
+    share = float(softmax(np.log(odds / widths) - 0.5 * (offset / widths) ** 2)[0])
     sigma = prior_sigma(graph)
-    sigma[slips] = max(abs(offset) * np.sqrt(share), _SMALL)
-    sigma[at] = max(abs(offset) * np.sqrt(1.0 - share), _SMALL)
+    sigma[slips] = max(abs(offset) * np.sqrt(share), policy.small)
+    sigma[at] = max(abs(offset) * np.sqrt(1.0 - share), policy.small)
     estimate = replace(estimate, graph=with_free(with_prior_sigma(graph, sigma), TURNING))
     return estimate.with_estimates_of(Optimizer().optimize(estimate.problem, task.config.solver)[0])
-
-
-_SMALL = 0.01
-"""m; a mounting, or the origin of a base, is not known better than this."""
-_BY_TAPE = 0.03
-"""Standard deviation of a mounting that is given and right, m."""
-_SIGNIFICANT = 3.0
-"""Standard deviations from which an offset of the lidar is significant."""
-_WRONG_FRAME = 0.1
-"""Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
-_NEVER = 1e-300
-"""Probability density of an offset without a known cause; it is then assigned to the mounting."""
-_SLIPS = 0.5
-"""Prior odds of a robot that slips in turns against one that does not."""
 
 
 def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
     """Return the settings without the hypothesis that a unit of the wheels is wrong, where a lidar has measured their ways.
 
-    Ranges through walls to an anchor or two may fit wheels several times too short better than a path that is right. Lidar and
-    wheels that agree would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
+    Ranges through walls may fit wheels several times too short better than a path that is right; lidar and wheels that agree
+    would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
     """
     ways = np.array([float("nan") if log.screening is None else log.screening.lidar_by_wheels for log in logs])
     if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
@@ -146,18 +157,6 @@ def _lidar_agrees(recording: Recording, factor: float) -> bool:
     return abs(ratio - factor) < abs(ratio - 1.0)
 
 
-_OTHER_UNIT = 0.12
-"""Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
-
-
-TOLERANCE = 0.004
-"""Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
-_PARTS = 8
-"""Parts of a recording whose offsets are compared."""
-_LEAST = 20
-"""Least number of keyframes in a part."""
-
-
 def late(estimate: Estimate, task: Task) -> float:
     """Return by how much the lidar's clock is later than that with which the clouds were made, s; 0 where that is not shown.
 
@@ -166,7 +165,7 @@ def late(estimate: Estimate, task: Task) -> float:
     calibration = estimate.graph.calibration
     at = calibration.index("laser_delay")
     off = calibration.get("laser_delay") - estimate.lidar.delay
-    if at < 0 or estimate.graph.fixed_calibration[at] or abs(off) < TOLERANCE:
+    if at < 0 or estimate.graph.fixed_calibration[at] or abs(off) < _TOLERANCE:
         return 0.0
     values, sigmas = _by_parts(estimate, at, task)
     prior = float(prior_sigma(estimate.graph)[at])

@@ -1,15 +1,14 @@
 """Prior knowledge given by the user, as edges of a graph in the user's frame.
 
-When the first estimate stands in the frame of the odometry, a rigid motion found from surveyed anchors and pinned poses
-transforms it; the anchors and poses that agree are found at the same time, so that an anchor that was moved since does not
-bend the map but is reported.
+A rigid motion found from surveyed anchors and pinned poses brings the first estimate there; an anchor of an earlier map that
+was moved since is found at the same time, and does not bend the map.
 
-A landmark (column, corner) is a place in the map before its distances are used. It is fixed to keyframes with points there: of
-each visit, the keyframe with most of these points keeps the landmark's place in its own frame. A measured distance constrains
-each visit of one landmark against each visit of the other, so that walls, odometry and calibration adapt to it; all these edges
-together have the weight of the one measurement.
+A landmark (column, corner) is a place in the map before its distances are used. Of each visit, the keyframe with most points
+there keeps its place in its own frame, and a measured distance constrains each visit of one landmark against each of the other;
+all these edges together have the weight of the one measurement.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, ClassVar
@@ -36,9 +35,17 @@ from .lidar_stages import refine_jointly, solve_by_own_errors
 
 
 @dataclass(frozen=True, slots=True)
-class LandmarkPolicy:
-    """Which clouds see a landmark."""
+class GivenPolicy:
+    """When places agree with what is given, and which clouds see a landmark."""
 
+    gate: ClassVar[float] = 3.0
+    """Standard deviations within which a place or a distance agrees."""
+    unsure: ClassVar[float] = 0.6
+    """m, more of a first estimate, whose biases are not yet known well."""
+    moved: ClassVar[float] = 4.0
+    """Standard deviations beyond which an anchor of an earlier map counts hardly: the scale of its kernel."""
+    heading: ClassVar[float] = 1e-4
+    """rad; standard deviation of a heading that is fixed."""
     near: ClassVar[float] = 0.4
     """m; points count as the landmark's when they lie so near to its place, or to the rim of its column."""
     least_points: ClassVar[int] = 3
@@ -47,6 +54,8 @@ class LandmarkPolicy:
     """m; observations belong to one visit while less than this is travelled between two."""
     visits: ClassVar[int] = 4
     """Visits used of a landmark, those with most points."""
+    noise: ClassVar[float] = 0.05
+    """m, of a map's points on a column: the cells of the search, of which a fit takes points of four and then of two."""
 
 
 def apply_given(estimate: Estimate, task: Task) -> Estimate:
@@ -63,43 +72,28 @@ def apply_given(estimate: Estimate, task: Task) -> Estimate:
     for anchor, off in applied.moved.items():
         task.stages.note("moved-anchor", anchor=anchor, distance=off)
     solved = optimize(applied.graph.with_edges(*estimate.odometry_and_ranges), config.solver)[0]
-    shift = [round(v, 4) for v in applied.motion.tolist()]
-    task.stages.end("constraints", moved=sorted(applied.moved), shift=shift)
+    task.stages.end("constraints", moved=sorted(applied.moved), shift=applied.motion.tolist())
     return replace(estimate, graph=applied.graph).with_estimates_of(solved).with_hypotheses_moved(applied.motion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Applied:
-    """A graph with the prior knowledge given by the user."""
+    """A graph in the user's frame with what is given."""
 
     graph: Graph
-    """In the user's frame, where that is known, with the further edges."""
     motion: Floats
-    """(3,) T_new_old: the motion of the frame."""
+    """(3,) T_new_old."""
     moved: dict[str, float]
-    """By id, anchors that are not at their given place: their distance from it, m."""
+    """Distance from its given place, m, of each anchor that is not there."""
 
 
 def apply(constraints: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
-    """Bring a first estimate into the user's frame and add the prior knowledge to its edges.
-
-    Parameters
-    ----------
-    graph : first estimate; its first pose is fixed.
-    anchor_ids : (a,) names of its anchors.
-    placed : (a,) which of them have a position.
-    clock : when its poses were.
-
-    Raises
-    ------
-    ConfigError : an anchor is not in the recording, or a stamp lies outside it.
-    """
+    """Bring a first estimate, whose first pose is fixed, into the user's frame and add the prior knowledge to its edges."""
     constraints = _present(constraints, anchor_ids)
     index = {name: k for k, name in enumerate(anchor_ids)}
     motion, moved = _fit(constraints, graph, index, placed, clock)
     graph = replace(graph, poses=se2.compose(motion, graph.poses), anchors=se2.transform(motion, graph.anchors))
-    edges = [*_anchor_priors(constraints, index, moved), *_pose_priors(constraints, clock)]
-    edges += [*_distances(constraints, index), *_closures(constraints, clock)]
+    edges = _edges(constraints, index, moved, clock)
     if constraints.places:
         graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
         edges += _gauge(constraints, graph, moved)
@@ -108,7 +102,7 @@ def apply(constraints: Constraints, graph: Graph, anchor_ids: tuple[str, ...], p
 
 def _present(constraints: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
     """Return what concerns this recording; anchors of an earlier map without ranges now are left out."""
-    wanted = {a.id for a in constraints.anchors if not a.movable} | {name for d in constraints.distances for name in d.anchors}
+    wanted = {a.id for a in constraints.anchors if not a.movable}.union(*(d.anchors for d in constraints.distances))
     missing = sorted(wanted - set(anchor_ids))
     if missing:
         raise ConfigError(f"constraints: no ranges to anchor {missing[0]}; the recording has {', '.join(anchor_ids) or 'none'}")
@@ -133,11 +127,6 @@ def _fit(
     return motion, _strayed(constraints, graph, index, placed, motion)
 
 
-def _tolerance(anchor: GivenAnchor) -> float:
-    """Return how far a first estimate may lie from a known place, m; biases are not yet known well then."""
-    return 3.0 * anchor.sigma + 0.6
-
-
 def consensus(estimated: Floats, surveyed: Floats, tolerance: Floats) -> Floats:
     """Return the motion of the pair of places that most others agree with, fitted to all of these."""
     best: tuple[float, Bools] = (-np.inf, np.ones(len(estimated), dtype=bool))
@@ -151,79 +140,56 @@ def consensus(estimated: Floats, surveyed: Floats, tolerance: Floats) -> Floats:
     return align(estimated[agree], surveyed[agree])
 
 
+def _tolerance(anchor: GivenAnchor) -> float:
+    return GivenPolicy.gate * anchor.sigma + GivenPolicy.unsure
+
+
 def _strayed(constraints: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
+    """Return how far the anchors of an earlier map that were moved are from there, m."""
     strayed = {}
     for a in constraints.anchors:
         if a.movable and placed[index[a.id]]:
             off = float(np.hypot(*(se2.transform(motion, graph.anchors[index[a.id]]) - np.array(a.position))))
             if off > _tolerance(a):
-                strayed[a.id] = round(off, 3)
+                strayed[a.id] = off
     return strayed
 
 
-def _anchor_priors(constraints: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
-    """Surveyed anchors are taken as they are; those of an earlier map get a kernel that gives up a moved one."""
-    edges: list[Edges] = []
-    for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
-        anchors = [a for a in constraints.anchors if a.movable == movable and a.id not in moved]
-        if anchors:
+def _edges(constraints: Constraints, index: dict[str, int], moved: dict[str, float], clock: Clock) -> list[Edges]:
+    """Return what is given; the places of an earlier map have a kernel that gives up an anchor that was moved."""
+    edges = list[Edges]()
+    for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", GivenPolicy.moved))):
+        if anchors := [a for a in constraints.anchors if a.movable == movable and a.id not in moved]:
             place = np.array([index[a.id] for a in anchors], dtype=np.intp)
-            value = np.array([a.position for a in anchors])
             root = np.array([np.eye(2) / a.sigma for a in anchors])
-            edges.append(PriorEdges("anchors", place, value, root, kernel=kernel))
+            edges.append(PriorEdges("anchors", place, np.array([a.position for a in anchors]), root, kernel=kernel))
+    if poses := constraints.poses:
+        place = np.array([clock.nearest(p.stamp, p.recording) for p in poses], dtype=np.intp)
+        edges.append(PriorEdges("poses", place, np.array([p.pose for p in poses]), _roots([p.sigma for p in poses])))
+    if given := constraints.distances:
+        one, other = np.array([[index[name] for name in d.anchors] for d in given], dtype=np.intp).T
+        edges.append(AnchorDistanceEdges(one, other, *np.array([[d.distance, d.sigma] for d in given]).T))
+    if closures := constraints.closures:
+        ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in closures]
+        i, j = np.array(ends, dtype=np.intp).T
+        edges.append(RelativePoseEdges(i, j, np.array([c.pose for c in closures]), _roots([c.sigma for c in closures])))
     return edges
 
 
-def _pose_priors(constraints: Constraints, clock: Clock) -> list[Edges]:
-    if not constraints.poses:
-        return []
-    place = np.array([clock.nearest(p.stamp, p.recording) for p in constraints.poses], dtype=np.intp)
-    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in constraints.poses])
-    return [PriorEdges("poses", place, np.array([p.pose for p in constraints.poses]), root)]
-
-
-def _distances(constraints: Constraints, index: dict[str, int]) -> list[Edges]:
-    if not constraints.distances:
-        return []
-    ends = np.array([[index[name] for name in d.anchors] for d in constraints.distances], dtype=np.intp)
-    values = np.array([[d.distance, d.sigma] for d in constraints.distances])
-    return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
-
-
-def _closures(constraints: Constraints, clock: Clock) -> list[Edges]:
-    if not constraints.closures:
-        return []
-    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in constraints.closures]
-    i, j = np.array(ends, dtype=np.intp).T
-    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in constraints.closures])
-    return [RelativePoseEdges(i, j, np.array([c.pose for c in constraints.closures]), root)]
+def _roots(sigmas: Sequence[tuple[float, ...]]) -> Floats:
+    return np.array([np.diag(1.0 / np.array(sigma)) for sigma in sigmas])
 
 
 def _gauge(constraints: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
     """Fix the heading of the first pose where only one place is given, which does not determine it."""
     if constraints.poses or sum(a.id not in moved for a in constraints.anchors) > 1:
         return []
-    root = np.diag([0.0, 0.0, 1e4])[None]
+    root = np.diag([0.0, 0.0, 1.0 / GivenPolicy.heading])[None]
     return [PriorEdges("poses", np.zeros(1, dtype=np.intp), graph.poses[:1].copy(), root)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """Where a landmark stands, seen from some keyframes."""
-
-    keyframe: Ints
-    """(v,) one of each visit."""
-    position: Floats
-    """(v, 2) m, in the frame of that keyframe."""
-
-
-def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Observations:
-    """Find the keyframes that see a landmark.
-
-    Parameters
-    ----------
-    landmark : its place, in the frame of the poses.
-    path : (k,) m travelled.
+def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floats) -> tuple[Ints, Floats]:
+    """Return a keyframe (v,) of each visit to a landmark, and where this stands in its frame (v, 2), m.
 
     Raises
     ------
@@ -231,33 +197,33 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     """
     points = se2.transform_each(poses, clouds.owner, clouds.points)
     place = np.array(landmark.position)
-    reach = LandmarkPolicy.near
+    reach = GivenPolicy.near
     near = np.hypot(*(points - place).T) < landmark.radius + reach
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
     if landmark.radius > 0.0:
-        place = find_column(points[near], place, landmark.radius, reach, cell=0.05)
+        place = find_column(points[near], place, landmark.radius, reach, cell=GivenPolicy.noise)
         if not np.isfinite(place).all():
             raise ConfigError(f"{where}: no column of radius {landmark.radius:g} m stands there; look up its place in the map")
     count = np.bincount(clouds.owner[near], minlength=len(poses))
-    seen = np.flatnonzero(count >= LandmarkPolicy.least_points)
+    seen = np.flatnonzero(count >= GivenPolicy.least_points)
     if not len(seen):
         raise ConfigError(f"{where}: the lidar saw nothing within {reach:g} m of it; look up its place in the map")
-    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > LandmarkPolicy.one_visit]))
+    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > GivenPolicy.one_visit]))
     weight = np.bincount(visit, count[seen])
-    best = np.sort(np.argsort(-weight, kind="stable")[: LandmarkPolicy.visits])
+    best = np.sort(np.argsort(-weight, kind="stable")[: GivenPolicy.visits])
     best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.intp)
     position = se2.transform(se2.inverse(poses[best_view]), place)
     if landmark.radius > 0.0:
         views = zip(best_view.tolist(), position, strict=True)
         position = np.array([_column_in(clouds.cloud(k)[0], at, landmark.radius) for k, at in views])
-    return Observations(best_view, position)
+    return best_view, position
 
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
     """Return where one cloud has a column (2,): the column's place in the whole map bounds the search in the cloud."""
-    near = points[np.hypot(*(points - place).T) < radius + LandmarkPolicy.near]
-    centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
-    return centre if np.hypot(*(centre - place)) < LandmarkPolicy.near else place
+    near = points[np.hypot(*(points - place).T) < radius + GivenPolicy.near]
+    centre = fit_circle(near, fit_circle(near, place, radius, 4.0 * GivenPolicy.noise), radius, 2.0 * GivenPolicy.noise)
+    return centre if np.hypot(*(centre - place)) < GivenPolicy.near else place
 
 
 def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
@@ -276,14 +242,13 @@ def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
     estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(optimum)
     if estimate.joint is not None:
         estimate = solve_by_own_errors(refine_jointly(estimate, task), task).solved(rough(config.solver))[0]
-    figures = outcome(task, tied, estimate.graph)
-    task.stages.end("landmark distances", distances=figures)
+    task.stages.end("landmark distances", distances=outcome(task, tied, estimate.graph))
     return estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ties:
-    """Measured distances as edges between the poses that see the landmarks."""
+    """Measured distances between landmarks."""
 
     edges: PointDistanceEdges
     measured: Ints
@@ -305,10 +270,10 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
     views = {name: observations(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
     rows: list[tuple[NDArray[Any], ...]] = []
     for number, given in enumerate(constraints.landmark_distances):
-        one, other = (views[name] for name in given.landmarks)
-        a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
+        (i, p), (j, q) = (views[name] for name in given.landmarks)
+        a, b = np.indices((len(i), len(j))).reshape(2, -1)
         flat = np.ones(len(a))
-        ends = (one.keyframe[a], other.keyframe[b], one.position[a], other.position[b])
+        ends = (i[a], j[b], p[a], q[b])
         # All edges of one measurement together have its weight.
         rows.append((*ends, given.distance * flat, given.sigma * np.sqrt(len(a)) * flat, np.full(len(a), number)))
     i, j, p, q, distance, sigma, measured = (np.concatenate(column) for column in zip(*rows, strict=True))
@@ -316,13 +281,13 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
 
 
 def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
-    """Return the distances in the map, ready for a report; note those that differ from the measured ones."""
+    """Return the distances in the map, and note those that differ from the measured ones."""
     lengths = distances(tied.edges, graph)
     figures: list[dict[str, object]] = []
     for number, given in enumerate(task.constraints.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))
         names = " - ".join(given.landmarks)
-        figures.append({"landmarks": names, "measured": given.distance, "map": round(length, 4)})
-        if abs(length - given.distance) > 3.0 * given.sigma:
+        figures.append({"landmarks": names, "measured": given.distance, "map": length})
+        if abs(length - given.distance) > GivenPolicy.gate * given.sigma:
             task.stages.note("landmark-distance", **figures[-1])
     return figures

@@ -22,6 +22,10 @@ from .mapping_config import MappingConfig
 from .progress import Stages
 from .recordings import Recordings
 
+_NEXT_TO_NOTHING = 0.1
+"""Share of the poses that matches of clouds constrain, below which a lidar helps no map; in a nearly empty hall of 70 x 45 m,
+where it does, they constrain a quarter."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
@@ -46,7 +50,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class OtherHeights:
-    """A hypothesis about heights of anchors that the ranges do not refute."""
+    """Heights of anchors that the ranges do not refute."""
 
     high: float
     """Height of the anchors above the tag where they are high, m."""
@@ -152,8 +156,3 @@ class Estimate:
             tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in self.bootstrap.hypotheses
         )
         return replace(self, bootstrap=replace(self.bootstrap, hypotheses=moved))
-
-
-_NEXT_TO_NOTHING = 0.1
-"""Share of the poses that matches of clouds constrain, below which a lidar helps no map; in a nearly empty hall of 70 x 45 m,
-where it does, they constrain a quarter."""

@@ -16,17 +16,18 @@ _GRID = GridConfig()
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md."""
+    """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md.
+
+    Per metre of driving, range, reading of the laser, and cell of the grid, while which is counted half of the graph's memory
+    is free again.
+    """
 
     seconds_per_metre: float
-    """Of driving: matching of clouds, graph."""
     seconds_per_range: float
     seconds_per_reading: float
-    """Of the laser: parsing and tracing."""
     bytes_per_metre: float
     bytes_per_reading: float
     bytes_per_cell: float
-    """Of the grid, while which is counted half of the graph's memory is free again."""
 
 
 WITH_LIDAR = Rates(0.045, 1.5e-4, 2e-7, 0.2e6, 2.0, 8.0)
@@ -35,8 +36,8 @@ RANGES_ALONE = Rates(0.0005, 8e-4, 0.0, 0.09e6, 0.0, 0.0)
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files."""
 BYTES_AT_LEAST = 105e6
-"""Numpy, scipy, and what small recordings take. With these figures 31 min in a hall are 206 MB (282 measured, reading
-included), 1.4 km of a hospital with 40 million cells 568 (577), 1.9 km of corridors 561 (465), others 0.7 to 1.0 times."""
+"""Numpy, scipy, and what small recordings take."""
+_MEGA = 1e6
 _SCANS = 500
 """Looked at, at most, for the size of the map."""
 
@@ -70,10 +71,7 @@ def seen_size(log: SensorLog) -> Floats:
 
 
 def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
-    """Return the time and memory that the map of a screened recording is expected to need, and the size of the map.
-
-    The time is that on the computer of docs/lab/performance.md; a Raspberry Pi 4 takes several times as long.
-    """
+    """Return the time (see model_seconds) and memory that the map of a screened recording is expected to need, and its size."""
     size = seen_size(log)
     # A larger grid gets larger cells.
     cells = 0 if log.scans is None else min(int(np.prod(size / grid.resolution)), grid.max_cells)
@@ -90,8 +88,8 @@ def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
 
 def together(costs: Sequence[dict[str, float]]) -> dict[str, float]:
     """Return the time and memory of one map of several recordings."""
-    twice = (len(costs) - 1) * SECONDS_AT_LEAST, (len(costs) - 1) * 1e-6 * BYTES_AT_LEAST
-    return {name: sum(cost[name] for cost in costs) - less for name, less in zip(("seconds", "megabytes"), twice, strict=True)}
+    once = {"seconds": SECONDS_AT_LEAST, "megabytes": BYTES_AT_LEAST / _MEGA}
+    return {name: sum(cost[name] for cost in costs) - (len(costs) - 1) * least for name, least in once.items()}
 
 
 def expected_megabytes(path: float, scans: int, beams: int, cells: int) -> float:
@@ -99,4 +97,4 @@ def expected_megabytes(path: float, scans: int, beams: int, cells: int) -> float
     rates = WITH_LIDAR if scans else RANGES_ALONE
     graph = rates.bytes_per_metre * path
     largest = max(graph, 0.5 * graph + rates.bytes_per_cell * cells)
-    return 1e-6 * (BYTES_AT_LEAST + rates.bytes_per_reading * scans * beams + largest)
+    return (BYTES_AT_LEAST + rates.bytes_per_reading * scans * beams + largest) / _MEGA

@@ -47,13 +47,15 @@ class FinalPolicy:
     fastest: ClassVar[float] = 1.0
     """m/s and rad/s, at which a robot with wheels that measure nothing moves at most."""
 
+_MILLION = 1e6
+
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """Put every measurement into the graph; where the lidar has refined the poses, estimate anchors with other weights.
 
     For poses, a range is weighted by its own errors (lidar_stages.solve_by_own_errors); for anchors, also by the errors that
     all ranges from one direction have in common, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
-    graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
+    graphical models, 2015).
     """
     if estimate.joint is not None and estimate.ranges is not None:
         estimate = _anchors_alone(estimate, task)
@@ -95,7 +97,7 @@ def _between_scan_and_keyframe(graph: Graph, task: Task) -> Floats:
 
     Scans measure the pose at their own times; nothing but the odometry measures the motion from there to the keyframe.
     """
-    time, rate = np.zeros(len(graph.poses)), np.zeros((len(graph.poses), 3))
+    time, rate = np.zeros(len(graph.poses)), np.zeros_like(graph.poses)
     for recording in task.recordings.each:
         if recording.has_scans:
             time[recording.rows] = time_to_scans(recording, task.config.keyframes)
@@ -161,8 +163,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     def announce(geometry: GridGeometry) -> None:
         """Report what a large grid will take; the caller may still stop."""
         if geometry.cells >= FinalPolicy.large_grid:
-            cells, megabytes = geometry.cells / 1e6, geometry.megabytes
-            detail = f"of {cells:.0f} million cells, about {megabytes:.0f} MB"
+            detail = f"of {geometry.cells / _MILLION:.0f} million cells, about {geometry.megabytes:.0f} MB"
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)
 
     reporter = stages.reporter("occupancy grid")
@@ -171,7 +172,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     if grid.scans_astray:
         stages.note("scans-astray", scans=grid.scans_astray, used=grid.scans_used)
     if grid.geometry.resolution > config.grid.resolution:
-        cells = config.grid.max_cells / 1e6
+        cells = config.grid.max_cells / _MILLION
         stages.note("coarse-grid", resolution=grid.geometry.resolution, asked=config.grid.resolution, cells=cells)
     if config.crop is not None:
         grid = cropped(grid, config.crop)

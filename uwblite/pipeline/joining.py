@@ -1,13 +1,9 @@
 """Many recordings in one graph: anchors have ids, so recordings of other days and robots share a frame.
 
-Each recording is bootstrapped on its own. The anchors that two have in common then give the pose of one in the frame of
-the other; one that does not agree is left out of this and has a place for each recording (``5C0B`` and ``5C0B#2``), until
-anchor_places decides. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
-Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
-
-Places that a recording's ranges give are Gaussian together. Far from its first pose all of them err by metres, because the
-heading does, but alike: a rigid motion takes that out, and what is left shows an anchor that was moved. So places are compared
-under their joint covariances, with the motion of one recording into the frame of the other free.
+The anchors that two recordings, bootstrapped each on its own, have in common give the pose of one in the frame of the other.
+Far from its first pose all places of a recording err by metres, but alike: they are compared under their joint covariances with
+the rigid motion into the other frame free, and what is left shows an anchor that was moved. It has a place for each recording
+(``5C0B`` and ``5C0B#2``) until anchor_places decides. Systematic errors stay each recording's own, see calibration.unknowns.
 """
 
 from collections.abc import Sequence
@@ -18,7 +14,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, rms_length
 from ..errors import DataError
 from ..graph import calibration
 from ..graph.graph import Calibration, Graph, PriorEdges
@@ -50,17 +46,17 @@ class JoiningPolicy:
     """m; standard deviation of a rigid motion of which nothing is known."""
     steps: ClassVar[int] = 3
     """Gauss-Newton steps to the best motion, from the best one without covariances."""
+    exact: ClassVar[float] = 1e-9
+    """m^2 and m; least variance of a place, and least extent of places."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Where some anchors are."""
+    """Where some anchors are: (a, 2) m, and their joint covariance (2a, 2a) m^2."""
 
     names: tuple[str, ...]
     at: Floats
-    """(a, 2) m."""
     covariance: Floats
-    """(2a, 2a) m^2."""
 
     def moved(self, motion: Floats) -> "Places":
         """Return them in another frame, given T_new_old (3,)."""
@@ -75,7 +71,7 @@ def places_of(estimate: Estimate) -> Places:
     if len(placed) < 2:
         placed = np.flatnonzero(estimate.placed)
     values, vectors = np.linalg.eigh(anchor_covariance(estimate.graph.with_edges(*estimate.odometry_and_ranges), placed))
-    bounded = np.asarray((vectors / (1.0 / np.maximum(values, 1e-12) + JoiningPolicy.largest**-2)) @ vectors.T)
+    bounded = np.asarray((vectors / (1.0 / np.maximum(values, JoiningPolicy.exact) + JoiningPolicy.largest**-2)) @ vectors.T)
     return Places(tuple(estimate.anchor_ids[k] for k in placed), estimate.graph.anchors[placed], bounded)
 
 
@@ -108,7 +104,7 @@ def together(placed: Places, found: Places, names: Sequence[str]) -> Places:
     free = found.covariance + c.free**2 * tangent @ tangent.T + 0.5 * c.systematic**2 * np.eye(len(rows))
     known = 2 * len(placed.names)
     information, vector = np.zeros((2 * len(union), 2 * len(union))), np.zeros(2 * len(union))
-    information[:known, :known] = np.linalg.inv(placed.covariance + 1e-9 * np.eye(known))
+    information[:known, :known] = np.linalg.inv(placed.covariance + c.exact * np.eye(known))
     vector[:known] = information[:known, :known] @ placed.at.ravel()
     own = np.linalg.inv(free)
     information[np.ix_(rows, rows)] += own
@@ -131,27 +127,25 @@ def fitted(found: Places, placed: Places, pairs: Pairs) -> tuple[Floats, float]:
         weighted = cho_solve(factor, tangent)
         step = -np.linalg.solve(tangent.T @ weighted, weighted.T @ off)
         left = off + tangent @ step
-        turn_step = step[2] / _extent(at)
-        shift = at.mean(axis=0)
-        motion = se2.compose(np.append(shift + step[:2] - se2.rotate(turn_step, shift), turn_step), motion)
+        turn, middle = step[2] / _extent(at), at.mean(axis=0)
+        motion = se2.compose(np.append(middle + step[:2] - se2.rotate(turn, middle), turn), motion)
     return motion, float(left @ cho_solve(factor, left))
 
 
 def _tangent(at: Floats) -> Floats:
-    """Return how (2a, 3) places move with a rigid motion: x and y, and a turn about their mean by which they move as far."""
+    """Return how places (2a, 3) move with a rigid motion: x, y, and a turn about their mean by which they move as far."""
     turned = se2.rotate(0.5 * np.pi, at - at.mean(axis=0)) / _extent(at)
     return np.column_stack([np.tile(np.eye(2), (len(at), 1)), turned.ravel()])
 
 
 def _turned(covariance: Floats, angle: float) -> Floats:
-    """Return the covariance (2a, 2a) of places in a frame turned by an angle."""
     turn = np.kron(np.eye(len(covariance) // 2), se2.rotation(angle)[:2, :2])
     return np.asarray(turn @ covariance @ turn.T)
 
 
 def _extent(at: Floats) -> float:
     """Return the rms distance of places from their mean, m."""
-    return max(float(np.sqrt(np.mean(np.sum((at - at.mean(axis=0)) ** 2, axis=1)))), 1e-9)
+    return max(rms_length(at - at.mean(axis=0)), JoiningPolicy.exact)
 
 
 def _scalars(numbers: Ints) -> Ints:
@@ -160,13 +154,9 @@ def _scalars(numbers: Ints) -> Ints:
 
 
 def join(estimates: Sequence[Estimate], recordings: Recordings) -> Estimate:
-    """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
+    """Bring the estimates of all recordings into the frame of the first by common anchors, and make them one graph.
 
-    Recordings are joined in the order of how many anchors they share with those already joined, so that a third may link two.
-
-    Parameters
-    ----------
-    estimates : of each of the recordings, in its own frame and numbering.
+    The recording that shares most anchors with those already joined is next, so that a third may link two.
 
     Raises
     ------
@@ -174,15 +164,14 @@ def join(estimates: Sequence[Estimate], recordings: Recordings) -> Estimate:
     """
     found = [places_of(estimate) for estimate in estimates]
     placed = found[0]
-    motions = [np.zeros(3) for _ in estimates]
+    motions = [np.zeros_like(estimate.graph.poses[0]) for estimate in estimates]
     names = [list(estimate.anchor_ids) for estimate in estimates]
     waiting = list(range(1, len(estimates)))
     while waiting:
         number = max(waiting, key=lambda n: (len(set(found[n].names) & set(placed.names)), -n))
         waiting.remove(number)
-        own = found[number]
-        motions[number], agree = _laid_on(own, placed, recordings.each[number])
-        own = own.moved(motions[number])
+        motions[number], agree = _laid_on(found[number], placed, recordings.each[number])
+        own = found[number].moved(motions[number])
         called = list(own.names)
         for k, name in enumerate(own.names):
             if name in placed.names and (k, placed.names.index(name)) not in agree:
@@ -212,7 +201,7 @@ def _laid_on(found: Places, placed: Places, recording: Recording) -> tuple[Float
 def _one_graph(
     estimates: Sequence[Estimate], motions: Sequence[Floats], names: Sequence[Sequence[str]], recordings: Recordings
 ) -> Estimate:
-    """Make the estimates one, each moved by its motion, its anchors under the given names."""
+    """Return the estimates as one, each moved by its motion, its anchors under the given names."""
     # Second places stand last: they may be found to be none, and what the user gives is counted by number.
     ids = tuple(sorted(dict.fromkeys(name for own in names for name in own), key=lambda name: name != first_place(name)))
     place = [np.array([ids.index(name) for name in own], dtype=np.intp) for own in names]
@@ -272,12 +261,11 @@ def _one_bootstrap(
 
 
 def _renamed(indices: Ints, at: Ints) -> Ints:
-    """Return indices into one block as indices into another, -1 left."""
+    """Return indices into a block as indices into another, where -1 stays."""
     return np.append(at, -1)[indices]
 
 
 def _one_odometry(odometry: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
-    """Return the odometry edges of all recordings."""
     slips = [np.zeros(len(own)) if own.slips is None else own.slips for own in odometry]
     some = any(own.slips is not None for own in odometry)
     moved = [

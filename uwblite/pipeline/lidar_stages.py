@@ -17,6 +17,15 @@ from .estimate import Estimate, Task
 from .progress import solver_figures
 from .radio_stages import evidence_against, with_range_noise
 
+_TO_COME = 1e-3
+"""Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
+_STILL = 1e-3
+"""Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
+_VIOLATION = 0.05
+"""Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
+_ENOUGH_VISITS = 5
+"""Least number of keyframes of either visit for which their free-space violation counts."""
+
 
 def pairs(estimate: Estimate, graph: Graph, settings: RefinementConfig, task: Task) -> tuple[Ints, Ints]:
     """Return pairs of clouds (e,), (e,) that overlap at a graph's poses, without those that the user has forbidden and those
@@ -52,19 +61,17 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
     counts = {"pairs": len(refined.used), "used": int(refined.used.sum()), "rounds": refined.rounds}
-    figures = {"sigma": round(refined.sigma, 4), "shift": round(estimate.moved_since(before), 5)}
+    figures = {"sigma": refined.sigma, "shift": estimate.moved_since(before)}
     task.stages.end("joint refinement", **counts, **figures, **solver_figures(refined.summary))
     return estimate
 
 
 def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
-    """Solve everything with ranges that are weighted by their own errors alone.
+    """Solve everything with ranges that are weighted by their own errors alone, and correct these.
 
-    The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
-    gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
-    constrains these, and the poses may absorb the error as well: the evidence decides between the two weightings, and where it
-    is for the ranges, the lidar is matched again. With the ranges corrected by what they err by in common in each direction,
-    the adjustment to surfaces solves once more.
+    The common error of all ranges from one direction moves an anchor, but gives a pose nothing false, since the anchor's place
+    absorbs it. Where such ranges move poses by much, the lidar hardly constrains these, and they may absorb the error as well:
+    the evidence decides between the two weightings, and where it is for the ranges, the lidar is matched again.
     """
     if estimate.ranges is None or estimate.joint is None:
         return estimate
@@ -95,17 +102,11 @@ def _without_pattern(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, ranges=without_pattern(estimate.ranges, graph, marginals(graph)))
 
 
-_TO_COME = 1e-3
-"""Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
-_STILL = 0.001
-"""Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
-
-
 def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate:
     """Match all clouds again after the poses moved by a shift, m, and solve with these matches."""
     settings = replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
     refined = refine(estimate, estimate.graph, settings, task, "joint refinement")
-    task.stages.end("matched once more", pairs=len(refined.used), used=int(refined.used.sum()), shift=round(shift, 5))
+    task.stages.end("matched once more", pairs=len(refined.used), used=int(refined.used.sum()), shift=shift)
     graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
     return replace(estimate, graph=graph, joint=refined.edges)
 
@@ -114,13 +115,7 @@ def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
     """Compare the free space of one visit to a place with the points of another."""
     recordings, poses = task.recordings, estimate.graph.poses
     share, visits = visibility.free_space_violation(estimate.lidar.clouds, poses, recordings.path, recordings.of_keyframe)
-    task.stages.end("map consistency", visits=visits, free_space_violation=round(share, 4))
+    task.stages.end("map consistency", visits=visits, free_space_violation=share)
     if share > _VIOLATION and visits >= _ENOUGH_VISITS:
-        task.stages.note("free-space-violation", share=round(share, 4), visits=visits)
+        task.stages.note("free-space-violation", share=share, visits=visits)
     return estimate
-
-
-_VIOLATION = 0.05
-"""Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
-_ENOUGH_VISITS = 5
-"""Least number of keyframes of either visit for which their free-space violation counts."""

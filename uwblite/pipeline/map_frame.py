@@ -16,16 +16,19 @@ ALIGNMENTS = ("odometry", "first-pose", "walls", "anchors")
 first-pose, turned by at most 45 degrees so that most walls run along x and y. anchors: the first placed anchor (by id) is
 the origin and the last one lies along x."""
 
+_BINS = 90
+"""Of directions of walls, one degree each."""
+_WIDTHS = np.radians([5.0, 2.0])
+"""Of the kernels about their main direction, rad."""
+_EDGE = 1e-6
+"""Of a cell; a box that ends so near to the edge of one ends there."""
+
 
 def wall_direction(normals: Floats) -> float:
-    """Return the angle of the walls' main direction, rad in (-pi/4, pi/4]; walls at right angles count as one direction.
+    """Return the angle of the walls' main direction, rad in (-pi/4, pi/4], by unit normals (n, 2) of wall pieces.
 
-    The mean direction of exp(4 i angle) gives a first value; a kernel of five degrees around it, tightened once, excludes
-    oblique walls.
-
-    Parameters
-    ----------
-    normals : (n, 2) unit normals of wall pieces, map frame; zero rows are left out.
+    Zeros are left out, and walls at right angles count as one direction. A kernel around the most frequent angle, tightened
+    once, excludes oblique walls.
 
     Raises
     ------
@@ -38,20 +41,17 @@ def wall_direction(normals: Floats) -> float:
     bins = np.bincount(((angle % (np.pi / 2)) / (np.pi / 2) * _BINS).astype(np.intp) % _BINS, minlength=_BINS)
     smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
     main = (int(np.argmax(smooth)) + 0.5) / _BINS * np.pi / 2
-    for width in (np.radians(5.0), np.radians(2.0)):
+    for width in _WIDTHS:
         apart = _quarter(angle - main)
         weight = np.exp(-0.5 * (apart / width) ** 2)
         main += float(np.sum(weight * apart) / np.sum(weight))
     return float(_quarter(np.array(main)))
 
 
-_BINS = 90
-"""One degree each."""
-
-
 def _quarter(angle: Floats) -> Floats:
     """Return the angle moved into (-pi/4, pi/4]."""
-    return np.asarray(-(np.remainder(-angle + np.pi / 4, np.pi / 2) - np.pi / 4), dtype=np.float64)
+    quarter = np.pi / 2
+    return np.asarray(0.5 * quarter - np.remainder(0.5 * quarter - angle, quarter), dtype=np.float64)
 
 
 def align_axes(estimate: Estimate, task: Task) -> Estimate:
@@ -70,14 +70,11 @@ def alignment_of(estimate: Estimate, task: Task) -> Floats:
 
 
 def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
-    """Return T_new_map (3,), the motion that turns the present map frame into the wished one.
+    """Return T_new_map (3,), the motion that turns the map frame of final estimates into the wished one, one of ALIGNMENTS.
 
     Parameters
     ----------
-    how : one of ALIGNMENTS.
-    graph : final estimates.
-    placed : (a,) anchors whose position is known.
-    normals : (n, 2) unit normals of wall pieces, map frame.
+    placed : (a,) anchors whose position is known. normals : (n, 2) unit normals of wall pieces, map frame.
 
     Raises
     ------
@@ -85,7 +82,7 @@ def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
     DataError : the recording lacks the data that the alignment needs.
     """
     if how == "odometry":
-        return np.zeros(3)
+        return np.zeros_like(graph.poses[0])
     to_first = se2.inverse(graph.poses[0])
     if how == "first-pose":
         return to_first
@@ -130,8 +127,8 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
     """
     x0, y0, x1, y1 = box
     geometry = grid.geometry
-    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + 1e-6), 0, None).astype(np.intp)
-    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - 1e-6).astype(np.intp)
+    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + _EDGE), 0, None).astype(np.intp)
+    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - _EDGE).astype(np.intp)
     high = np.minimum(high, [geometry.cols, geometry.rows])
     if not np.all(high > low):
         (west, south), (east, north) = geometry.origin, geometry.corner

@@ -11,7 +11,6 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools
 from ..graph.calibration import LASER, TURNING, scan_indices, with_free
-from ..graph.graph import Graph
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
@@ -19,9 +18,9 @@ from ..lidar import scan_to_scan
 from ..lidar.scan_to_scan import ScanOdometry, Steps
 from ..odometry.wheels import reestimate_wheel_noise
 from ..problem.solution import rough
-from . import calibration_checks, scan_clouds
+from . import calibration_checks, keyframe_data
 from .estimate import Estimate, Task
-from .keyframe_changes import with_keyframes
+from .keyframe_data import with_keyframes
 from .lidar_stages import refine
 from .recordings import denser, later
 
@@ -42,7 +41,7 @@ class NeighbourPolicy:
 
 def make_clouds(estimate: Estimate, task: Task) -> Estimate:
     """Make a cloud for each keyframe, and free the laser's mounting and clock, or where it turns."""
-    scans = scan_clouds.make(task.recordings, task.config, 0.0, task.stages.work)
+    scans = keyframe_data.make(task.recordings, task.config, 0.0, task.stages.work)
     task.stages.end("clouds", points=len(scans.clouds.points))
     # Wheels that turn about another point of the base look like a laser elsewhere on it: one of the two is known.
     kinds = LASER if estimate.graph.calibration.of_kinds(*LASER[:2]).any() else (*LASER, TURNING)
@@ -52,9 +51,8 @@ def make_clouds(estimate: Estimate, task: Task) -> Estimate:
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """Make clouds and match neighbouring ones; where the lidar's clock is found to be off, move keyframes and clouds with it.
 
-    Keyframes are then at the times of the scans: otherwise the odometry's velocity would have to bridge the offset, and it is
-    inaccurate where the robot turns fast. The clouds are made here, and not in an earlier stage, so that no reference keeps
-    the replaced ones in memory.
+    Keyframes are then at the times of the scans: otherwise the odometry's velocity would have to bridge the offset. Clouds are
+    made here, so that no reference keeps the replaced ones in memory.
     """
     estimate, steps = _with_clock_found(make_clouds(estimate, task), task)
     task = task.following(estimate)
@@ -73,10 +71,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
-    """Return the estimate with keyframes and clouds at the lidar's clock, and the steps that the clouds measure there.
-
-    The steps to which matching descends from the odometry show an offset of the clock; none needs to be searched for.
-    """
+    """Return the estimate with keyframes and clouds at the lidar's clock, which the steps that the clouds measure show."""
     estimate, steps = _descended(estimate, task)
     corrected = np.inf
     for _ in range(NeighbourPolicy.retimings):
@@ -119,36 +114,25 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
 
     Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
-    Without ranges, steps that the clouds contradict were cut before, and loops that they tie judge the wheels.
-
-    Parameters
-    ----------
-    estimate : its odometry has the noise of sound wheels, and the slips that ranges show.
     """
     track = _followed(estimate, _steps(estimate, task))
     cut = _with_keyframes_where(estimate, track.slips > NeighbourPolicy.likely, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
-    estimate = replace(_without_moving(estimate, track, task), odometry=track.slipped)
-    return _match_neighbours(estimate, track, task)
-
-
-def _without_moving(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
-    """Return the estimate without the points of objects that move."""
-    return replace(estimate, scans=scan_clouds.only(estimate.lidar, ~track.moving, task.config))
+    # Points of objects that move leave the clouds.
+    still = keyframe_data.only(estimate.lidar, ~track.moving, task.config)
+    return _match_neighbours(replace(estimate, scans=still, odometry=track.slipped), track, task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
     """Return the estimate with the lidar's clock late by `delay` s and no longer an unknown, until covariances are taken.
 
-    An offset moves clouds along the velocity of the wheels, whose noise would bend steps and bias the offset; clouds made with
-    it need no velocity.
+    Clouds made with the offset need no velocity of the wheels, whose noise would bend steps and bias it.
     """
-    fixed = estimate.graph.calibration.of_kinds("laser_delay")
-    graph = estimate.graph.updated(
-        estimate.graph.poses, estimate.graph.anchors, np.where(fixed, delay, estimate.graph.calibration.values)
-    )
+    graph = estimate.graph
+    fixed = graph.calibration.of_kinds("laser_delay")
+    graph = graph.updated(graph.poses, graph.anchors, np.where(fixed, delay, graph.calibration.values))
     return replace(estimate, graph=replace(graph, fixed_calibration=graph.fixed_calibration | fixed))
 
 
@@ -157,8 +141,8 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
     before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
     task = task.following(estimate)
-    estimate = replace(estimate, scans=scan_clouds.make(task.recordings, task.config, delay, task.stages.work))
-    task.stages.end("clouds made again", laser_delay=round(delay, 4))
+    estimate = replace(estimate, scans=keyframe_data.make(task.recordings, task.config, delay, task.stages.work))
+    task.stages.end("clouds made again", laser_delay=delay)
     return estimate
 
 
@@ -187,64 +171,52 @@ def _followed(estimate: Estimate, steps: Steps) -> ScanOdometry:
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
-    """Cut doubtful steps of the odometry (e,) at the scans within them: it slipped there, or the clouds contradict it.
+    """Cut doubtful steps of the odometry (e,) at the scans within them; None where no scans are.
 
-    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud. None is returned
-    where no scans are within them.
+    Where the robot moves little between two scans, any odometry is good enough to place the rays of a cloud.
     """
     before = task.recordings
     steps = estimate.odometry.i[doubtful]
     after = denser(before, steps, NeighbourPolicy.cuts, estimate.lidar.delay)
     if len(after.stamps) == len(before.stamps):
         return None
-    scans = scan_clouds.remake(estimate.lidar, before, after, task.config)
+    scans = keyframe_data.make(after, task.config, estimate.lidar.delay, task.stages.work)
     task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
     return replace(with_keyframes(estimate, before, after), scans=scans)
 
 
 def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Estimate:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    config, rules, graph = task.config, task.config.refinement, estimate.graph
+    rules, graph = task.config.refinement, estimate.graph
     rejected = np.zeros(len(graph.poses), dtype=bool)
     rejected[estimate.odometry.i[track.rejected]] = True
     estimate = replace(estimate, rejected=rejected)
     weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, track.steps)
-    graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
+    graph = graph.with_estimates_of(optimize(problem, rough(task.config.solver))[0])
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
-    figures: dict[str, object] = {
-        "searched": track.searched,
-        "rejected": int(track.rejected.sum()),
-        "slipped": int(np.sum(track.slips > NeighbourPolicy.likely)),
-        "moving": round(float(track.moving.mean()) if len(track.moving) else 0.0, 4),
-    }
-    return _refined_neighbours(estimate, graph, gate, task, figures)
-
-
-def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, figures: dict[str, object]) -> Estimate:
-    """Let neighbouring clouds constrain the poses of a graph; the gate, m, is the farthest match of the first round."""
-    scans, rules = estimate.lidar, task.config.refinement
-    settings, weak = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate), _with_inflated_ranges(estimate)
+    settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     refined = refine(weak, graph, settings, task, "scan-to-scan matching")
-    ends = np.concatenate([refined.i[refined.used], refined.j[refined.used]])
+    scans, ends = estimate.lidar, np.concatenate([refined.i[refined.used], refined.j[refined.used]])
     poses, laid = scan_to_scan.reattached(
         scans.clouds, scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
         rules.first_gate,
     )
-    if len(laid):
+    if placed_again := len(laid):
         graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
-        settings = replace(settings, first_gate=rules.later_gate)
-        refined = refine(weak, graph, settings, task, "scan-to-scan matching")
-        figures = {**figures, "placed_again": len(laid)}
-    own = {"gate": round(gate, 3), "sigma": round(refined.sigma, 4), "rounds": refined.rounds}
-    task.stages.end("scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), **own, **figures)
+        refined = refine(weak, graph, replace(settings, first_gate=rules.later_gate), task, "scan-to-scan matching")
+    task.stages.end(
+        "scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), gate=gate, sigma=refined.sigma,
+        rounds=refined.rounds, searched=track.searched, rejected=int(track.rejected.sum()),
+        slipped=int(np.sum(track.slips > NeighbourPolicy.likely)), placed_again=placed_again,
+        moving=float(track.moving.mean()) if len(track.moving) else 0.0,
+    )
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
     return calibration_checks.with_constant_turn_scales(estimate, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:
     """Return the estimate with ranges that constrain the trajectory only where nothing else does."""
-    ranges = estimate.ranges
-    if ranges is None:
+    if (ranges := estimate.ranges) is None:
         return estimate
     return replace(estimate, ranges=replace(ranges, sigma=ranges.sigma * NeighbourPolicy.inflation))

@@ -1,6 +1,7 @@
 """Summaries of the stages, facts for the rules, and the caller's progress callback and clock."""
 
 from collections.abc import Callable
+from typing import Any
 
 from ..errors import Cancelled
 from ..findings import DOUBT, WARNING, Fact, Finding, of_severity
@@ -58,13 +59,14 @@ class Stages:
             raise Cancelled(f"stopped by the caller during {stage}")
 
     def note(self, kind: str, **figures: object) -> None:
-        """Add a fact, of which the rule of its kind (assessment/decisions.py) makes a finding."""
+        """Add a fact, of which the rule of its kind (assessment/facts.py) makes a finding."""
         self.facts.append(Fact(kind, figures))
 
     def end(self, stage: str, **figures: object) -> None:
-        """Close a stage."""
+        """Close a stage; its figures are rounded."""
         now = self._clock() if self._clock else 0.0
-        self.done.append(StageSummary(stage, now - self._since, figures, {kind: n for kind in KINDS if (n := self.work[kind])}))
+        work = {kind: n for kind in KINDS if (n := self.work[kind])}
+        self.done.append(StageSummary(stage, now - self._since, _rounded(figures), work))
         self._since = now
         self.work.clear()
         self.report(stage, 1, 1)
@@ -79,13 +81,20 @@ class Stages:
         return lambda done, total: self.report(stage, done, total)
 
 
+_DECIMALS = 5
+"""Of figures in a report."""
+
+
+def _rounded(figure: Any) -> Any:
+    """Return a figure, or a list or dictionary of them, rounded."""
+    if isinstance(figure, dict):
+        return {name: _rounded(value) for name, value in figure.items()}
+    if isinstance(figure, list):
+        return [_rounded(value) for value in figure]
+    return round(figure, _DECIMALS) if isinstance(figure, float) else figure
+
+
 def solver_figures(result: SolverSummary) -> dict[str, object]:
     """Return the figures of an optimisation."""
-    return {
-        "converged": result.converged,
-        "reason": result.reason,
-        "iterations": result.iterations,
-        "chi2": round(result.chi2, 4),
-        "dof": result.dof,
-        "chi2_per_dof": round(result.chi2_per_dof, 4),
-    }
+    names = ("converged", "reason", "iterations", "chi2", "dof", "chi2_per_dof")
+    return {name: getattr(result, name) for name in names}

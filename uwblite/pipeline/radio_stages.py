@@ -1,7 +1,7 @@
 """Odometry and ranges: from dead reckoning to the first optimisation, and re-estimating the ranges later.
 
 Each recording is bootstrapped on its own, then the recordings are joined. Once the lidar has stiffened the trajectory,
-the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
+the ranges are re-estimated: their noise and the priors of their systematic errors.
 """
 
 from dataclasses import dataclass, replace
@@ -26,9 +26,9 @@ from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
 from ..radio.bootstrap_attempt import Measured
 from ..radio.line_of_sight import blocked
-from ..radio.range_measurements import learn_noise, log_densities, range_edges, relocate
+from ..radio.range_measurements import learn_noise, log_densities, range_edges
 from ..radio.range_noise import assumed, short_term_sigma
-from . import anchor_heights, joining, line_sides, map_frame
+from . import joining, map_frame, range_alternatives
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -51,15 +51,15 @@ class LapPolicy:
 def first_optimisation(task: Task) -> Estimate:
     """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
     recordings = task.recordings
-    task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
+    task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=recordings.travelled)
     estimates = [dead_reckoning(recording, task.config, task.stages.work) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
-        return anchor_heights.choose_heights(estimates[0], task.config)
+        return range_alternatives.choose_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
-    return anchor_heights.choose_heights(joined, task.config)
+    return range_alternatives.choose_heights(joined, task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | None = None) -> Estimate:
@@ -76,13 +76,13 @@ def dead_reckoning(recording: Recording, config: MappingConfig, work: Work | Non
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    ranges = range_edges(attached, ids, log.mounting, block, config.ranges, config.trilateration)
+    ranges = range_edges(attached, ids, log.mounting, block, config.ranges, config.trilateration.max_range)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 
 def tag_rises(recording: Recording) -> tuple[float, ...]:
     """Return the height of each of a robot's tags above the first tag, m."""
-    heights = recording.log.mounting.tags[:, 2]
+    heights = recording.log.mounting.tags[:, -1]
     return tuple((heights - heights[0]).tolist())
 
 
@@ -123,7 +123,7 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     measured = Measured(estimate.odometry, ranges, path - path[0])
     result = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
     number_if_several = {"recording": number + 1} if len(recordings) > 1 else {}
-    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(result.placed.sum()), **number_if_several)
+    task.stages.end("bootstrap", range_sigma=sigma, placed=int(result.placed.sum()), **number_if_several)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.
     back = se2.compose(estimate.graph.poses[0], se2.inverse(result.graph.poses[0]))
     graph = estimate.graph.with_estimates_of(map_frame.moved(result.graph, back))
@@ -141,7 +141,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
     assumed_noise = wheels = estimate.odometry
-    slips, factors = np.zeros(len(wheels)), np.ones(3)
+    slips, factors = np.zeros(len(wheels)), np.ones_like(estimate.graph.poses[0])
     # Recordings that were joined have their slips in their odometry.
     if len(estimate.bootstrap.slips) and not estimate.alone:
         slips = estimate.bootstrap.slips
@@ -163,7 +163,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         # Ranges that are wrong show slips as well: where clouds measure a step, they tell.
         estimate = replace(estimate, odometry=replace(wheels, slips=slips)) if have_scans else estimate
         task.stages.report("first optimisation", lap + 1, LapPolicy.laps)
-    sided = estimate if have_scans or estimate.alone else line_sides.choose_side(estimate, task)
+    sided = estimate if have_scans or estimate.alone else range_alternatives.choose_side(estimate, task)
     if sided is not estimate:
         estimate, result = _lap(sided, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
@@ -223,16 +223,15 @@ def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tup
     assert ranges is not None
     graph = estimate.problem
     squared = edge_cost(ranges, ranges.residuals(graph))
-    density, share = log_densities(ranges, graph, config.ranges)
+    density, share = log_densities(ranges, graph, config.ranges.min_sigma)
     return (laplace_marginal_likelihood(graph) + 0.5 * squared, density), share
 
 
 def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate anchors and range noise on the trajectory that matches of neighbouring clouds have stiffened.
 
-    Odometry alone can be bent until ranges with errors that last for minutes seem to fit. On the stiffer chain of scan
-    matches, beside which ranges had little weight so far, such errors show in the residuals, unless scans see so little that
-    this chain can be bent as well.
+    Odometry alone bends until ranges with errors that last for minutes seem to fit. On the stiffer chain of scan matches such
+    errors show in the residuals, unless scans see so little that it bends as well.
     """
     if estimate.ranges is None or estimate.steps is None:
         return estimate
@@ -240,9 +239,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     held = estimate.solved(rough(config.solver), optimizer)[0]
     estimate = held if _let_go(held, estimate) else estimate
     for solver in (rough(config.solver), config.solver):
-        assert estimate.ranges is not None
-        graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
-        estimate = with_range_noise(replace(estimate, graph=graph), config).solved(solver, optimizer)[0]
+        estimate = with_range_noise(estimate, config).solved(solver, optimizer)[0]
     task.stages.end("ranges re-estimated")
     return estimate
 

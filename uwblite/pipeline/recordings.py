@@ -27,7 +27,7 @@ from .mapping_config import MappingConfig
 
 @dataclass(frozen=True, slots=True)
 class RecordingPolicy:
-    """How recordings are told apart, and which of their scans a map needs."""
+    """How recordings are told apart, and which scans a map needs."""
 
     apart: ClassVar[float] = 1000.0
     """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
@@ -125,7 +125,7 @@ class Recordings:
 
 
 def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
-    """Choose the keyframes of one or more recordings and number them through."""
+    """Choose the keyframes of recordings and number them through."""
     return _joined(logs, [keyframes.of(log, config) for log in logs])
 
 
@@ -184,11 +184,8 @@ def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -
     for recording in recordings.each:
         stamps, log = recording.frames.stamps, recording.log
         starts = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
-        added = (
-            [np.zeros(0)]
-            if log.scans is None
-            else [_spread(log.scans.middles + delay, stamps[k], stamps[k + 1], most) for k in starts.tolist()]
-        )
+        scans = np.zeros(0) if log.scans is None else log.scans.middles + delay
+        added = [_spread(scans, stamps[k], stamps[k + 1], most) for k in starts.tolist()]
         moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
         alone = np.isin(moments, np.concatenate([stamps[starts], stamps[starts + 1], *added]))
         frames.append(keyframes.at(log, moments, alone))
@@ -234,11 +231,7 @@ def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
 def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:
     """Return the recording with the scans that a map of it may need; the notes count the others.
 
-    Thinning the result again with the same settings changes nothing.
-
-    Parameters
-    ----------
-    frames, grid : which scans make clouds and which are traced. ``grid.move_distance = 0`` keeps all.
+    Thinning the result again changes nothing. ``grid.move_distance = 0`` keeps all.
     """
     scans = log.scans
     if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:

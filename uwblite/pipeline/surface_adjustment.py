@@ -1,20 +1,19 @@
 """Adjustment of all poses and surfaces: single rays on straight walls and round columns, beside matched pairs of clouds.
 
-A pair of clouds, condensed to its relative pose, has lost two constraints on the robot's poses: metres of wall, seen from
-many places, are one straight line, and the views of a column from all sides show one circle. And a range offset of
-a surface, which distorts a pair, shows in the rays of many scans. So after the joint refinement walls and columns become
-unknowns themselves, with their offsets, and rays on them measure poses beside the pairs; surfaces are eliminated
-(graph/eliminated.py). Then the pairs get the resulting relative poses, so that later stages start from there; the rays
-are used again for the covariances.
+A pair of clouds, condensed to its relative pose, has lost that metres of wall, seen from many places, are one straight line,
+that the views of a column from all sides show one circle, and that a surface's range offset is the same in all scans. So walls
+and columns become unknowns themselves, with their offsets, and are eliminated (graph/eliminated.py). Then the pairs get the
+resulting relative poses, so that later stages start from there; the rays are used again for the covariances.
 
-The weight of a ray is learnt from the residuals (lidar/ray_noise.py). Where rays are nearly independent, pairs add nothing
-on walls, and their points there get hardly any weight; where walls bend, as in most real offices, all rays of one place get
-the weight of a few, and pairs keep their weight. On columns they get hardly any: lines through points of a column lie inside
-it, to the side from which it is seen, so that pairs err along the path by what the robot passes of them.
+The weight of a ray is learnt from the residuals (lidar/ray_noise.py). Where rays are nearly independent, pairs add nothing on
+walls, and their points there get hardly any weight; where walls bend, all rays of one place get the weight of a few, and pairs
+keep their weight. On columns they get hardly any: lines through points of a column lie inside it, to the side from which it is
+seen.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, entries, factor, side_by_side
+from ..graph.eliminated import Blocks, entries, factor
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
@@ -47,25 +46,45 @@ from ..lidar.surface_rays import (
     surfaces_of,
 )
 from ..lidar.walls import Pieces, find_walls, straight_pieces
-from ..odometry import floor as floors
-from ..odometry.attached import ScanPoints, choose_scans, scan_points
+from ..odometry.attached import ScanPoints
+from ..odometry.wheels import noise_at
 from .estimate import Estimate, Task
-from .recordings import Recording
-
-_AT_ONCE = 128
-"""Keyframes whose rays are in memory at once."""
+from .keyframe_data import rays_of
 
 
-_ON_RIM = 0.06
-"""Distance from a column's rim up to which the middle of a straight piece is on it, m."""
+@dataclass(frozen=True, slots=True)
+class SurfacePolicy:
+    """Adjustment of poses and surfaces."""
+
+    on_rim: ClassVar[float] = 0.06
+    """Distance from a column's rim up to which the middle of a straight piece is on it, m."""
+    ahead: ClassVar[float] = 2.0
+    """Farthest that a lidar is from its keyframe, m: its mounting, and the way to the scan."""
+    steps: ClassVar[int] = 6
+    """Most Gauss-Newton steps."""
+    settling: ClassVar[int] = 2
+    """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
+    still: ClassVar[float] = 1e-3
+    """The next change of the poses, rms, m, that ends them once noise and pairs have settled."""
+    kernel: ClassVar[float] = 3.0
+    wider: ClassVar[float] = 4.0
+    """Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
+    step; half as much in each that follows (graduated non-convexity: A. Blake, A. Zisserman, Visual reconstruction, 1987)."""
+    least: ClassVar[float] = 0.03
+    """Least weight of a point in pairs of clouds."""
+    prior: ClassVar[tuple[float, ...]] = (1e3, 1e3, 0.0156, 0.1)
+    """Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm by data sheets, a
+    surface's 12 mm by colour and material: L. Kneip et al., ICRA 2009), and radius, m. Those of turn and place must not even
+    constrain the heading of the whole map."""
 
 
 def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfaces:
     """Return the surfaces of the map with clouds at poses (k, 3)."""
     circles, pieces, on = _shapes(scans, task, len(poses))
     columns = join_circles(circles, poses)
-    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, _ON_RIM)
-    walls = find_walls(pieces, poses, ~near.on_rim(se2.transform_each(poses, pieces.keyframe, pieces.centre), _ON_RIM))
+    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, SurfacePolicy.on_rim)
+    middles = se2.transform_each(poses, pieces.keyframe, pieces.centre)
+    walls = find_walls(pieces, poses, ~near.on_rim(middles, SurfacePolicy.on_rim))
     columns, on = fitted_columns(around, poses, columns), on.renumbered(walls.of_piece)
     surfaces = surfaces_of(walls.centre, walls.normal, columns)
     rays = concatenated([on, on_columns(around, poses, columns, len(walls.centre)).packed()])
@@ -90,48 +109,16 @@ def _around(columns: Floats, poses: Floats, none: SurfaceRays, scans: ScanClouds
         return none
     reach = max(r.log.scans.range_max for r in task.recordings.each if r.log.scans is not None)
     reach = min(task.config.clouds.range_max, reach)
-    within = cKDTree(columns[:, :2]).query(poses[:, :2])[0] < reach + _AHEAD
+    within = cKDTree(columns[:, :2]).query(poses[:, :2])[0] < reach + SurfacePolicy.ahead
     near = surroundings(columns, NEAR)
     return concatenated([none, *(around_columns(as_rays(r), poses, near).packed() for r in _rays(scans, task, within))])
-
-
-_AHEAD = 2.0
-"""Farthest that a lidar is from its keyframe, m: its mounting, and the way to the scan."""
 
 
 def _rays(scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
     """Yield the rays of the wanted keyframes (k,), some keyframes at a time."""
     for recording in task.recordings.each:
-        if recording.has_scans:
-            yield from _rays_of(recording, scans, task, wanted[recording.rows])
-
-
-def _rays_of(recording: Recording, scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
-    log = recording.log.with_later_scans(scans.delay)
-    assert log.scans is not None
-    owner, chosen = choose_scans(log.scans, recording.frames, task.config.keyframes)
-    for first in range(0, len(recording.frames), _AT_ONCE):
-        if not wanted[first : first + _AT_ONCE].any():
-            continue
-        own = (owner >= first) & (owner < first + _AT_ONCE) & wanted[owner]
-        rays = scan_points(log, recording.frames, owner[own], chosen[own], task.config.clouds.range_max)
-        yield replace(rays, keyframe=rays.keyframe + recording.first)
-
-
-_ROUNDS, _STILL = 6, 1e-3
-"""Most Gauss-Newton steps; the next change of the poses, rms, m, that ends them once noise and pairs have settled."""
-_SETTLING = 2
-"""Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
-_KERNEL, _WIDER = 3.0, 4.0
-"""Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
-step; half as much in each that follows (graduated non-convexity: A. Blake and A. Zisserman, Visual reconstruction, 1987)."""
-_LEAST = 0.03
-"""Least weight of a point in pairs of clouds."""
-_PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
-"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm by data sheets, a
-surface's 12 mm by colour and material: L. Kneip et al., ICRA 2009), and radius, m. Those of turn and place must not even
-constrain the heading of the whole map: four surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the
-first pose to 0.01 rad."""
+        for _, rays in rays_of(recording, task.config, scans.delay, wanted[recording.rows]):
+            yield replace(rays, keyframe=rays.keyframe + recording.first)
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
@@ -148,14 +135,8 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
         return estimate.solved(task.config.solver)[0]
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
-    task.stages.end(
-        "surfaces",
-        walls=walls,
-        columns=columns,
-        rays=len(found.rays.keyframe),
-        shift=round(estimate.moved_since(before), 5),
-        alike=found.noise.alike.round(1).tolist(),
-    )
+    figures = {"shift": estimate.moved_since(before), "alike": found.noise.alike.tolist()}
+    task.stages.end("surfaces", walls=walls, columns=columns, rays=len(found.rays.keyframe), **figures)
     found = replace(found, surfaces=found.surfaces.seen_from(graph.poses[0]))
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
@@ -170,7 +151,7 @@ def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[
     ]
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
-    sums = weighted_sums(found, lidar.sensors, graph.poses, _KERNEL)
+    sums = weighted_sums(found, lidar.sensors, graph.poses, SurfacePolicy.kernel)
     return replace(graph, edges=tuple(edges)), lambda unknowns: _blocks(sums, found.surfaces, graph, lidar, unknowns)
 
 
@@ -188,12 +169,12 @@ class _Lidar:
     def by_lidar(self, poses: Floats) -> Floats:
         """Return the matrices (k, 4, 3) that turn derivatives by the pose of each keyframe into those by mounting and delay."""
         c, s = se2.cos_sin(poses[:, 2])
-        arm, found = self.sensors[:, :2] - poses[:, :2], np.zeros((len(poses), 4, 3))
+        arm, found = self.sensors[:, :2] - poses[:, :2], np.zeros((len(poses), len(self.calibration), len(poses.T)))
         found[:, 0, 0] = found[:, 1, 1] = c
         found[:, 0, 1], found[:, 1, 0] = s, -s
         found[:, 2] = np.column_stack([arm[:, 1], -arm[:, 0], np.ones(len(arm))])
-        found[:, 3] = np.einsum("ka,kab->kb", self.twist[:, :2], found[:, :2])
-        found[:, 3, 2] += self.twist[:, 2]
+        found[:, -1] = np.einsum("ka,kab->kb", self.twist[:, :2], found[:, :2])
+        found[:, -1, 2] += self.twist[:, 2]
         return found
 
 
@@ -206,42 +187,38 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
 def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, MeasuredSurfaces]:
     """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; unchanged without rays."""
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
-    floor, certainty = floors.even(wheels), np.zeros((0, 3, 3))
+    certainty, rules = np.zeros((0, 3, 3)), SurfacePolicy
     assert joint is not None
     report = task.stages.reporter("surfaces")
-    report(0, _ROUNDS + 1)
+    report(0, rules.steps + 1)
     found = find_surfaces(_lidar(graph, joint, task).sensors, estimate.lidar, task)
-    kind = np.zeros(0, dtype=np.int8)
     others = () if estimate.ranges is None else (estimate.ranges,)
-    step = np.inf
-    for turn in range(_ROUNDS):
+    step, kind = np.inf, np.zeros(0, dtype=np.int8)
+    for turn in range(rules.steps):
         poses, lidar = graph.poses, _lidar(graph, joint, task)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
         if turn == 1:
-            wheels, floor = floors.learnt(wheels, graph, certainty)
+            wheels = noise_at(graph, wheels, certainty)
             kind = points_on(estimate.lidar.clouds, found, lidar.sensors)
         if not len(found.rays.keyframe):
             break
-        report(turn + 1, _ROUNDS + 1)
-        if 0 < turn <= _SETTLING:
+        report(turn + 1, rules.steps + 1)
+        if 0 < turn <= rules.settling:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, subtrees=True, like=normal)
         task.stages.work[RAYS] += len(found.rays.keyframe)
-        kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
-        sums = weighted_sums(found, lidar.sensors, poses, kernel)
+        sums = weighted_sums(found, lidar.sensors, poses, rules.kernel * max(rules.wider * 0.5**turn, 1.0))
         certainty, rays = sums.poses, _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)
-        both = side_by_side(rays, floors.equations(wheels, floor, graph, normal.unknowns))
-        known = factor(normal, both, order)
-        (change, by_block), order = known.step(normal, both), known.order
+        known = factor(normal, rays, order)
+        (change, by_surface), order = known.step(normal, rays), known.order
         del known
-        many = len(found.surfaces.facing)
-        graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
-        found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
+        graph = moved(graph, normal.unknowns, change)
+        found = replace(found, surfaces=found.surfaces.moved(by_surface))
         before, step = step, rms_length((graph.poses - poses)[:, :2])
         # Steps get smaller by the same factor each.
-        if turn >= _SETTLING and step * min(step, before) <= _STILL * before:
+        if turn >= rules.settling and step * min(step, before) <= rules.still * before:
             break
     return graph, found
 
@@ -250,7 +227,7 @@ def _measured_again(
     joint: ScanEdges, graph: Graph, scans: ScanClouds, kind: NDArray[np.int8], noise: RayNoise, task: Task
 ) -> ScanEdges:
     """Return the pairs, with points on walls weighted by the information that the rays leave, and hardly any on columns."""
-    weight = np.array([max(1.0 - 1.0 / noise.alike[0], _LEAST), _LEAST, 1.0])[kind]
+    weight = np.array([max(1.0 - 1.0 / noise.alike[0], SurfacePolicy.least), SurfacePolicy.least, 1.0])[kind]
     return measured_again(joint, graph, scans, task.config.refinement, weight)
 
 
@@ -259,15 +236,16 @@ def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unkn
     # An index -1 gives the number -1: fixed.
     of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
     number = np.column_stack([unknowns.number["poses"], np.tile(of_lidar, (len(graph.poses), 1))])
-    by = np.concatenate([np.tile(np.eye(3), (len(graph.poses), 1, 1)), lidar.by_lidar(graph.poses)], axis=1)
+    by = np.concatenate([np.tile(np.eye(len(graph.poses.T)), (len(graph.poses), 1, 1)), lidar.by_lidar(graph.poses)], axis=1)
     among = entries(number, number, by @ sums.poses @ by.transpose(0, 2, 1), (unknowns.size, unknowns.size))
     slope = np.zeros(unknowns.size)
     np.add.at(slope, number[number >= 0], np.einsum("kab,kb->ka", by, sums.pose_slope)[number >= 0])
-    rows = 4 * sums.surface[:, None] + np.arange(4)
+    prior = np.array(SurfacePolicy.prior)
+    rows = len(prior) * sums.surface[:, None] + np.arange(len(prior))
     across = sums.across @ by[sums.keyframe].transpose(0, 2, 1)
-    across = entries(rows, number[sums.keyframe], across, (4 * len(surfaces.facing), unknowns.size))
+    across = entries(rows, number[sums.keyframe], across, (len(prior) * len(surfaces.facing), unknowns.size))
     # Walls have no radius.
     across.eliminate_zeros()
-    own, own_slope = sums.surfaces + np.diag(_PRIOR**-2.0), sums.surface_slope.copy()
-    own_slope[:, 2] += surfaces.offset * _PRIOR[2] ** -2.0
+    own, own_slope = sums.surfaces + np.diag(prior**-2.0), sums.surface_slope.copy()
+    own_slope[:, 2] += surfaces.offset * prior[2] ** -2.0
     return Blocks(among, across, own, slope, own_slope)

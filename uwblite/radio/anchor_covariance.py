@@ -31,15 +31,12 @@ from .range_noise import RangeNoiseConfig, distance_sums, steady_sums
 _STEADY = 0.7
 """Share of the variance that changes only with direction and distance: one half is assumed as slow before it is learnt, and
 antennas, received power and the robot's own body contribute more to it than noise does."""
-_ENOUGH = 30
-"""Least number of ranges from which an anchor's errors, and its covariance with them, are learnt; also the weight, in ranges,
-of the assumed error."""
 _SAMPLE = 200
 """Ranges of a sample from which the share of an error that remains in residuals is computed."""
 _NO_WEIGHT = 1e-12
 """Weight below which a range does not count."""
-_OUTLYING = 3.0
-"""Robust standard deviations to which residuals are clipped."""
+_LEAST_SIGMA, _LEAST_SHARE = 1e-9, 1e-9
+"""m and rad, below any; share of a variance below which round-off begins."""
 
 
 def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
@@ -61,7 +58,11 @@ def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Float
     found = whole.copy()
     for anchor, place in enumerate(around.unknowns.number["anchors"]):
         own = np.flatnonzero((edges.anchor == anchor) & (weights > 0.0))
-        if place[0] < 0 or len(own) < _ENOUGH or np.trace(own_covariances[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1)):
+        if (
+            place[0] < 0
+            or len(own) < config.enough
+            or np.trace(own_covariances[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1))
+        ):
             continue  # given, hardly measured, or with an uncertainty above its distance: there the linearisation is invalid
         columns = np.unique(slopes[own].indices)
         inverse, factors = around.columns(columns)[columns], slopes[own][:, columns].toarray()
@@ -89,7 +90,10 @@ def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, co
     moving = np.all(number["poses"][plain.chosen] >= 0, axis=1)
     if config.steady == 0.0 or not np.any(weights > 0.0) or not moving.any():
         return plain
-    offsets, variance = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor], _variance(edges, weights)
+    offsets, variance = (
+        edges.tag_positions(graph.poses) - graph.anchors[edges.anchor],
+        edges.sigma**2 / np.maximum(weights, _NO_WEIGHT),
+    )
     factors = _by_each_range(found, edges)
     scatter = _scatter(found, graph, edges, config, factors, offsets)
     parts = [number["poses"][plain.chosen].ravel(), number["anchors"].ravel(), number["calibration"].ravel()]
@@ -116,34 +120,23 @@ def _grown(plain: Covariances, among: Floats, moving: Bools) -> Floats:
     With C the covariance of a chosen pose and P the plain one, M = root(C) root(P)^-1 makes M P M^T = C. Between chosen poses M
     is linear, so that a triangle with a positive diagonal stays one.
     """
-    before, after = (_blocks(matrix)[moving] for matrix in (plain.among, among))
-    by = (_root(after) @ np.linalg.inv(_root(before))).reshape(-1, 9)
+    count, size = len(plain.chosen), plain.poses.shape[1]
+    before, after = (
+        np.einsum("kikj->kij", matrix.reshape(count, size, count, size))[moving] for matrix in (plain.among, among)
+    )
+    by = (_root(after) @ np.linalg.inv(_root(before))).reshape(-1, size**2)
     at, chosen = np.arange(len(plain.poses)), plain.chosen[moving]
-    grown = np.stack([np.interp(at, chosen, own) for own in by.T], axis=1).reshape(-1, 3, 3)
+    grown = np.stack([np.interp(at, chosen, own) for own in by.T], axis=1).reshape(-1, size, size)
     return np.asarray(grown @ plain.poses @ grown.transpose(0, 2, 1))
-
-
-def _blocks(matrix: Floats) -> Floats:
-    """Return the blocks (k, 3, 3) on the diagonal of a matrix (3 k, 3 k)."""
-    return np.stack([matrix[k : k + 3, k : k + 3] for k in range(0, len(matrix), 3)])
 
 
 def _root(covariances: Floats) -> Floats:
     """Return the lower triangles L (k, 3, 3) with L L^T = covariances, which round-off may have made indefinite."""
-    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariances), _LEAST_VARIANCE))
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariances), _LEAST_SIGMA**2))
     correlations = covariances / (sigma[:, :, None] * sigma[:, None, :])
     values, vectors = np.linalg.eigh(correlations)
     sound = (vectors * np.maximum(values, _LEAST_SHARE)[:, None, :]) @ vectors.transpose(0, 2, 1)
     return np.asarray(sigma[:, :, None] * np.linalg.cholesky(sound))
-
-
-_LEAST_VARIANCE, _LEAST_SHARE = 1e-18, 1e-9
-"""m^2 and rad^2, below any; share of a variance below which round-off begins."""
-
-
-def _variance(edges: RangeEdges, weights: Floats) -> Floats:
-    """Return W^-1 (m,), m^2, finite where a range counts for nothing."""
-    return np.asarray(edges.sigma**2 / np.maximum(weights, _NO_WEIGHT))
 
 
 def _by_each_range(found: Marginals, edges: RangeEdges) -> sparse.csr_matrix:
@@ -163,15 +156,13 @@ def _times_correlation(edges: RangeEdges, offsets: Floats, values: Floats) -> Fl
 def _scatter(
     found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig, factors: sparse.csr_matrix, offsets: Floats
 ) -> float:
-    """Return the standard deviation of ranges, m, that leaves residuals as large as they are.
-
-    A residual is (I - J H^-1 J^T W) times the errors of all ranges, plus the effect of other measurements.
-    """
+    """Return the standard deviation of ranges, m, that leaves residuals, (I - J H^-1 J^T W) times the errors of all ranges plus
+    the effect of other measurements, as large as they are."""
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.flatnonzero(weights > 0.0)
-    most = _OUTLYING * max(spread(residuals[alive]), config.steady)
+    most = config.outlier * max(spread(residuals[alive]), config.steady)
     some = alive[np.linspace(0, len(alive) - 1, min(len(alive), _SAMPLE)).round().astype(np.intp)]
-    variance = _variance(edges, weights)
+    variance = edges.sigma**2 / np.maximum(weights, _NO_WEIGHT)
     jacobian = factors[some].multiply(variance[some, None]).toarray()
     moved = found.solve(jacobian.T)
     taken = factors @ moved
@@ -181,7 +172,7 @@ def _scatter(
     shown = np.einsum("ms,ms->s", left, _times_correlation(edges, offsets, left))
     unexplained = max(float(np.mean(np.minimum(np.abs(residuals[alive]), most) ** 2) - np.mean(by_others)), 0.0)
     checks = len(alive) * float(np.mean(shown))
-    scatter = np.sqrt((_ENOUGH * config.sigma**2 + len(alive) * unexplained) / (_ENOUGH + checks))
+    scatter = np.sqrt((config.enough * config.sigma**2 + len(alive) * unexplained) / (config.enough + checks))
     return max(config.steady, float(scatter))
 
 
@@ -193,12 +184,7 @@ def _positive(matrix: Floats) -> Floats:
 
 def _shown(inverse: Floats, jacobian: Floats, factors: Floats, correlated: Floats) -> float:
     """Return the share of the variance of errors that least squares leaves in residuals: of their covariance R (m, m), by 1 on
-    its diagonal, the trace of (I - J H^-1 J^T W) R (I - J H^-1 J^T W)^T over m.
-
-    Parameters
-    ----------
-    inverse : (q, q) H^-1. jacobian : (m, q) J. factors : (m, q) W J. correlated : (m, q) R W J.
-    """
+    its diagonal, the trace of (I - J H^-1 J^T W) R (I - J H^-1 J^T W)^T over m; of H^-1 (q, q), J, W J and R W J (m, q)."""
     absorbed = 2.0 * np.trace(inverse @ (correlated.T @ jacobian))
     absorbed -= np.trace(inverse @ (factors.T @ correlated) @ inverse @ (jacobian.T @ jacobian))
     return 1.0 - float(absorbed) / len(factors)

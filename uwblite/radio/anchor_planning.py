@@ -18,6 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from .line_of_sight import blocked
 
 SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
 """m; of a range in line of sight, and of one through walls, whose delay is not known."""
@@ -27,10 +28,9 @@ _CELL = 0.2
 """m; least size of the cells in which the map is evaluated."""
 _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
 """Cells at which the error is evaluated, and places offered to anchors: the time goes with their product."""
-_APART = 1.0
-"""m; least distance between anchors."""
-_FROM_WALLS = 0.5
-"""m; nearer to metal and corners, reflections disturb the antenna (docs/driving.md)."""
+_APART, _FROM_WALLS, _LEAST = 1.0, 0.5, 1e-3
+"""m between anchors; from walls: nearer to metal and corners, reflections disturb the antenna (docs/driving.md); least distance
+of a point."""
 _SWEEPS = 10
 """Most rounds of exchanges; two or three are usually enough."""
 
@@ -61,8 +61,8 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
     ------
     ConfigError : the map has no free space, or too few places for so many anchors.
     """
-    blocked, free, low, cell = _coarse(grid)
-    points, candidates = _places(free, _MOST_POINTS), _wall_cells(blocked, free, cell)
+    occupied, free, low, cell = _coarse(grid)
+    points, candidates = _places(free, _MOST_POINTS), _wall_cells(occupied, free, cell)
     if len(points) == 0:
         raise ConfigError("the map has no free space to plan anchors for")
     candidates = candidates if len(candidates) >= count else _places(free, _MOST_CANDIDATES)
@@ -70,15 +70,11 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
     def metres(cells: Ints) -> Floats:
         return low + cell * (cells[:, ::-1] + 0.5)
 
-    at, offered = metres(points), metres(candidates)
-    here = np.floor((anchors - low) / cell).astype(np.intp)[:, ::-1]
-    today = _information(at, anchors, _line_of_sight(blocked, here, points), reach).sum(axis=0)
-    gains = _information(at, offered, _line_of_sight(blocked, candidates, points), reach)
-    offered_too_near = _near(offered, anchors)
-    chosen = _choose(today, gains, offered, offered_too_near, count)
-    errors = [position_errors(today)]
-    for k in range(count):
-        errors.append(position_errors(today + gains[chosen[: k + 1]].sum(axis=0)))
+    at, offered, walls = metres(points), metres(candidates), metres(np.argwhere(occupied))
+    today = _information(at, anchors, walls, reach).sum(axis=0)
+    gains = _information(at, offered, walls, reach)
+    chosen = _choose(today, gains, offered, _near(offered, anchors), count)
+    errors = [position_errors(today + gains[chosen[:k]].sum(axis=0)) for k in range(count + 1)]
     return AnchorPlan(offered[chosen], at, np.array(errors))
 
 
@@ -88,11 +84,13 @@ def position_errors(information: Floats) -> Floats:
     return np.asarray(np.sqrt((xx + yy) / (xx * yy - xy**2)))
 
 
-def _information(points: Floats, anchors: Floats, line_of_sight: Bools, reach: float) -> Floats:
-    """Return the information of a range to each anchor at each point (a, m, 3): xx, xy, yy, 1/m^2."""
+def _information(points: Floats, anchors: Floats, walls: Floats, reach: float) -> Floats:
+    """Return the information of a range to each anchor at each point (a, m, 3): xx, xy, yy, 1/m^2; walls are points (w, 2)."""
     away = points[None] - anchors[:, None]
-    distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
-    weight = np.where(line_of_sight, SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS) ** -2.0 * (distance <= reach)
+    distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), _LEAST)
+    behind = [blocked(points, np.broadcast_to(anchor, points.shape), walls, least=1) for anchor in anchors]
+    sigma = np.where(np.reshape(behind, distance.shape), SIGMA_BEHIND_WALLS, SIGMA_LINE_OF_SIGHT)
+    weight = sigma**-2.0 * (distance <= reach)
     x, y = np.moveaxis(away / distance[..., None], -1, 0)
     return np.stack([x * x, x * y, y * y], axis=-1) * weight[..., None]
 
@@ -117,12 +115,7 @@ def _choose(today: Floats, gains: Floats, places: Floats, taken: Bools, count: i
 
 
 def _best(base: Floats, gains: Floats, taken: Bools) -> int:
-    """Return the candidate with which the mean error is least.
-
-    Raises
-    ------
-    ConfigError : all are taken.
-    """
+    """Return the candidate with which the mean error is least."""
     if taken.all():
         raise ConfigError(f"the map has no room for so many anchors {_APART:g} m apart; ask for fewer")
     means = np.array([np.inf if skip else position_errors(base + gain).mean() for gain, skip in zip(gains, taken, strict=True)])
@@ -142,9 +135,9 @@ def _coarse(grid: OccupancyGrid) -> tuple[Bools, Bools, Floats, float]:
     padded = np.full((rows, cols), -1, dtype=states.dtype)
     padded[: states.shape[0], : states.shape[1]] = states
     blocks = padded.reshape(rows // together, together, cols // together, together)
-    blocked = (blocks == OCCUPIED).any(axis=(1, 3))
-    free = (blocks == FREE).mean(axis=(1, 3)) > 0.5
-    return blocked, free & ~blocked, grid.geometry.origin, together * grid.geometry.resolution
+    occupied = (blocks == OCCUPIED).any(axis=(1, -1))
+    free = (blocks == FREE).mean(axis=(1, -1)) > 0.5
+    return occupied, free & ~occupied, grid.geometry.origin, together * grid.geometry.resolution
 
 
 def _places(cells: Bools, most: int) -> Ints:
@@ -153,24 +146,7 @@ def _places(cells: Bools, most: int) -> Ints:
     return found[:: max(-(-len(found) // most), 1)]
 
 
-def _wall_cells(blocked: Bools, free: Bools, cell: float) -> Ints:
+def _wall_cells(occupied: Bools, free: Bools, cell: float) -> Ints:
     """Return the free cells (n, 2) of the first row that keeps away from blocked ones, thinned evenly."""
-    away = cell * (np.asarray(distance_transform_edt(~blocked)) - 0.5) if blocked.any() else np.full(blocked.shape, np.inf)
+    away = cell * (np.asarray(distance_transform_edt(~occupied)) - 0.5) if occupied.any() else np.full(occupied.shape, np.inf)
     return _places(free & (away >= _FROM_WALLS) & (away < _FROM_WALLS + np.sqrt(2.0) * cell), _MOST_CANDIDATES)
-
-
-def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
-    """Return for which sources (a, 2) which targets (m, 2) the line of sight is free (a, m).
-
-    The first cell on the line is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
-    """
-    line_of_sight = np.zeros((len(sources), len(targets)), dtype=np.bool_)
-    for k, source in enumerate(sources):
-        step = targets - source
-        length = np.abs(step).max(axis=1)
-        along = np.arange(2, max(int(length.max(initial=0)), 2))
-        share = along[None] / np.maximum(length, 1)[:, None]
-        cells = np.rint(source + step[:, None] * share[..., None]).astype(np.intp)
-        cells = np.clip(cells, 0, np.array(blocked.shape) - 1)
-        line_of_sight[k] = ~(blocked[cells[..., 0], cells[..., 1]] & (share < 1.0)).any(axis=1)
-    return line_of_sight

@@ -1,18 +1,18 @@
 """Starts for the optimisation of an imported graph: every chain and every anchor gets a place.
 
-Which minimum an optimisation finds depends on its start; without a certificate (graph/certificate.py) further starts may lead
-to a lower one. Trajectories of several robots that only ranges and landmarks connect are placed one after another, the best
-connected first, each rigid with the shape of its odometry: for every heading R on a circle of starts, a range d from its point
-b to a placed point a (0 where the chain sees the landmark a at b) means |a - R b - t| = d; squared, |p|^2 - 2 p.t + |t|^2 = d^2
-with p = a - R b is linear in t and |t|^2. Gauss-Newton steps with Cauchy weights follow, because odometry drifts and some
-ranges are wrong. Several hypotheses are kept from chain to chain; the optimisation of the whole graph decides between them.
+Without a certificate (graph/certificate.py) further starts may lead to a lower minimum. Trajectories of several robots that
+only ranges and landmarks connect are placed one after another, the best connected first, each rigid: for every heading R on a
+circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at b) means
+|a - R b - t| = d; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. A robust descent follows,
+because odometry drifts and some ranges are wrong. The optimisation of the whole graph decides between several hypotheses.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
@@ -22,6 +22,17 @@ from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
 from .trilateration import TrilaterationConfig, trilaterate
+
+_CLEARLY = 0.02
+"""Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
+_HEADINGS = 24
+"""Starts of a chain's heading."""
+_MOST_RANGES, _LEAST_RANGES = 300, 4
+"""Ranges used for one chain: more add no information; fewer are three unknowns and no check."""
+_BEND = 0.5
+"""m; from this residual on a range gets less weight: the error of rigid chains after some minutes of odometry."""
+_KEPT, _APART = 4, 0.1
+"""Hypotheses kept, and m and rad between them."""
 
 
 class Start(NamedTuple):
@@ -58,6 +69,15 @@ def starts_nearby(start: Start, optimised: Graph) -> Iterator[Start]:
             yield Start(graph, start.unplaced)
 
 
+def ranges_to(edges: Iterable[RangeEdges], poses: Floats) -> tuple[Floats, Floats]:
+    """Return positions (m, 2) of the tag at ranges along poses, and the distances (m,) in the plane that they measured, m."""
+    places, distances = [np.zeros((0, 2))], [np.zeros(0)]
+    for own in edges:
+        places.append(own.tag_positions(poses))
+        distances.append(own.planar_ranges())
+    return np.concatenate(places), np.concatenate(distances)
+
+
 def place_anchors(graph: Graph, elsewhere: Floats | None = None) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
@@ -71,8 +91,7 @@ def place_anchors(graph: Graph, elsewhere: Floats | None = None) -> tuple[Graph,
         return graph, ()
     anchors, lost = graph.anchors.copy(), []
     for anchor in missing.tolist():
-        positions, ranges = _distances_to(graph, anchor)
-        found = trilaterate(positions, ranges, TrilaterationConfig())
+        found = trilaterate(*ranges_to(_of_anchor(graph, anchor), graph.poses), TrilaterationConfig())
         if found:
             anchors[anchor] = found[0].position
         elif elsewhere is not None and np.isfinite(elsewhere[anchor]).all():
@@ -88,95 +107,50 @@ def place_anchors(graph: Graph, elsewhere: Floats | None = None) -> tuple[Graph,
 def search_anchors(graph: Graph) -> Graph | None:
     """Return the graph with anchors put where their ranges alone cost less from these poses, None where none does.
 
-    An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there; the
-    global search of trilateration avoids this.
+    An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there.
     """
     anchors = graph.anchors.copy()
     for anchor in np.flatnonzero(~graph.fixed_anchors).tolist():
-        own = replace(graph, edges=tuple(e.rows(e.anchor == anchor) for e in graph.edges if isinstance(e, RangeEdges)))
-        found = trilaterate(*_distances_to(own, anchor), TrilaterationConfig())
-        places = [graph.anchors[anchor], *(h.position for h in found)]
-        costs = [_moved(own, anchor, place).chi2() for place in places]
+        own = replace(graph, edges=_of_anchor(graph, anchor))
+        found = trilaterate(*ranges_to(_of_anchor(graph, anchor), graph.poses), TrilaterationConfig())
+        places, costs, tried = [graph.anchors[anchor], *(h.position for h in found)], [], graph.anchors.copy()
+        for place in places:
+            tried[anchor] = place
+            costs.append(replace(own, anchors=tried).chi2())
         anchors[anchor] = places[int(np.argmin([(1.0 - _CLEARLY) * costs[0], *costs[1:]]))]
     return None if np.array_equal(anchors, graph.anchors) else replace(graph, anchors=anchors)
 
 
-_CLEARLY = 0.02
-"""Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
-
-
-def _moved(graph: Graph, anchor: int, place: Floats) -> Graph:
-    anchors = graph.anchors.copy()
-    anchors[anchor] = place
-    return replace(graph, anchors=anchors)
-
-
-def _distances_to(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
-    """Return positions (m, 2) of the tag and ranges (m,) of one anchor, m."""
-    positions, ranges = [np.zeros((0, 2))], [np.zeros(0)]
-    for edges in graph.edges:
-        if isinstance(edges, RangeEdges):
-            own = edges.rows(edges.anchor == anchor)
-            positions.append(own.tag_positions(graph.poses))
-            ranges.append(own.ranges)
-    return np.concatenate(positions), np.concatenate(ranges)
+def _of_anchor(graph: Graph, anchor: int) -> tuple[RangeEdges, ...]:
+    return tuple(e.rows(e.anchor == anchor) for e in graph.edges if isinstance(e, RangeEdges))
 
 
 def _without(edges: RangeEdges, anchors: list[int]) -> RangeEdges:
     return replace(edges, weights=np.where(np.isin(edges.anchor, anchors), 0.0, edges.own_weights))
 
 
-_HEADINGS = 24
-"""Starts of a chain's heading."""
-_STEPS = 15
-"""Gauss-Newton steps from each."""
-_MOST_RANGES = 300
-"""Most ranges used for one chain; more add no information."""
-_BEND = 0.5
-"""m; from this residual on a range gets less weight: the error of rigid chains after some minutes of odometry."""
-_KEPT = 4
-"""Hypotheses kept."""
-_LEAST_RANGES = 4
-"""Least number of ranges: three unknowns and one range as a check."""
-
-
 def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
-    """Return graphs with every chain placed, the likeliest first.
-
-    Parameters
-    ----------
-    graph : poses of each chain in a frame of its own; those of chain 0, and anchors that have a place, are where they are.
-    chains : (n,) chain of each pose.
-    """
+    """Return graphs with every chain placed, the likeliest first; see starts."""
     hypotheses = [(0.0, graph)]
-    waiting = set(chains.tolist()) - {0}
-    here = chains == 0
+    waiting, here = set(chains.tolist()) - {0}, chains == 0
     while waiting:
         anchors = [_measured_from(g, here) for _, g in hypotheses]
         chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], anchors[0], chains == c, here)[2]))
+        mine = chains == chain
         found = [
-            (cost + more, replace(g, poses=_moved_chain(g.poses, chains == chain, T)))
+            (cost + more, replace(g, poses=np.where(mine[:, None], se2.compose(T, g.poses), g.poses)))
             for (cost, g), there in zip(hypotheses, anchors, strict=True)
-            for more, T in _places(*_ties(g, there, chains == chain, here))
+            for more, T in _places(*_ties(g, there, mine, here))
         ]
         hypotheses = sorted(found, key=lambda h: h[0])[:_KEPT]
         waiting.remove(chain)
-        here = here | (chains == chain)
+        here = here | mine
     return [g for _, g in hypotheses]
 
 
-def _moved_chain(poses: Floats, mine: Bools, T: Floats) -> Floats:
-    return np.where(mine[:, None], se2.compose(T, poses), poses)
-
-
 def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floats, Floats, Floats]:
-    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them.
-
-    Parameters
-    ----------
-    anchors : (a, 2) m, places measured from the placed poses; nan: none.
-    mine, here : (n,) poses of the chain, and those that are placed.
-    """
+    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them; anchors (a, 2)
+    as measured from the poses that are placed (here), nan: none, and from those of the chain (mine)."""
     there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
@@ -195,7 +169,7 @@ def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floa
                 own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
                 ranges.append(np.zeros(int(tied.sum())))
     every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
-    return tuple(np.concatenate(part)[::every] for part in (there, own, ranges))  # type: ignore[return-value]
+    return np.concatenate(there)[::every], np.concatenate(own)[::every], np.concatenate(ranges)[::every]
 
 
 def _measured_from(graph: Graph, here: Bools) -> Floats:
@@ -211,22 +185,16 @@ def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Flo
     """Return (robust cost, T_map_chain) of the best places, apart from each other."""
     if len(ranges) < _LEAST_RANGES:
         return [(0.0, np.zeros(3))]
-    found = [_converged(start, there, own, ranges) for start in _starts(there, own, ranges)]
-    found.sort(key=lambda place: place[0])
     best: list[tuple[float, Floats]] = []
-    for cost, T in found:
+    for cost, T in sorted((_converged(start, there, own, ranges) for start in _starts(there, own, ranges)), key=lambda p: p[0]):
         if all(np.abs(se2.between(T, other)).max() > _APART for _, other in best):
             best.append((cost, T))
     return best[:_KEPT]
 
 
-_APART = 0.1
-"""m and rad between two hypotheses."""
-
-
 def _starts(there: Floats, own: Floats, ranges: Floats) -> list[Floats]:
     starts = []
-    for theta in np.arange(_HEADINGS) * 2.0 * np.pi / _HEADINGS:
+    for theta in np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False):
         p = there - se2.rotate(np.full(len(own), theta), own)
         A = np.column_stack([-2.0 * p, np.ones(len(p))])
         t = np.linalg.lstsq(A, ranges**2 - np.sum(p**2, axis=1), rcond=None)[0]
@@ -234,26 +202,12 @@ def _starts(there: Floats, own: Floats, ranges: Floats) -> list[Floats]:
     return starts
 
 
-def _converged(T: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
-    """Return cost and place after damped Gauss-Newton steps with Cauchy weights."""
+def _converged(start: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
+    """Return cost and place after a descent with Cauchy weights."""
 
-    def residuals(T: Floats) -> tuple[Floats, Floats, Floats, float]:
-        arm = se2.rotate(np.full(len(own), T[2]), own)
-        offset = T[:2] + arm - there
-        length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
-        left = length - ranges
-        return left, offset / length[:, None], arm, float(np.log1p((left / _BEND) ** 2).sum())
+    def residuals(T: Floats) -> Floats:
+        return np.asarray(np.hypot(*(se2.transform(T, own) - there).T) - ranges)
 
-    left, along, arm, cost = residuals(T)
-    damping = 1e-3
-    for _ in range(_STEPS):
-        J = np.column_stack([along, along[:, 1] * arm[:, 0] - along[:, 0] * arm[:, 1]])
-        W = 1.0 / (1.0 + (left / _BEND) ** 2)
-        H = J.T @ (W[:, None] * J)
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), -J.T @ (W * left))
-        tried = residuals(T + step)
-        if tried[3] < cost:
-            T, (left, along, arm, cost), damping = T + step, tried, damping / 3.0
-        else:
-            damping *= 5.0
-    return cost, np.array([T[0], T[1], float(se2.wrap_angle(np.asarray(T[2])))])
+    found = least_squares(residuals, start, loss="cauchy", f_scale=_BEND)
+    T = np.array([*found.x[:2], float(se2.wrap_angle(found.x[2]))])
+    return float(np.log1p((found.fun / _BEND) ** 2).sum()), T

@@ -1,11 +1,10 @@
 """Incremental optimisation of a graph whose initial values are only locally right: poses are added in time.
 
-Dead reckoning over kilometres drifts so far that no descent from it finds the minimum, but the guess of the next hundred poses,
-appended to the estimate so far, is always near. Each time the last few hundred are optimised with older ones fixed; the whole
-is optimised again when it is longer by half, or when the last part does not fit: when its chi2 per degree of freedom exceeds
-the usual by five standard deviations, each of sqrt(2 / dof). Such a part is tried, in this order, without the anchors that were
-added last, without those most of whose ranges are outliers by a robust kernel, and with more and more of the older poses free.
-(The mirror image of an anchor passed on one side is often found, and is recognised only after a turn.)
+No descent from dead reckoning over kilometres finds the minimum, but the guess of the next hundred poses, appended to the
+estimate so far, is always near. The last few hundred are optimised with older ones fixed; the whole is optimised again when it
+is longer by half, or when the last part does not fit: when its chi2 per degree of freedom exceeds the usual by five standard
+deviations, each of sqrt(2 / dof). Such a part is tried, in this order, without the anchors that were added last (mirror images
+are recognised after a turn), without those most of whose ranges are outliers, and with more and more of the older poses free.
 """
 
 from collections.abc import Iterator
@@ -15,13 +14,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Ints
 from ..graph.graph import Edges, Graph
 from ..graph.problem_checks import check, given_anchors
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, optimize
 from ..graph.unknowns import free_unknowns
+from .graph_starts import ranges_to
 from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
 
@@ -41,19 +41,19 @@ class IncrementalPolicy:
     significance: ClassVar[float] = 5.0
     """Standard deviations by which chi2 may exceed the usual."""
     ranges: ClassVar[int] = 20
-    """Ranges before an anchor is searched; it is searched again with a fifth more of them."""
+    again: ClassVar[float] = 1.2
+    """Ranges before an anchor is searched, and the factor on them after which it is searched again."""
     position_sigma: ClassVar[float] = 0.5
     """An anchor less certain than this is not added yet, m."""
     drift: ClassVar[float] = 0.1
     """Assumed error of the path over the ranges an anchor is searched from, m."""
     outlier: ClassVar[float] = 4.0
-    """Standard deviations beyond which a range is an outlier."""
     outlier_share: ClassVar[float] = 0.3
-    """An anchor with a larger share of outliers is removed."""
+    """Standard deviations beyond which a range is an outlier, and the share of these with which an anchor is removed."""
     search: ClassVar[TrilaterationConfig] = TrilaterationConfig(ambiguity=0.7)
-    """How anchors are searched; stricter than usual, since another try comes soon."""
+    """Stricter than usual, since another try comes soon."""
     step: ClassVar[SolverConfig] = SolverConfig(max_iterations=30, relative_decrease=1e-4)
-    """Settings of the intermediate optimisations."""
+    """Of the intermediate optimisations."""
 
 
 def optimize_incrementally(
@@ -115,26 +115,28 @@ class _Incremental:
         self.kinds = [_by_time(edges, graph) for edges in graph.edges]
         self.free = free_unknowns(graph)
         count = len(graph.anchors)
-        self.ranges = [(kind.edges, kind.latest) for kind in self.kinds if isinstance(kind.edges, RangeEdges)]
-        self.of_anchor = [_groups(edges.anchor, count) for edges, _ in self.ranges]
-        self.ranged = np.zeros(count, dtype=bool)
-        for edges, _ in self.ranges:
-            self.ranged[edges.anchor] = True
         given = given_anchors(graph)
-        self.ranged &= ~given
+        self.ranged = ~given & (self._counts(len(graph.poses)) > 0)
         self.joined = ~self.ranged
         self.joined_at = np.where(self.joined, -1, len(graph.poses))
-        self.tried = np.zeros(count, dtype=np.intp)
-        self.first_seen = self._first_seen(given)
-        self.usual = 1.0
-
-    def _first_seen(self, given: Bools) -> Ints:
-        """Return when each anchor appears that has neither ranges nor a known place: from then on it moves with the path."""
-        first = np.full(len(given), len(self.guess))
+        self.tried, self.usual = np.zeros(count, dtype=np.intp), 1.0
+        first = np.full(count, len(self.guess))
         for kind in self.kinds:
             for anchors in kind.anchors:
                 np.minimum.at(first, anchors, kind.latest)
-        return np.where(given | self.ranged, -1, first)
+        self.first_seen = np.where(given | self.ranged, -1, first)
+        """When each anchor appears that has neither ranges nor a known place: from then on it moves with the path."""
+
+    def _ranges(self, now: int) -> Iterator[RangeEdges]:
+        """Yield the ranges so far."""
+        for kind in self.kinds:
+            if isinstance(kind.edges, RangeEdges):
+                yield kind.edges.rows(np.arange(np.searchsorted(kind.latest, now)))
+
+    def _counts(self, now: int) -> Ints:
+        """Return how many ranges there are to each anchor so far (a,)."""
+        count = len(self.graph.anchors)
+        return sum((np.bincount(edges.anchor, minlength=count) for edges in self._ranges(now)), np.zeros(count, dtype=np.intp))
 
     def run(self) -> Iterator[int]:
         """Add poses up to the whole path, or while there is work allowed, yielding the number done."""
@@ -166,7 +168,7 @@ class _Incremental:
             return
         poses, anchors = self.graph.poses.copy(), self.graph.anchors.copy()
         poses[done:now] = se2.compose(poses[done - 1], se2.between(self.guess[done - 1], self.guess[done:now]))
-        new = np.nonzero((self.first_seen >= done) & (self.first_seen < now))[0]
+        new = np.flatnonzero((self.first_seen >= done) & (self.first_seen < now))
         at = self.first_seen[new]
         anchors[new] = se2.transform(se2.compose(poses[at], se2.inverse(self.guess[at])), anchors[new])
         self.graph = replace(self.graph, poses=poses, anchors=anchors)
@@ -186,15 +188,12 @@ class _Incremental:
     def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
         """Return the part without some anchors if it fits then, and remove these; otherwise return it unchanged."""
         fresh = self.joined & self.ranged & (self.joined_at >= now - IncrementalPolicy.window)
-        for accused in (fresh, None):
-            if accused is None:
-                accused = self._outlying(low, now)
-            if accused.any():
-                other = self._solve(low, now, without=accused)
-                if other.fits:
-                    self.joined &= ~accused
-                    self.joined_at[accused] = len(self.guess)
-                    return other
+        for accused in (None, self._outlying):
+            these = fresh if accused is None else accused(low, now)
+            if these.any() and (other := self._solve(low, now, without=these)).fits:
+                self.joined &= ~these
+                self.joined_at[these] = len(self.guess)
+                return other
         return part
 
     def _outlying(self, low: int, now: int) -> Bools:
@@ -240,39 +239,14 @@ class _Incremental:
 
     def _search(self, now: int) -> None:
         """Place the anchors that the ranges so far make clear; at the end also those that stay doubtful."""
-        last = now == len(self.guess)
-        anchors = self.graph.anchors.copy()
-        for anchor in np.nonzero(~self.joined)[0]:
-            measured = self._measured(int(anchor), now)
-            count = sum(len(edges) for edges in measured)
-            if not last and (count < IncrementalPolicy.ranges or count < 1.2 * self.tried[anchor]):
-                continue
-            self.tried[anchor] = count
-            found = trilaterate(*self._distances(measured), IncrementalPolicy.search, IncrementalPolicy.drift)
+        last, counts, anchors = now == len(self.guess), self._counts(now), self.graph.anchors.copy()
+        enough = counts >= np.maximum(IncrementalPolicy.ranges, IncrementalPolicy.again * self.tried)
+        for anchor in np.flatnonzero(~self.joined & (last | enough)).tolist():
+            self.tried[anchor] = counts[anchor]
+            measured = (edges.rows(edges.anchor == anchor) for edges in self._ranges(now))
+            found = trilaterate(*ranges_to(measured, self.graph.poses), IncrementalPolicy.search, IncrementalPolicy.drift)
             clear = bool(found) and not ambiguous(found, IncrementalPolicy.search)
             if found and (last or (clear and found[0].position_sigma < IncrementalPolicy.position_sigma)):
                 anchors[anchor] = found[0].position
                 self.joined[anchor], self.joined_at[anchor] = True, now
         self.graph = replace(self.graph, anchors=anchors)
-
-    def _measured(self, anchor: int, now: int) -> list[RangeEdges]:
-        """Return the ranges to an anchor so far."""
-        measured = []
-        for (edges, latest), groups in zip(self.ranges, self.of_anchor, strict=True):
-            which = groups[anchor]
-            measured.append(edges.rows(which[: np.searchsorted(latest[which], now)]))
-        return measured
-
-    def _distances(self, measured: list[RangeEdges]) -> tuple[Floats, Floats]:
-        """Return where the tag was (m, 2) at ranges, and the planar distances (m,) they measured."""
-        places, distances = [np.zeros((0, 2))], [np.zeros(0)]
-        for edges in measured:
-            places.append(edges.tag_positions(self.graph.poses))
-            distances.append(edges.planar_ranges())
-        return np.concatenate(places), np.concatenate(distances)
-
-
-def _groups(labels: Ints, count: int) -> list[Ints]:
-    """Return for each label 0..count - 1 where it stands, ascending."""
-    order = np.argsort(labels, kind="stable")
-    return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))

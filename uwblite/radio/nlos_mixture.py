@@ -1,8 +1,7 @@
-"""Mixture model of one anchor's range errors: a core, a tail of NLOS delays, and gross errors.
+"""Model of one anchor's range errors: a core in line of sight, a tail of NLOS delays, and gross errors.
 
-A range in line of sight has a small error of either sign; one that goes around or through an obstacle is too long,
-never too short. So the errors of an anchor are modelled as a mixture of a normal core, the same core lengthened by an
-exponentially distributed detour, and a uniform rest of gross errors (reflections, false detections)::
+A range that goes around or through an obstacle is too long, never too short. So errors are a mixture of a normal core, the same
+core lengthened by an exponentially distributed detour, and a uniform rest (reflections, false detections)::
 
     f(e) = (1 - p - u) N(e; c, s) + p EMG(e; c, s, t) + u / W
 
@@ -17,21 +16,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import erfcx
 
-from ..arrays import Floats
+from ..arrays import MAD_TO_SIGMA, Floats
 
-_ROUNDS = 60
+_TAIL, _DETOUR, _WILD = 0.2, 0.5, 0.05
+"""Usual share of ranges with a detour, mean detour, m, and share of gross errors."""
+_LEAST_WILD, _WIDTH = 1e-3, 2.0
+"""Share of gross errors that no number of ranges without one excludes; least width of their distribution, m."""
 _SHORTEST = 2.0
 """Least mean detour, in standard deviations of the core; a shorter one is no tail but a part of the core."""
 _CLEAN = 15.0
 """Prior number of ranges in the core: a few ranges alone determine neither tail nor gross errors."""
-_NARROWED, _PARTS = 3, 256
-"""Rounds in which the interval with the mode is cut into so many parts: the last interval is below a ten millionth of it."""
-_LEAST_WILD = 1e-3
-"""Share of gross errors that no number of ranges without one excludes."""
+_ROUNDS, _STILL = 60, 1e-4
+"""Most rounds of a fit, and the move of the core, in its standard deviations, that ends it."""
+_PARTS = 256
+"""Parts into which the interval with the mode is cut, three times: the last one is below a ten millionth of the first."""
 _NEVER = 1e-300
 """Density, 1/m, that is added where all parts underflow."""
-_WIDEST = 2.0
-"""Least width of the distribution of gross errors, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,11 @@ class RangeMixture:
     width: float
     """Width of the distribution of gross errors, m."""
 
+    @staticmethod
+    def usual(sigma: float, width: float) -> "RangeMixture":
+        """Return the distribution before there are errors."""
+        return RangeMixture(0.0, sigma, _TAIL, _DETOUR, _WILD, width)
+
     def density(self, errors: Floats) -> Floats:
         """Return the probability density (m,) of each error, 1/m."""
         normal, late, _ = _densities(errors - self.centre, self.sigma, self.detour)
@@ -68,21 +73,17 @@ class RangeMixture:
     def mode(self) -> float:
         """Return the likeliest error, m."""
         low, high = 0.0, 3.0 * self.sigma
-        for _ in range(_NARROWED):
+        for _ in range(3):
             at = np.linspace(low, high, _PARTS + 1)
             first = int(np.argmax(np.append(self._score(at[1:-1]) > 0.0, True)))
             low, high = float(at[first]), float(at[first + 1])
         return self.centre + low
 
-    def weights(self, errors: Floats) -> Floats:
+    def weights(self, errors: Floats, mode: float | None = None) -> Floats:
         """Return the weights (m,), 0..1, of squared errors about the mode that make them a maximum-likelihood estimate."""
-        return self.weights_about(self.mode(), errors)
-
-    def weights_about(self, mode: float, errors: Floats) -> Floats:
-        """Return the same where the mode, m, is known."""
-        off, mode = errors - self.centre, mode - self.centre
-        near = np.abs(off - mode) < 1e-3 * self.sigma
-        away = np.where(near, mode + 1e-3 * self.sigma, off)
+        off, mode = errors - self.centre, (self.mode() if mode is None else mode) - self.centre
+        step = 10.0 * _STILL * self.sigma
+        away = np.where(np.abs(off - mode) < step, mode + step, off)
         return np.clip(self.sigma**2 * self._score(away) / (away - mode), 0.0, 1.0)
 
     def _score(self, off: Floats) -> Floats:
@@ -103,8 +104,8 @@ def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> Range
     """
     centre, sigma = shortest_half(errors)
     sigma = min(max(sigma, least_sigma), most_sigma)
-    width = max(float(np.ptp(errors)), _WIDEST)
-    tail, detour, wild = 0.2, 4.0 * sigma, 0.05
+    width = max(float(np.ptp(errors)), _WIDTH)
+    tail, detour, wild = _TAIL, 2.0 * _SHORTEST * sigma, _WILD
     for _ in range(_ROUNDS):
         off = errors - centre
         normal, late, expected = _densities(off, sigma, detour)
@@ -114,11 +115,12 @@ def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> Range
         of_core, of_tail, gross = float(core.sum()), float(slow.sum()), rest * float(each.sum())
         total = of_core + of_tail + gross + _CLEAN
         tail, wild = of_tail / total, gross / total
-        detour = max(float(slow @ expected) / max(of_tail, 1e-9), _SHORTEST * sigma)
-        before = centre
-        centre += float(core @ off) / max(of_core, 1e-9)
-        sigma = min(max(math.sqrt(float(core @ (errors - centre) ** 2) / max(of_core, 1e-9)), least_sigma), most_sigma)
-        if abs(centre - before) < 1e-4 * sigma:
+        of_core, of_tail = max(of_core, _NOTHING), max(of_tail, _NOTHING)
+        detour = max(float(slow @ expected) / of_tail, _SHORTEST * sigma)
+        moved = float(core @ off) / of_core
+        centre += moved
+        sigma = min(max(math.sqrt(float(core @ (errors - centre) ** 2) / of_core), least_sigma), most_sigma)
+        if abs(moved) < _STILL * sigma:
             break
     return RangeMixture(centre, sigma, tail, detour, wild, width)
 
@@ -129,15 +131,19 @@ def shortest_half(values: Floats) -> tuple[float, float]:
     inside = max(int(np.ceil(0.5 * len(order))), 1)
     spans = order[inside - 1 :] - order[: len(order) - inside + 1]
     first = int(np.argmin(spans))
-    return float(order[first : first + inside].mean()), float(spans[first]) / (2.0 * 0.6745)
+    return float(order[first : first + inside].mean()), 0.5 * MAD_TO_SIGMA * float(spans[first])
+
+
+_NOTHING = 1e-9
+"""Ranges that are none."""
 
 
 def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats, Floats]:
     """Return the densities (m,) of the core and of core plus detour at errors from the core's mean, and the expected detour.
 
     A detour, given the error, is normal about off - sigma^2 / detour =: sigma a and cut off at 0: its mean is
-    sigma (a + phi(a) / Phi(a)). Both that and the density come from Phi(a) exp(a^2 / 2) = erfcx(-a / sqrt(2)) / 2, which
-    neither loses digits nor overflows below _SURE; above it, Phi(a) is 1.
+    sigma (a + phi(a) / Phi(a)). Phi(a) exp(a^2 / 2) = erfcx(-a / sqrt(2)) / 2 neither loses digits nor overflows below _SURE;
+    above it, Phi(a) is 1.
     """
     z, ratio = off / sigma, sigma / detour
     a = z - ratio

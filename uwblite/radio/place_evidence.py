@@ -1,14 +1,13 @@
-"""Evidence of where an anchor stood, and when: one model of places and intervals, within a recording and between recordings.
+"""Evidence of where an anchor stood, and when, within a recording and between recordings.
 
 Along a given path the ranges of one radio are explained by places, each of which holds during intervals; ranges made while it
-is carried from one to the next are gross errors. Explanations are compared by their evidence, the logarithm of the marginal
-likelihood (Laplace; D. MacKay, Bayesian interpolation, 1992):
+is carried are gross errors. Explanations are compared by the logarithm of the marginal likelihood (Laplace; D. MacKay, Bayesian
+interpolation, 1992):
 
     sum_i c_i log f(e_i) + log priors + sum_k log(|2 pi S_k|^1/2 / A)
 
-f is the mixture of line of sight, NLOS delays and gross errors (nlos_mixture) of the errors e_i under that explanation, c_i
-counts errors that neighbouring places have in common once, S_k is the covariance of place k, and A the area in reach, over
-which a place is uniform beforehand.
+with the mixture f of line of sight, NLOS delays and gross errors (nlos_mixture), c_i that counts errors of neighbours once, the
+covariance S_k of place k, and the area A in reach, over which a place is uniform beforehand.
 """
 
 from collections.abc import Sequence
@@ -31,12 +30,10 @@ class MovePolicy:
     """That an anchor is moved while a recording is made."""
     moved_between: ClassVar[float] = 0.05
     """That it is moved between two recordings."""
-    blocked: ClassVar[float] = 0.3
-    """That its line of sight changes lastingly while a recording is made."""
-    high: ClassVar[float] = 0.3
-    """That an anchor whose height nobody gave is high above the tag."""
-    heights: ClassVar[tuple[float, ...]] = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    """m; heights that are tried."""
+    usual: ClassVar[float] = 0.3
+    """That its line of sight changes lastingly while a recording is made; that one whose height nobody gave is high."""
+    heights: ClassVar[tuple[float, ...]] = tuple(np.arange(1.0, 7.0).tolist())
+    """m; heights above the tag that are tried."""
     most_ranges: ClassVar[int] = 1000
     """Ranges of one radio that are compared, spread evenly; a place needs no more."""
     splits: ClassVar[int] = 3
@@ -49,15 +46,9 @@ class MovePolicy:
     """Divisions of an interval from which the search for times is continued."""
     compared: ClassVar[int] = 3
     """Places by a part of the ranges that are compared."""
-    still: ClassVar[float] = 1e-3
-    """m; a step that ends the descent of a place."""
     farthest: ClassVar[float] = 1.0
-    """m; the longest step."""
-    nearest: ClassVar[float] = 1e-6
-    """m; least distance of a place from the path."""
-    finest: ClassVar[float] = 0.03
-    """m; no radio measures more finely."""
-    least_level: ClassVar[float] = 0.1
+    """m; the longest step of a descent."""
+    nearest: ClassVar[float] = 0.1
     """m; a range shorter than the height keeps so much of a distance."""
 
 
@@ -78,7 +69,7 @@ class Track:
 
     def level(self, height: float) -> Floats:
         """Return the distances (m,) in the plane to an anchor at a height, m."""
-        return np.sqrt(np.maximum(self.ranges**2 - height**2, MovePolicy.least_level**2))
+        return np.sqrt(np.maximum(self.ranges**2 - height**2, MovePolicy.nearest**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +99,7 @@ class PlaceModel:
         reach = float(np.max(track.ranges, initial=1.0))
         self.width = max(reach, 2.0)
         self.area = float(np.prod(np.ptp(track.path, axis=0) + 2.0 * reach))
-        self.usual = RangeMixture(0.0, max(2.0 * track.sigma, 0.1), 0.2, 0.5, 0.05, self.width)
+        self.usual = RangeMixture.usual(max(2.0 * track.sigma, MovePolicy.nearest), self.width)
         self.count = np.bincount(track.recording)[track.recording]
         self.alone = self.worth(np.zeros(len(track.ranges), dtype=np.intp))
 
@@ -117,11 +108,8 @@ class PlaceModel:
         return PlaceModel(replace(self.track, path=path), self.config, self.noise)
 
     def worth(self, place: Ints) -> Floats:
-        """Return what share (m,) of a range with errors of its own each range is worth.
-
-        Ranges of one interval from neighbouring places have most of their errors in common. That ranges differ which were made
-        at one place at different times is no error of that kind, so intervals count apart.
-        """
+        """Return what share (m,) of a range with errors of its own each range is worth: neighbours within one interval have
+        most of their errors in common."""
         return independent_shares(self.track.path, [*intervals_of(place), *ways_of(place)], self.noise)
 
     def likeliest(self, height: float, parts: Sequence[slice | Bools | Ints]) -> list[AnchorHypothesis]:
@@ -164,7 +152,7 @@ class PlaceModel:
         error = np.zeros(len(place))
         for _ in range(MovePolicy.laps):
             offset = at[of] - path
-            distance = np.maximum(np.hypot(*offset.T), MovePolicy.nearest)
+            distance = np.maximum(np.hypot(*offset.T), _TINY)
             error[placed], direction = level[placed] - distance, offset / distance[:, None]
             likely, pulled, weight = self._errors(error, group, place >= 0, shares)
             information, gradient = np.tile(free, (len(at), 1, 1)), np.zeros((len(at), 2))
@@ -172,9 +160,9 @@ class PlaceModel:
             np.add.at(gradient, of, (weight * pulled)[placed, None] * direction)
             now, determinants = at, np.linalg.slogdet(information)[1]
             step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
-            if np.abs(step).max() < MovePolicy.still:
+            if np.abs(step).max() < self.config.still:
                 break
-            at = at + step * np.minimum(1.0, MovePolicy.farthest / np.maximum(np.hypot(*step.T), MovePolicy.nearest))[:, None]
+            at = at + step * np.minimum(1.0, MovePolicy.farthest / np.maximum(np.hypot(*step.T), _TINY))[:, None]
         evidence = likely + self._log_prior(place, height)
         evidence += float(np.sum(np.log(2.0 * np.pi / self.area) - 0.5 * determinants))
         sigma = np.linalg.eigvalsh(information)[:, 0] ** -0.5
@@ -184,9 +172,7 @@ class PlaceModel:
     def _errors(self, error: Floats, group: Ints, placed: Bools, shares: Floats) -> tuple[float, Floats, Floats]:
         """Return the evidence of errors (m,), their difference (m,) from the likeliest error, m, and their weights (m,), 1/m^2.
 
-        Parameters
-        ----------
-        group : (m,) each has a distribution; that of a number beyond the recordings' is behind an obstacle.
+        Each group (m,) has a distribution; that of a number beyond the recordings' is behind an obstacle.
         """
         track, spread, clear = self.track, self.config.bias_sigma**2, (0.0, np.inf)
         pulled, weight = np.zeros(len(error)), np.zeros(len(error))
@@ -195,10 +181,10 @@ class PlaceModel:
             own, behind = np.flatnonzero((group == number) & placed), number > track.recording.max()
             # Obstacles make ranges longer, never shorter, and they do not make the radio noisier.
             most = clear[1] if behind else np.inf
-            mixture = replace(fit(error[own], min(max(track.sigma, MovePolicy.finest), most), most), width=self.width)
+            mixture = replace(fit(error[own], min(max(track.sigma, self.noise.min_sigma), most), most), width=self.width)
             mode, relative = mixture.mode(), mixture.centre - (clear[0] if behind else 0.0)
             pulled[own] = error[own] - mode
-            weight[own] = shares[own] * mixture.weights_about(mode, error[own]) / mixture.sigma**2
+            weight[own] = shares[own] * mixture.weights(error[own], mode) / mixture.sigma**2
             # Of the other four parameters only the number of ranges counts (G. Schwarz 1978), of the constant error its prior.
             count = max(float(shares[own].sum()), 1.0)
             evidence += float(shares[own] @ mixture.log_density(error[own])) - 2.0 * np.log(count)
@@ -217,9 +203,11 @@ class PlaceModel:
         between = self.track.recording[before] != self.track.recording[after]
         times = np.log(self.count[before]) * np.where(after - before > 1, 2.0, 1.0)
         moved = float(np.sum(np.where(between, np.log(policy.moved_between), np.log(policy.moved) - times)))
-        return moved + (float(np.log(policy.high / len(policy.heights))) if height != self.track.heights[0] else 0.0)
+        return moved + (float(np.log(policy.usual / len(policy.heights))) if height != self.track.heights[0] else 0.0)
 
 
+_TINY = 1e-9
+"""m; keeps divisions finite."""
 _NOWHERE = AnchorHypothesis(np.zeros(2), 0.0, 1.0, np.inf, np.inf)
 """In place of that of too few ranges."""
 

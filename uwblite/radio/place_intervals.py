@@ -17,7 +17,7 @@ def explain(model: PlaceModel) -> Explanation:
     """Return the explanation of greatest evidence."""
     search = _Search(model)
     best = search.one_place(model.track.heights[0])
-    for others in (search.divided, search.returned, search.united):
+    for others in (search.divided, search.returned):
         while (better := others(best)) is not None:
             best = better
     return best
@@ -88,17 +88,6 @@ class _Search:
                 better += self._better(best, place, best.found, self.model.worth(place))
         return max(better, key=_evidence, default=None)
 
-    def united(self, best: Explanation) -> Explanation | None:
-        """Return the explanation with two of the places as one; None where none is better."""
-        better = []
-        for k in range(len(best.found)):
-            for other in range(k):
-                place = np.where(best.place == k, other, best.place)
-                rows = np.flatnonzero(place == other)
-                found = [*best.found[:other], *self.model.likeliest(best.height, [rows]), *best.found[other + 1 :]]
-                better += self._better(best, place, found, self.model.worth(best.place))
-        return max(better, key=_evidence, default=None)
-
     def _better(self, best: Explanation, place: Ints, found: Sequence[AnchorHypothesis], shares: Floats) -> list[Explanation]:
         """Return an explanation by other times where it is better than the best one."""
         if np.array_equal(place, best.place):
@@ -157,7 +146,7 @@ class _Search:
                     apart[part] = True
                     found = [*best.found[:here], start, *best.found[here + 1 :]]
                     tried.append(self.model.explanation(best.place, found, best.height, shares, apart).evidence)
-        return max(tried, default=-np.inf) + float(np.log(MovePolicy.blocked / self.model.count[own[0]]))
+        return max(tried, default=-np.inf) + float(np.log(MovePolicy.usual / self.model.count[own[0]]))
 
 
 def _evidence(each: Explanation) -> float:
@@ -166,10 +155,7 @@ def _evidence(each: Explanation) -> float:
 
 def _times(one: Floats, other: Floats, carried: Floats, least: int) -> tuple[float, tuple[int, int]]:
     """Return the greatest sum of logarithms of likelihoods (m,) at one place, on the way, and at the other place, and when the
-    way begins and ends; at least so many ranges are of either place.
-
-    A few ranges of neither place are gross errors: that a radio is carried for a time takes a time more to say.
-    """
+    way begins and ends, a time more to say; at least so many ranges are of either place."""
     low, high = least, len(one) - least
     until, since = (np.append(0.0, np.cumsum(each - carried)) for each in (one, other))
     begun = until[low : high + 1]

@@ -1,14 +1,12 @@
 """Widths of the priors of the radios' errors and of the units of length, chosen by marginal likelihood of the recording.
 
-Most radios are calibrated: their clocks are right to parts of a million and their antennas to a few centimetres. Some are not:
-scales 7 % off and biases of a metre and more have been observed. A prior wide enough for those leaves the others' anchors and
-the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by marginal
-likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
+Most radios are calibrated. A prior wide enough for those that are not (scales 7 % off, biases of a metre) leaves the others'
+anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by
+marginal likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-A wheel's radius is a setting and can be wrong by any factor: of two hypotheses about the wheels' unit the likelier one is
-taken, without contradiction that all units are right. The scale and the biases of radios can be wrong by little or much: of
-several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the widest where a scale is clearly
-off. Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too (pipeline/anchor_heights.py).
+A wheel's radius is a setting and can be wrong by any factor: of the hypotheses about the wheels' unit the likeliest one is
+taken. The scale and the biases of radios can be wrong by little or much: of several widths the mean (of the logarithms),
+weighted by marginal likelihood, is taken, and the widest where a scale is clearly off.
 """
 
 from collections.abc import Sequence
@@ -31,7 +29,7 @@ class UnitPolicy:
     """What is known beforehand of units of length and of the calibration of radios."""
 
     widths: ClassVar[int] = 4
-    """Number of widths tried, from calibrated to uncalibrated radios, evenly spaced in their logarithm."""
+    """Widths tried from calibrated to uncalibrated radios, and of heights, evenly spaced in their logarithm."""
     wrong_unit: ClassVar[float] = 0.1
     """Prior odds that the wheels' unit of length is wrong, against all units being right."""
     off: ClassVar[float] = 1.0
@@ -39,9 +37,15 @@ class UnitPolicy:
     farthest: ClassVar[float] = 0.08
     """Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
     short: ClassVar[float] = -0.01
-    """Relative error from which on ranges are shorter than the speed of light allows."""
     too_short: ClassVar[float] = 0.01
-    """Factor on the odds of such a radio: ranges too long may come from late first paths, too short ones do not."""
+    """Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a
+    radio: ranges too long may come from late first paths, too short ones do not."""
+    least_heights: ClassVar[float] = 0.3
+    """Least spread of squared heights, m^2: anchors 1.5 m above the tag, mounted within 10 cm."""
+    together: ClassVar[float] = 4.0
+    """Ratio of the prior width of the mean to that of a single square: all anchors of a hall may be twice as high as usual."""
+    fewest: ClassVar[int] = 3
+    """Least number of anchors for a common mean."""
 
 
 def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:
@@ -109,26 +113,18 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
 
 
 def _unit_widths(units: Floats, likely: Floats) -> Floats:
-    """Return the chosen widths (n,) from those under one hypothesis about the wheels (h, n), the first for a calibrated radio.
-
-    Parameters
-    ----------
-    likely : (h,) how likely each is.
-    """
+    """Return the chosen widths (n,) of those under one hypothesis about the wheels (h, n), the first for a calibrated radio."""
     if likely[1:].sum() > np.exp(EvidencePolicy.positive) * likely[0]:
         return np.asarray(units[likely > 0.0][-1])
     return np.asarray(np.exp(likely @ np.log(units) / likely.sum()))
 
 
 def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats, Floats, Ints]:
-    """Return the widths of units of length that are tried, and which hypothesis about the wheels' unit each is under.
+    """Return the widths of units of length that are tried (h, radios + wheels), their logarithmic odds (h,), and which
+    hypothesis about the wheels' unit each is under (h,).
 
     All units of wheels are right, and the radio's scale is sound or off by more and more; that of one recording's wheels is
     wrong; those of all recordings are.
-
-    Returns
-    -------
-    Widths (h, radios + wheels), their logarithmic odds (h,), and numbers of hypotheses (h,).
     """
     scales = _between(config.range_scale_sound, config.range_scale) if radios else [1.0]
     right = np.full(wheels, config.odometry_scale)
@@ -163,28 +159,16 @@ def _free(graph: Graph, name: str) -> Ints:
     return np.flatnonzero(graph.calibration.of_kinds(name) & ~graph.fixed_calibration)
 
 
-_LEAST = 0.3
-"""Least spread of squared heights, m^2: anchors 1.5 m above the tag, mounted within 10 cm."""
-_WIDTHS = 6
-"""Spreads tried, evenly spaced in their logarithm."""
-_TOGETHER = 4.0
-"""Ratio of the prior width of the mean to that of a single square: all anchors of a hall may be twice as high as usual."""
-_FEWEST = 3
-"""Least number of anchors for a common mean."""
-
-
 def with_alike_heights(graph: Graph) -> Graph:
     """Return the graph with priors of squared heights about their common mean: anchors of one building are alike in height.
 
-    From a straight path, as along a corridor, the ranges to an anchor determine its distance from the path's line, but not
-    which part of that is height. An assumed height of 0 then moves every anchor away from the path. The height of anchors near
-    corners is observable. So the squared heights q of one robot's tag get the prior
+    From a straight path ranges hardly determine which part of an anchor's distance is height, and an assumed height of 0 moves
+    every anchor away from the path. So the squared heights q of one robot's tag get the prior
 
         q_k = m + d_k,    m ~ N(0, (4 sigma)^2),    d_k ~ N(0, tau^2)
 
-    instead of independent ones, N(0, sigma^2). Their spread tau is the mean of widths from nearly equal to independent
-    heights, weighted by marginal likelihood as above. Every height then has a prior of its own about the common mean, whose
-    width contains the uncertainty of the mean and the spread.
+    instead of independent ones, N(0, sigma^2); tau is the mean of widths from nearly equal to independent heights, weighted by
+    marginal likelihood. Every height then has a prior of its own about the common mean, whose width contains its uncertainty.
 
     Parameters
     ----------
@@ -193,7 +177,7 @@ def with_alike_heights(graph: Graph) -> Graph:
     kinds = graph.calibration.of_kinds(HEIGHT) & ~graph.fixed_calibration
     sigma, owners = prior_sigma(graph), [(key.recording, key.tag) for key in graph.calibration.keys]
     groups = [np.flatnonzero(kinds & np.array([o == own for o in owners])) for own in sorted(set(owners), key=str)]
-    groups = [group for group in groups if len(group) >= _FEWEST and np.all(np.isfinite(sigma[group]))]
+    groups = [group for group in groups if len(group) >= UnitPolicy.fewest and np.all(np.isfinite(sigma[group]))]
     if not groups:
         return graph
     try:
@@ -208,17 +192,13 @@ def with_alike_heights(graph: Graph) -> Graph:
 
 
 def _common(values: Floats, covariance: Floats, sigma: Floats) -> tuple[float, float]:
-    """Return the mean of the heights' common prior and its standard deviation.
-
-    Parameters
-    ----------
-    values, covariance : (h,) and (h, h) posterior of the squared heights. sigma : (h,) of their independent priors.
-    """
+    """Return mean and standard deviation of the heights' common prior, by the posterior of the squared heights (h,), (h, h) and
+    the standard deviations (h,) of their independent priors."""
     posterior = np.linalg.inv(covariance)
     pulled, measured = posterior @ values, posterior - np.diag(sigma**-2.0)
     usual = float(np.median(sigma))
-    wide, found = _TOGETHER * usual, []
-    for spread in np.geomspace(min(_LEAST, usual), usual, _WIDTHS).tolist():
+    wide, found = UnitPolicy.together * usual, []
+    for spread in np.geomspace(min(UnitPolicy.least_heights, usual), usual, UnitPolicy.widths).tolist():
         prior = wide**2 + spread**2 * np.eye(len(values))
         whole = measured + np.linalg.inv(prior)
         likely = 0.5 * (pulled @ np.linalg.solve(whole, pulled) - np.linalg.slogdet(whole)[1] - np.linalg.slogdet(prior)[1])

@@ -1,21 +1,20 @@
 """Systematic errors of ranges: of all by the anchor's direction in the robot's frame, of each anchor by the tag's place.
 
 The robot's own body shadows its tag (Otim et al., Electronics 8(11):1351, 2019), and an antenna's delay changes with the
-direction by centimetres to decimetres (bitcraze/crazyflie-firmware, issue 680): equally for all anchors, and in every
-range. Taken as noise, it shifts poses to one side wherever anchors are on one side. Once clouds determine the
+direction (bitcraze/crazyflie-firmware, issue 680): equally for all anchors, and in every range. Once clouds determine the
 trajectory, it is estimated with all other unknowns, as errors that ranges have in common (graph/marginals.py).
 
-Multipath, walls and an anchor whose place is off by decimetres cause errors that depend on the tag's place and are the same
-on every visit. The range residuals of the map are therefore interpolated over the floor by a Gaussian process, whose
-noise is learnt from them as in mapping (radio.range_noise): covariance ``slow^2 exp(-d / length)``, and
-far from the path only the anchor's mean is corrected (C. Rasmussen, C. Williams, Gaussian Processes for Machine Learning,
-2006, algorithm 2.1). The error by direction is subtracted before.
+Multipath, walls and an anchor whose place is off cause errors that depend on the tag's place and are the same on every visit.
+The range residuals of the map are interpolated over the floor by a Gaussian process of covariance ``slow^2 exp(-d / length)``,
+learnt as in mapping (radio.range_noise); far from the path only the anchor's mean is corrected (C. Rasmussen, C. Williams,
+Gaussian Processes for Machine Learning, 2006, algorithm 2.1). The error by direction is subtracted before.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from .. import se2
@@ -23,6 +22,7 @@ from ..arrays import Floats, Ints, spread
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals
 from ..graph.range_edges import RangeEdges
+from ..graph.robust import Kernel
 from .range_noise import RangeNoise, RangeNoiseConfig, learn
 
 HARMONICS = 3
@@ -60,13 +60,10 @@ def without_pattern(edges: RangeEdges, graph: Graph, around: Marginals) -> Range
 
 _CONSTANT = 0.1
 """m; common error of the ranges to one anchor, everywhere."""
-_CELL = 0.25
-"""m; ranges from one square of this size are averaged: their errors are correlated."""
-_MOST_CELLS = 400
-"""Most squares of one anchor; where there are more the squares are larger, to bound the time for a matrix of them."""
-_GATE = 2.0
-"""White standard deviations at which a range's weight falls to a half (Cauchy)."""
-_ITERATIONS = 4
+_CELL, _MOST_CELLS = 0.25, 400
+"""m; ranges from one square of this size are averaged, of a larger one where an anchor has more squares: it bounds the time."""
+_ROBUST, _ITERATIONS = Kernel("cauchy", 2.0), 4
+"""By white standard deviations."""
 _PER_LENGTH, _MOST_ENTRIES, _FADED = 0.2, 10_000, 3.0
 """Step of the table of errors, in lengths over which they are alike; most entries of an anchor, in larger buildings with a
 larger step; and lengths after which a place says nothing about another one: 5 %."""
@@ -88,13 +85,8 @@ class RangeErrors:
 
     def at(self, places: Floats) -> Floats:
         """Return the errors (...) to expect at places (..., 2) of the tag, m; outside of the table that of its edge."""
-        last = np.array(self.table.shape) - 1
-        at = np.clip((places - self.origin) / self.cell, 0.0, last)
-        low = np.minimum(at.astype(np.intp), np.maximum(last - 1, 0))
-        (x, y), (i, j) = np.moveaxis(at - low, -1, 0), np.moveaxis(low, -1, 0)
-        i1, j1 = np.minimum(i + 1, last[0]), np.minimum(j + 1, last[1])
-        lower, upper = (self.table[i, k] + x * (self.table[i1, k] - self.table[i, k]) for k in (j, j1))
-        return np.asarray(lower + y * (upper - lower))
+        at = np.moveaxis((places - self.origin) / self.cell, -1, 0)
+        return np.asarray(map_coordinates(self.table, at, order=1, mode="nearest"))
 
 
 def range_errors(anchor: Ints, tags: Floats, bearings: Floats, errors: Floats, count: int) -> tuple[RangeErrors, ...]:
@@ -122,7 +114,7 @@ def _robust_fit(jacobian: Floats, errors: Floats, prior: Floats) -> tuple[Floats
     for _ in range(_ITERATIONS):
         left = errors - jacobian @ x
         sigma = max(spread(left), RangeNoiseConfig().min_sigma) if len(left) else 1.0
-        weight = 1.0 / (1.0 + np.square(left / (_GATE * sigma)))
+        weight = _ROBUST.weight(np.square(left / sigma))
         weighted = jacobian.T * (weight / sigma**2)
         x = np.asarray(np.linalg.solve(weighted @ jacobian + information, weighted @ errors), dtype=np.float64)
     return x, weight
@@ -140,7 +132,7 @@ def _of_one(tags: Floats, errors: Floats, noise: RangeNoise) -> RangeErrors:
         mean = np.bincount(member, weight * errors) / total
         coefficients = np.asarray(np.linalg.solve(covariance + np.diag(noise.white**2 / total), mean), dtype=np.float64)
         left = errors - (covariance @ coefficients)[member]
-        weight = 1.0 / (1.0 + np.square(left / (_GATE * noise.white)))
+        weight = _ROBUST.weight(np.square(left / noise.white))
     return _table(places, coefficients, noise)
 
 

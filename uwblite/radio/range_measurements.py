@@ -9,10 +9,16 @@ from ..graph.calibration import range_indices
 from ..graph.graph import Calibration, Graph
 from ..graph.range_edges import RangeEdges
 from ..odometry.attached import AttachedRanges
-from ..sensor_log import SensorMounting
+from ..sensor_log import SensorMounting, plausible
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
-from .trilateration import TrilaterationConfig, agreement, trilaterate_each, usable
+
+_ENOUGH_ERRORS = 5
+"""Least number of ranges to an anchor to which a mixture is fitted."""
+_LEAST_TRUST = 1e-6
+"""Weight of a gross error, which keeps a graph solvable."""
+_LEAST_DELAY = 0.15
+"""Least delay of a range through an obstacle, m: a wall of 0.1 to 0.2 m whose permittivity is 4 and more."""
 
 
 def range_edges(
@@ -21,14 +27,14 @@ def range_edges(
     mounting: SensorMounting,
     calibration: Calibration,
     noise: RangeNoiseConfig,
-    search: TrilaterationConfig,
+    max_range: float,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 
     Parameters
     ----------
     anchor_ids : names of the graph's anchors; attached.anchor indexes them.
-    noise : of all ranges until it is learnt. search : decides which readings can be distances.
+    noise : of all ranges until it is learnt. max_range : m; longer readings are no distances.
     """
     above = [mounting.height_difference(a) for a in anchor_ids]
     given = np.array([height or 0.0 for height in above])
@@ -46,36 +52,8 @@ def range_edges(
         range_indices(calibration, attached.anchor, anchor_ids, attached.tag),
         attached.stamps,
         kernel=noise.kernel,
-        weights=(usable(attached.ranges, search) & attached.inside).astype(np.float64),
+        weights=(plausible(attached.ranges, max_range) & attached.inside).astype(np.float64),
     )
-
-
-def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: TrilaterationConfig) -> Graph:
-    """Return the graph with anchors moved to places where clearly more of their ranges agree, with fixed poses.
-
-    Parameters
-    ----------
-    edges : ranges; those of weight 0 do not count. placed : (a,) anchors that may be moved.
-    """
-    positions, anchors = edges.tag_positions(graph.poses), graph.anchors.copy()
-    rows = [np.flatnonzero(edges.alive & (edges.anchor == anchor)) for anchor in np.flatnonzero(placed)]
-    each = trilaterate_each([(positions[own], edges.rows(own).planar_ranges()) for own in rows], search, _LEVEL_SIGMA)
-    for anchor, own, found in zip(np.flatnonzero(placed), rows, each, strict=True):
-        if not found:
-            continue
-        here, there = (
-            agreement(positions[own], edges.ranges[own], place, edges.height[own])
-            for place in (anchors[anchor], found[0].position)
-        )
-        if there > here + _CLEARLY:
-            anchors[anchor] = found[0].position
-    return replace(graph, anchors=anchors)
-
-
-_LEVEL_SIGMA = 0.15
-"""Error of a path that the lidar determines, m."""
-_CLEARLY = 0.1
-"""Least additional share of its ranges that agree with another place, for an anchor to be moved there."""
 
 
 def learn_noise(
@@ -91,63 +69,47 @@ def learn_noise(
     steady : also count errors once that depend only on direction and distance, see range_noise.steady_sigma: right for
         anchors at given poses, and against sustained outliers. Such errors do not affect poses, since the anchors'
         places absorb them; for poses, all ranges together must constrain the trajectory.
+    blocked : (m,) ranges that went through an obstacle.
     """
     positions, sigma, weights = edges.tag_positions(graph.poses), edges.sigma.copy(), np.zeros(len(edges))
-    errors = edges.residuals(graph)[:, 0] * edges.sigma
-    alive = edges.alive
-    delay = 0.0 if blocked is None else max(spread(errors[alive & blocked]) if np.any(alive & blocked) else 0.0, _LEAST_DELAY)
+    errors, late = -edges.residuals(graph)[:, 0] * edges.sigma, np.zeros(len(edges), dtype=bool) if blocked is None else blocked
+    through = errors[edges.alive & late]
+    delay = max(spread(through), _LEAST_DELAY) if len(through) else _LEAST_DELAY
     noises = []
     for anchor in range(anchors):
-        own = np.flatnonzero(alive & (edges.anchor == anchor))
-        late = np.zeros(len(own), dtype=bool) if blocked is None else blocked[own]
-        clear = np.flatnonzero(~late) if np.sum(~late) >= _ENOUGH_CLEAR else np.arange(len(own))
-        noise = assumed(config)
-        trust = np.ones(len(own))
+        own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
+        clear = own[~late[own]] if np.sum(~late[own]) >= config.enough else own
+        noise, trust = assumed(config), np.ones(len(own))
         if config.learn and len(own) >= _ENOUGH_ERRORS:
-            mixture = nlos_mixture.fit(-errors[own[clear]], config.min_sigma)
-            trust = np.maximum(mixture.weights(-errors[own]), _LEAST_TRUST)
-            noise = learn(positions[own[clear]], errors[own[clear]], mixture.core(-errors[own[clear]]), config)
-        sigma[own] = max(noise.sigma, 1e-6)
-        effective = np.hypot(
-            effective_sigma(positions[own], noise, trust),
-            steady_sigma(positions[own] - graph.anchors[anchor], config, trust) if steady else 0.0,
-        )
-        effective[late] = np.hypot(effective[late], _delay_sigma(positions[own[late]], delay, trust[late], noise, steady))
+            mixture = nlos_mixture.fit(errors[clear], config.min_sigma)
+            trust = np.maximum(mixture.weights(errors[own]), _LEAST_TRUST)
+            noise = learn(positions[clear], errors[clear], mixture.core(errors[clear]), config)
+        sigma[own] = max(noise.sigma, _LEAST_TRUST)
+        effective = effective_sigma(positions[own], noise, trust)
+        if steady:
+            effective = np.hypot(effective, steady_sigma(positions[own] - graph.anchors[anchor], config, trust))
+        hid = late[own]
+        # For the anchor, all late ranges together are one sample of the delay; for a pose, those from nearby are.
+        common = delay * np.sqrt(max(float(trust[hid].sum()), 1.0))
+        nearby = effective_sigma(positions[own[hid]], RangeNoise(0.0, delay, noise.length), trust[hid])
+        effective[hid] = np.hypot(effective[hid], common if steady else nearby)
         weights[own] = trust * (sigma[own] / effective) ** 2
         noises.append(noise)
     return replace(edges, sigma=sigma, weights=weights), tuple(noises)
 
 
-def log_densities(edges: RangeEdges, graph: Graph, config: RangeNoiseConfig) -> tuple[Floats, Floats]:
+def log_densities(edges: RangeEdges, graph: Graph, least_sigma: float) -> tuple[Floats, Floats]:
     """Return the logarithm of the density of each range's error (m,), 1/m, and the share (m,) that is independent of others.
 
-    The density is the mixture fitted to the errors of its anchor. With n correlated neighbours a share of 1 / n is independent;
-    0 where a range does not count, or its anchor has too few.
+    The density is the mixture fitted to the errors of its anchor. With n correlated neighbours a weight of 1 / n is
+    independent; 0 where a range does not count, or its anchor has too few.
     """
     density, share = np.zeros(len(edges)), np.zeros(len(edges))
     errors = -edges.residuals(graph)[:, 0] * edges.sigma
     for anchor in np.unique(edges.anchor[edges.alive]).tolist():
         own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
         if len(own) >= _ENOUGH_ERRORS:
-            mixture = nlos_mixture.fit(errors[own], config.min_sigma)
-            density[own] = np.log(mixture.density(errors[own]))
+            mixture = nlos_mixture.fit(errors[own], least_sigma)
+            density[own] = mixture.log_density(errors[own])
             share[own] = np.minimum(edges.own_weights[own] / np.maximum(mixture.weights(errors[own]), _LEAST_TRUST), 1.0)
     return density, share
-
-
-def _delay_sigma(positions: Floats, delay: float, trust: Floats, noise: RangeNoise, steady: bool) -> Floats:
-    """Return the standard deviation (m,) of an anchor's ranges through obstacles, from their delay.
-
-    For the anchor, all of them together are one sample of the delay, since all are late; for a pose, those from nearby are.
-    """
-    if steady:
-        return np.full(len(trust), delay * np.sqrt(max(float(trust.sum()), 1.0)))
-    return effective_sigma(positions, RangeNoise(0.0, delay, noise.length), trust)
-
-
-_ENOUGH_ERRORS, _LEAST_TRUST = 5, 1e-6
-"""Least number of ranges to an anchor to which a mixture is fitted; weight of a gross error, which keeps a graph solvable."""
-_ENOUGH_CLEAR = 30
-"""Least number of ranges in line of sight from which the noise is learnt from these alone."""
-_LEAST_DELAY = 0.15
-"""Least delay of a range through an obstacle, m: a wall of 0.1 to 0.2 m whose permittivity is 4 and more."""

@@ -10,7 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, Table
+from ..graph.robust import Kernel
 from ..odometry.slips import EVERY, LASTS
 
 
@@ -26,12 +27,12 @@ class SlipSearchPolicy:
     """Time over which the motion is sought, in mean durations of a slip: six in seven are shorter."""
     stride: ClassVar[float] = 0.5
     """Time between moments that are tried, in mean durations of a slip."""
-    outlier: ClassVar[float] = 3.0
-    """Error of a range, in standard deviations, from which on it counts less: the scale of a Geman-McClure kernel."""
+    kernel: ClassVar[Kernel] = Kernel("geman-mcclure", 3.0)
+    """Of ranges, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TagRanges:
+class TagRanges(Table):
     """Ranges to anchors that have a place."""
 
     pose: Ints
@@ -48,11 +49,7 @@ class TagRanges:
     def cost(self, tag: Floats, place: Floats) -> Floats:
         """Return the robust cost (..., m) of the ranges for tags (..., m, 2) and anchors (m, 2) in one frame."""
         error = (np.hypot(tag[..., 0] - place[:, 0], tag[..., 1] - place[:, 1]) - self.distance) / self.sigma
-        return np.asarray(0.5 * error**2 / (1.0 + (error / SlipSearchPolicy.outlier) ** 2))
-
-    def rows(self, index: Ints) -> "TagRanges":
-        """Return some of them."""
-        return TagRanges(self.pose[index], self.tag[index], self.place[index], self.distance[index], self.sigma[index])
+        return SlipSearchPolicy.kernel.rho(error**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,16 +76,15 @@ def likeliest_slip(poses: Floats, duration: Floats, ranges: TagRanges) -> Slip |
     for moment in np.arange(0.0, time[-1], SlipSearchPolicy.stride * LASTS).tolist():
         first = int(np.searchsorted(time, moment, "right")) - 1
         last = max(int(np.searchsorted(time, moment + SlipSearchPolicy.longest * LASTS)), first + 1)
-        behind, during = np.flatnonzero(ranges.pose >= last), np.flatnonzero((ranges.pose > first) & (ranges.pose < last))
-        if last >= len(poses) or not len(behind):
+        after, within = ranges.rows(ranges.pose >= last), ranges.rows((ranges.pose > first) & (ranges.pose < last))
+        if last >= len(poses) or not len(after.pose):
             break
         motions = _motions(se2.between(poses[first], poses[last]))
-        after, within = ranges.rows(behind), ranges.rows(during)
         tag = se2.transform(se2.between(poses[last], poses[after.pose]), after.tag)
         place = se2.transform(se2.inverse(poses[first]), after.place)
         cost = after.cost(se2.transform(motions[:, None], tag), place).sum(axis=1) + usual[ranges.pose <= first].sum()
         # The tag stays about where it was before the slip.
-        cost += within.cost(np.broadcast_to(poses[first, :2], (len(during), 2)), within.place).sum()
+        cost += within.cost(poses[first, :2], within.place).sum()
         k = int(np.argmin(cost))
         if cost[k] < best:
             best, slip = float(cost[k]), Slip(first, last, _displaced(poses, first, last, motions[k]))
@@ -112,6 +108,5 @@ def _displaced(poses: Floats, first: int, last: int, motion: Floats) -> Floats:
     moved, end = poses.copy(), se2.compose(poses[first], motion)
     moved[last:] = se2.compose(end, se2.between(poses[last], poses[last:]))
     share = np.arange(1, last - first) / (last - first)
-    one, other = (np.tile(pose, (len(share), 1)) for pose in (poses[first], end))
-    moved[first + 1 : last] = se2.interpolate(one, other, share)
+    moved[first + 1 : last] = se2.interpolate(poses[first], end, share)
     return moved

@@ -1,4 +1,4 @@
-"""Initial positions of anchors from ranges along a path alone.
+"""Places of anchors by ranges along a path alone.
 
 The intersection of the circles is searched, not linearised: every cell of a coarse raster is scored by how many
 ranges agree with it up to one common bias (their median), so up to almost half of the ranges may be outliers. The best
@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import MAD_TO_SIGMA, Bools, Floats, row_medians
+from ..arrays import MAD_TO_SIGMA, Floats, row_medians
 from ..config import setting
-from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE
+from ..sensor_log import LONGEST_RANGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,27 @@ class TrilaterationConfig:
     bias_sigma: float = setting(0.6, above=0.0)
     """Plausible size of one anchor's constant error, m."""
     outlier: ClassVar[float] = 3.0
-    """Standard deviations beyond which a range counts as an outlier when hypotheses are compared."""
+    """Standard deviations beyond which a range counts as an outlier when hypotheses are compared; also those of a bias."""
     ambiguity: float = setting(0.2, advanced=True)
     """An anchor is ambiguous where a second hypothesis costs less than this more: of 100 ranges, a likelihood ratio of e^10."""
+    looked_at: ClassVar[int] = 200
+    starts: ClassVar[int] = 10
+    """Cells of the raster, the best first, among which so many are chosen from which descent starts."""
+    apart: ClassVar[float] = 1.5
+    """Cells between two starts, and the width of the first kernel."""
+    shrinking: ClassVar[float] = 0.7
+    """Factor on the kernel from step to step; in cells, the error at which a cell is no place for a range."""
+    finest: ClassVar[float] = 0.05
+    """m; least width of the kernel."""
+    steps: ClassVar[int] = 25
+    still: ClassVar[float] = 1e-3
+    """Most steps of descent, and m of one that ends it; also the damping, as a share of the information."""
+
+
+_NEAREST = 1e-9
+"""m; keeps divisions finite."""
+_AT_ONCE = 8
+"""Stretches searched together; more do not fit into the processor's cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +68,6 @@ class AnchorHypothesis:
     """Mean truncated squared residual, in units of the best hypothesis' variance; 0 perfect, outlier^2 hopeless."""
     position_sigma: float
     """Larger standard deviation of the position were the errors independent, m."""
-
-
-def usable(ranges: Floats, config: TrilaterationConfig) -> Bools:
-    """Return which readings (m,) can be distances at all: positive and below max_range."""
-    return (ranges > SHORTEST_RANGE) & (ranges < config.max_range)
 
 
 def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift: float = 0.0) -> list[AnchorHypothesis]:
@@ -90,8 +103,9 @@ def trilaterate_each(
     return found
 
 
-_AT_ONCE = 8
-"""Stretches searched together; more do not fit into the processor's cache."""
+def ambiguous(hypotheses: Sequence[AnchorHypothesis], config: TrilaterationConfig) -> bool:
+    """Return whether the second hypothesis explains the ranges about as well as the first."""
+    return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
 
 
 def _of_one_size(
@@ -108,38 +122,17 @@ def _of_one_size(
     refined = _refine(paths[each], ranges[each], np.concatenate(starts), steps, drift, config)
     for k, (path, own) in enumerate(picked):
         own_refined = tuple(values[each == k] for values in refined)
-        floor = max(float(own_refined[2].min()), 0.5 * drift, 0.02)
-        distinct: list[AnchorHypothesis] = []
+        floor = max(float(own_refined[2].min()), 0.5 * drift, 0.5 * config.finest)
+        apart, distinct = max(config.outlier * floor, 0.5 * searched[k][2]), list[AnchorHypothesis]()
         for hypothesis in _scored(path, own, own_refined, floor, config):
-            apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
-            if all(a > max(3.0 * floor, 0.5 * searched[k][2]) for a in apart):
+            if all(np.hypot(*(hypothesis.position - other.position)) > apart for other in distinct):
                 distinct.append(hypothesis)
         yield distinct
 
 
-def ambiguous(hypotheses: list[AnchorHypothesis], config: TrilaterationConfig) -> bool:
-    """Return whether the second hypothesis explains the ranges about as well as the first."""
-    return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
-
-
-_WITHIN = 0.4
-"""m; width of an interval of errors that agree: four standard deviations of usual ranges."""
-
-
-def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | float = 0.0) -> float:
-    """Return the largest share of ranges (m,) that agree with a place (2,) up to one common bias, within _WITHIN.
-
-    Parameters
-    ----------
-    path : (m, 2) positions of the tag at the ranges, m. height : of the anchor above the tag, m.
-    """
-    error = np.sort(ranges - np.hypot(np.hypot(*(place - path).T), height))
-    return float(np.max(np.searchsorted(error, error + _WITHIN, "right") - np.arange(len(error)))) / len(error)
-
-
 def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, Floats, float]:
     """Return the best raster cells (s, 2), the best bias (s,) of each, and the cell size, m."""
-    reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma
+    reach = float(np.quantile(ranges, _FARTHEST)) + config.bias_sigma
     low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
     step = float(np.max(high - low)) / config.raster
     axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
@@ -147,89 +140,71 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     # Single precision is enough to choose cells, and takes half the time.
     across, along = (((axis[:, None] - place) ** 2).astype(np.float32) for axis, place in zip(axes, path.T, strict=True))
     error = ranges.astype(np.float32) - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
-    bias = np.clip(row_medians(error), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
+    bias = np.clip(row_medians(error), -config.bias_sigma - step, config.outlier * config.bias_sigma + step)
     error -= bias[:, None]
-    error /= 0.7 * step
+    error /= config.shrinking * step
     cost = np.minimum(np.square(error, out=error), 1.0, out=error).mean(axis=1)
-    cost += 0.05 * (bias / (config.bias_sigma + step)) ** 2
-    likely = np.argsort(cost, kind="stable")[:_CELLS_LOOKED_AT]
-    best, apart = list[int](), np.ones(len(likely), dtype=bool)
-    while len(best) < _MOST_STARTS and apart.any():
-        best.append(int(likely[np.argmax(apart)]))
-        apart &= np.abs(cells[likely] - cells[best[-1]]).max(axis=1) > 1.5 * step
+    cost += _OF_BIAS * (bias / (config.bias_sigma + step)) ** 2
+    likely = np.argsort(cost, kind="stable")[: config.looked_at]
+    best, free = list[int](), np.ones(len(likely), dtype=bool)
+    while len(best) < config.starts and free.any():
+        best.append(int(likely[np.argmax(free)]))
+        free &= np.abs(cells[likely] - cells[best[-1]]).max(axis=1) > config.apart * step
     return cells[best], bias[best], step
 
 
-_CELLS_LOOKED_AT = 200
-"""Cells of the raster, the best first, among which starts are chosen."""
-_MOST_STARTS = 10
-"""Cells from which descent starts."""
+_FARTHEST, _OF_BIAS = 0.9, 0.05
+"""Quantile of the ranges beyond which they are false; cost of a cell of a bias of its standard deviation, in false ranges."""
 
 
 def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
-    """Return the starts (s, 3) of descent: each cell with no bias, and with its best bias where that is not small."""
+    """Return the starts (s, 3) of descent: each cell with no bias, and with its best bias where descent does not find it."""
     plain, biased = np.column_stack([cells, np.zeros(len(cells))]), np.column_stack([cells, bias])
-    return np.concatenate([plain, biased[np.abs(bias) > _SMALL_BIAS * step]])
-
-
-_SMALL_BIAS = 0.5
-"""Cells; descent finds a smaller bias by itself."""
+    return np.concatenate([plain, biased[np.abs(bias) > 0.5 * step]])
 
 
 def _refine(
     paths: Floats, ranges: Floats, starts: Floats, steps: Floats, drift: float, config: TrilaterationConfig
 ) -> tuple[Floats, Floats, Floats]:
-    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel, each with its own ranges.
+    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel, each with its own path (s, m, 2), ranges (s, m) and cell of
+    the raster (s,), m.
 
-    Parameters
-    ----------
-    paths : (s, m, 2) positions of the tag, m. ranges : (s, m) m. steps : (s,) cell of the raster of each start, m.
-
-    Returns
-    -------
-    Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
+    Returns position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
     """
-    count, eye = len(starts), np.eye(3)
-    state, x, y = starts.copy(), np.ascontiguousarray(paths[:, :, 0]), np.ascontiguousarray(paths[:, :, 1])
-    scale, normal = 1.5 * steps, np.tile(eye, (count, 1, 1))
-    robust, on = np.zeros(count), np.arange(count)
-    for _ in range(25):
+    eye, state, on = np.eye(starts.shape[1]), starts.copy(), np.arange(len(starts))
+    x, y = np.ascontiguousarray(paths[:, :, 0]), np.ascontiguousarray(paths[:, :, 1])
+    scale, normal, robust = config.apart * steps, np.tile(eye, (len(starts), 1, 1)), np.zeros(len(starts))
+    for _ in range(config.steps):
         here, width = state[on], scale[on]
         dx, dy = here[:, :1] - x, here[:, 1:2] - y
-        distance = np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
+        distance = np.maximum(np.sqrt(dx * dx + dy * dy), _NEAREST)
         rows = np.stack([dx / distance, dy / distance, np.ones_like(dx), ranges - distance - here[:, 2:]], axis=1)
-        error = rows[:, 3]
+        error = rows[:, -1]
         weight = 1.0 / np.square(1.0 + np.square(error / width[:, None]))
-        products = (rows[:, :3] * weight[:, None]) @ rows.transpose(0, 2, 1)
-        equations, gradient = products[:, :, :3], products[:, :, 3]
+        products = (rows[:, :-1] * weight[:, None]) @ rows.transpose(0, 2, 1)
+        equations, gradient = products[:, :, :-1], products[:, :, -1]
         robust[on] = sigma = MAD_TO_SIGMA * row_medians(np.abs(error))
         prior = (np.clip(sigma, drift, width) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * here[:, 2]
-        equations += 1e-3 * equations * eye + 1e-9 * eye
+        equations += config.still * equations * eye + _NEAREST * eye
         delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
-        farthest = 2.0 * steps[on] / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12)
+        farthest = 2.0 * steps[on] / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), _NEAREST)
         state[on] = here + delta * np.minimum(1.0, farthest)[:, None]
         normal[on] = equations
-        tight = np.maximum(2.0 * sigma, max(drift, 0.05))
-        going = (width > tight * 1.01) | (np.abs(delta).max(axis=1) >= 1e-3)
-        scale[on] = np.maximum(0.7 * width, tight)
-        if not going.all():
-            on, x, y, ranges = on[going], x[going], y[going], ranges[going]
-        if not len(on):
+        tight = np.maximum(2.0 * sigma, max(drift, config.finest))
+        going = (width > 1.01 * tight) | (np.abs(delta).max(axis=1) >= config.still)
+        scale[on] = np.maximum(config.shrinking * width, tight)
+        if not going.any():
             break
-    return state, np.asarray(np.linalg.inv(normal), dtype=np.float64), np.maximum(robust, 1e-3)
+        on, x, y, ranges = on[going], x[going], y[going], ranges[going]
+    return state, np.asarray(np.linalg.inv(normal), dtype=np.float64), np.maximum(robust, config.still)
 
 
 def _scored(
     path: Floats, ranges: Floats, refined: tuple[Floats, ...], sigma: float, config: TrilaterationConfig
 ) -> list[AnchorHypothesis]:
-    """Return the hypotheses of refined states, best first.
-
-    Parameters
-    ----------
-    refined : states (s, 3), covariances (s, 3, 3) and robust sigmas (s,), see _refine. sigma : of the best, m.
-    """
+    """Return the hypotheses of states, covariances and robust sigmas as of _refine, best first; sigma: of the best, m."""
     states, covariances, own = refined
     offset, bias = states[:, :2, None] - path.T, states[:, 2]
     error = ranges - np.hypot(offset[:, 0], offset[:, 1]) - bias[:, None]

@@ -4,28 +4,63 @@ Everything that comes from a log (names of files and anchors, reasons) is escape
 from elsewhere, and its script reads only the page itself.
 """
 
+import base64
 import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape as escape_markup
 
 import numpy as np
 
 from ..arrays import Floats, Ints
 from ..findings import DOUBT, Finding, folded
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
-from .page import PAGE, SCRIPT, STYLE
-from .printable import duration, printable, sigma_text
-from .svg_map import draw, number, shown_closures, sigma, thin
+from .canvas import PATHS
+from .drawn_map import drawn_map, shown_closures, thin
+from .page import SCALED, ZOOM, document, key
+from .printable import duration, escape, sigma_text, sigmas, signed
+from .svg_map import map_svg
 
-MOST_RESIDUALS = 1500
+_MOST_RESIDUALS = 1500
 """Residuals of one anchor drawn at most."""
+_USUAL, _LEAST_LIMIT = 0.99, 0.1
+"""Share of the residuals that agree which lies within half the scale of their plot, and the least scale, m."""
+_PLOT = 1000, 60
+"""Width and half height of a plot of residuals."""
+_LONG = 20
+"""Letters of a sentence; a cell of more may be wrapped."""
 
-
-def escape(text: str) -> str:
-    """Return text without markup and without what cannot be printed."""
-    return escape_markup(printable(text))
+_STYLE = """
+main{max-width:70rem;margin:0 auto;padding:1rem}
+h1{font-size:1.5rem;overflow-wrap:anywhere}h2{font-size:1.15rem;margin:1.6rem 0 .5rem}
+.scroll{overflow-x:auto;background:linear-gradient(90deg,var(--card) 40%,transparent) 0 0/2.5rem 100% local no-repeat,
+linear-gradient(270deg,var(--card) 40%,transparent) 100% 0/2.5rem 100% local no-repeat,
+linear-gradient(90deg,var(--shade),transparent) 0 0/.9rem 100% no-repeat,
+linear-gradient(270deg,var(--shade),transparent) 100% 0/.9rem 100% no-repeat}
+th,td{padding:.2rem .6rem;border-bottom:1px solid var(--line)}
+td{white-space:nowrap}td.words{white-space:normal;min-width:15rem}
+summary{cursor:pointer;padding:.4rem 0}
+.facts td{white-space:normal;overflow-wrap:anywhere}.facts th{font-weight:500;color:var(--faint);white-space:nowrap}
+.box{padding:.6rem .9rem;border-radius:.4rem;margin:.6rem 0}.box ul{margin:.3rem 0;padding-left:1.2rem}
+.hint{color:var(--faint);font-size:.85rem}.lead{margin:.4rem 0;color:var(--faint)}
+pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wrap;overflow-wrap:anywhere}
+.controls{display:flex;flex-wrap:wrap;gap:.3rem .9rem;align-items:center;margin:.4rem 0}
+.controls label,.buttons{white-space:nowrap}button{font:inherit;min-width:2.2rem;min-height:2.2rem}
+.map{touch-action:none;cursor:grab}#place{font-variant-numeric:tabular-nums;float:right;color:var(--ink)}
+figure{margin:.6rem 0}figcaption{font-weight:600}
+.plot{display:flex;gap:.4rem}.ends{display:flex;justify-content:space-between;margin-left:4.9rem}
+.scale{display:flex;flex-direction:column;justify-content:space-between;width:4.5rem;text-align:right}
+.scale,.ends{font-size:.75rem;color:var(--faint);font-variant-numeric:tabular-nums}
+.residuals{display:block;flex:1;min-width:0;height:7rem;border:1px solid var(--line);border-radius:.3rem}
+.residuals path{fill:none;stroke:var(--path0);stroke-width:3;stroke-linecap:round;vector-effect:non-scaling-stroke}
+.residuals .axis{stroke:var(--line);stroke-width:1}.residuals .nlos{stroke:var(--nlos)}.nlos-text{color:var(--nlos)}
+@media (max-width:40rem){main{padding:.6rem}body{font-size:15px}h1{margin:.3rem 0}h2{margin:1rem 0 .3rem}
+.cards thead{display:none}.cards,.cards tbody,.cards tr,.cards td{display:block}
+.cards tr{padding:.4rem 0;border-bottom:1px solid var(--line)}
+.cards td,.cards td.words{display:flex;gap:.6rem;border:0;padding:.1rem 0;white-space:normal;min-width:0;overflow-wrap:anywhere}
+.cards td::before{content:attr(data-name);color:var(--faint);flex:0 0 8rem}.cards td:empty{display:none}
+.cards td:first-child{font-weight:600}.cards td:first-child::before{content:none}}
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +77,12 @@ class Heading:
 
 
 def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    grid_png : picture of the bare grid, one pixel a cell, highest y first.
-    """
+    """Return the page; `grid_png` is the picture of the bare grid, one pixel a cell, highest y first."""
     again = f"<p>{escape(_WHERE.format(heading.title))}</p><pre>{escape(heading.command)}</pre>"
     table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in heading.facts)
     sections = (
         _banner(result, heading.lead),
-        _section("Map", draw(result, grid_png)),
+        _section("Map", _map(result, grid_png)),
         _section("Anchors", _anchor_table(result.anchors)),
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
@@ -60,8 +90,8 @@ def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -
         _section("Stages", _stage_table(result)),
         _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
-    body = f"<h1>{escape(heading.title)}</h1>" + "".join(sections)
-    return PAGE.format(title=escape(heading.title), style=STYLE, script=SCRIPT, body=body)
+    title = escape(heading.title)
+    return document(f"{title} \u2013 uwblite", f"<main><h1>{title}</h1>{''.join(sections)}</main>", _STYLE, SCALED + ZOOM)
 
 
 _WHERE = "The command that makes this map again, byte for byte, in the folder of {}:"
@@ -69,6 +99,34 @@ _WHERE = "The command that makes this map again, byte for byte, in the folder of
 
 def _section(title: str, content: str) -> str:
     return f'<section id="{title.lower().replace(" ", "-")}"><h2>{title}</h2>{content}</section>'
+
+
+def _map(result: MapResult, grid_png: bytes | None) -> str:
+    """Return the map with its switches and buttons."""
+    drawn = drawn_map(result)
+    image = f"data:image/png;base64,{base64.b64encode(grid_png).decode()}" if grid_png is not None else ""
+    layers = (
+        ("grid", key("faint", "map")),
+        ("trajectory", key("path0", "trajectory")),
+        ("anchors", key("anchor", "anchors, 2\u03c3", "anchors")),
+        ("kept", key("accepted", "closures accepted")),
+        ("rejected", key("rejected", "closures rejected")),
+    )
+    boxes = "".join(
+        f'<label><input type=checkbox{"" if name == "rejected" else " checked"} data-layer="{name}"> {text}</label>'
+        for name, text in layers
+    )
+    names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
+    buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
+    several = range(len(drawn.paths)) if len(drawn.paths) > 1 else ()
+    keys = [key("start", "start", "disc"), key("path0", "end", "ring")]
+    keys += [key(f"path{k % len(PATHS)}", f"recording {k + 1}") for k in several]
+    keys += [key("unsure", "an anchor that is not certain", "anchors")] if any(a.kind == "doubt" for a in drawn.anchors) else []
+    keys += [key("doubted", "not to be trusted")] if drawn.doubted else []
+    return (
+        f"{map_svg(drawn, image)}<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><p class=hint>"
+        f'<output id="place"></output>{" ".join(keys)}; wheel or pinch zooms, dragging moves; point at things for details.</p>'
+    )
 
 
 def _banner(result: MapResult, lead: str) -> str:
@@ -106,13 +164,18 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -
 
 def _cell(text: str, name: str) -> str:
     """Return a cell of a table; one that holds a sentence may be wrapped, but not to a word a line."""
-    words = " class=words" if len(text) > 20 and " " in text else ""
+    words = " class=words" if len(text) > _LONG and " " in text else ""
     named = f' data-name="{escape(name)}"' if name else ""
     return f"<td{words}{named}>{escape(text)}</td>"
 
 
+def _number(value: float, digits: int = 3, sign: bool = False) -> str:
+    """Return a number with a true minus sign; a dash where it is not finite."""
+    return signed(value, digits, plus=sign).replace("-", "\u2212") if np.isfinite(value) else "\u2013"
+
+
 def _with_sigma(value: float, sigma: float, digits: int = 3, sign: bool = False) -> str:
-    return f"{number(value, digits, sign)} \u00b1{sigma_text(sigma, digits)}" if np.isfinite(value) else number(value)
+    return f"{_number(value, digits, sign)} \u00b1{sigma_text(sigma, digits)}" if np.isfinite(value) else _number(value)
 
 
 def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
@@ -121,12 +184,11 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
         (
             a.id,
             f"{a.status}: {a.reason}" if a.reason else a.status,
-            _with_sigma(a.position[0], sigma(a, 0)),
-            _with_sigma(a.position[1], sigma(a, 1)),
+            *map(_with_sigma, a.position.tolist(), sigmas(a)),
             _with_sigma(a.bias, a.bias_sigma, sign=True),
             str(a.ranges),
             f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
-            number(a.residual_rms),
+            _number(a.residual_rms),
         )
         for a in anchors
     ]
@@ -154,63 +216,43 @@ def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
 
 
 def _closure_table(result: MapResult) -> str:
-    kept, rejected = shown_closures(result)
     count = sum(c.accepted for c in result.closures)
     outcomes = Counter(OUTCOMES[c.outcome] for c in result.closures if not c.accepted)
     text = f"<p>{count} of {len(result.closures)} candidates accepted.</p>" if result.closures else ""
     if outcomes:
         text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in outcomes.most_common()], "")
-    state = {True: "accepted", False: "rejected"}
+    shown = [result.closures[k] for k in shown_closures(result.closures)]
     rows = [
-        (f"{c.i}\u2013{c.j}", state[bool(c.accepted)], f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
-        for c in [*kept, *rejected]
+        (
+            f"{c.i}\u2013{c.j}",
+            "accepted" if c.accepted else "rejected",
+            f"{c.fitness:.3f}",
+            f"{100 * c.overlap:.0f} %",
+            c.reason,
+        )
+        for c in shown
     ]
     listing = _table(("keyframes", "outcome", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")
     return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
 
 
 def _stage_table(result: MapResult) -> str:
-    head = ("stage", "\u03c7\u00b2 / degrees of freedom", "figures")
     rows = []
     for stage in result.stages:
-        chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
-        ratio = f"{chi2:.0f} / {dof} = {number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
-        values = {name: value for name, value in stage.figures.items() if isinstance(value, int | float) and value}
-        shown = ", ".join(text.format(values[name]) for name, text in _FIGURES.items() if name in values)
+        values = {name: v for name, v in stage.figures.items() if isinstance(v, int | float) and not isinstance(v, bool) and v}
+        chi2, dof = values.pop("chi2", None), values.pop("dof", 0)
+        ratio = f"{chi2:.0f} / {dof} = {_number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
+        shown = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
         if ratio or shown:
             rows.append((stage.name, ratio, shown))
-    return f"<details><summary>{len(rows)} stages</summary>{_table(head, rows, '')}<p class=hint>{_ABOUT_STAGES}</p></details>"
+    table = _table(("stage", "\u03c7\u00b2 / degrees of freedom", "figures"), rows, "")
+    return f"<details><summary>{len(rows)} stages</summary>{table}<p class=hint>{_ABOUT_STAGES}</p></details>"
 
-
-_FIGURES = {
-    "keyframes": "{} keyframes",
-    "travelled": "{:.1f} m",
-    "odometry": "{} steps of odometry",
-    "ranges": "{} ranges",
-    "placed": "{} anchors placed",
-    "points": "{} points",
-    "pairs": "{} pairs of scans",
-    "used": "{} of them used",
-    "submaps": "{} sub-maps",
-    "candidates": "{} candidates",
-    "accepted": "{} accepted",
-    "walls": "{} walls",
-    "columns": "{} columns",
-    "rays": "{} rays",
-    "sigma": "scatter {:.4f} m",
-    "range_sigma": "scatter of ranges {:.3f} m",
-    "shift": "poses moved by {:.4f} m",
-    "visits": "{} visits of places seen before",
-    "scans": "{} scans drawn",
-    "free_space_violation": "{:.2%} of the rays end in free space",
-    "iterations": "{} iterations",
-}
-"""Figures of stages that are shown, and how."""
 
 _ABOUT_STAGES = (
     "Each line is what its stage did; later ones add keyframes and weigh anew. \u03c7\u00b2 below the degrees of freedom is"
     " intended: ranges, and scans that are matched several times, have errors in common and are given less weight for it."
-    " report.json has all figures, and the time of each stage."
+    " Lengths are in metres; report.json has all figures, and the time of each stage."
 )
 
 
@@ -219,39 +261,35 @@ def _residuals(result: MapResult) -> str:
     several = len(np.unique(result.recording)) > 1
     # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
     time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
-    span = max(float(time.max()), 1e-9)
-    ends = ("first recording", "last recording") if several else ("0 s", duration(span))
+    ends = ("first recording", "last recording") if several else ("0 s", duration(float(time.max())))
     parts = [
         "<p class=hint>Measured minus expected range over time: above zero the range is too long;"
         " <span class=nlos-text>marked</span>: does not agree with the map, as where something blocks the line of sight (NLOS)."
         " What lies beyond the scale is drawn at its edge.</p>"
     ]
+    table["x"] = _PLOT[0] * time / max(float(time.max()), np.finfo(float).tiny)
     for index, anchor in enumerate(result.anchors):
-        rows = np.flatnonzero(table["anchor"] == index)
-        rows = rows[np.isfinite(table["residual"][rows])]
+        rows = np.flatnonzero((table["anchor"] == index) & np.isfinite(table["residual"]))
         if len(rows):
-            parts.append(_residual_plot(anchor.id, table, rows[thin(len(rows), MOST_RESIDUALS)], time / span, ends))
+            parts.append(_residual_plot(escape(anchor.id), table, rows[thin(len(rows), _MOST_RESIDUALS)], ends))
     return "".join(parts)
 
 
-def _dots(x: Floats, y: Floats) -> str:
-    return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x.tolist(), y.tolist(), strict=True))
-
-
-def _residual_plot(anchor_id: str, table: dict[str, Floats], which: Ints, time: Floats, ends: tuple[str, str]) -> str:
+def _residual_plot(name: str, table: dict[str, Floats], which: Ints, ends: tuple[str, str]) -> str:
+    """Return the plot of some rows of the ranges, at x along it."""
     residual, good = table["residual"][which], table["agrees"][which] > 0
-    inner = float(np.quantile(np.abs(residual[good]), 0.99)) if good.any() else 0.0
-    limit = max(2.0 * inner, 0.1)
-    x = 1000.0 * time[which]
-    y = 60.0 - 55.0 * np.clip(residual / limit, -1.0, 1.0)
+    limit = max(2.0 * float(np.quantile(np.abs(residual[good]), _USUAL)), _LEAST_LIMIT) if good.any() else _LEAST_LIMIT
+    width, middle = _PLOT
+    places = np.stack([table["x"][which], middle * (1.0 - np.clip(residual / limit, -1.0, 1.0))], axis=1)
     dots = "".join(
-        f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>' for name, sel in (("los", good), ("nlos", ~good)) if sel.any()
+        f'<path class="{kind}" d="{"".join(f"M{x:.1f} {y:.1f}h0" for x, y in places[chosen].tolist())}"/>'
+        for kind, chosen in (("los", good), ("nlos", ~good))
+        if chosen.any()
     )
-    scale = "".join(f"<span>{number(value, 2, True)} m</span>" for value in (limit, -limit))
-    marked = f"<span class=hint>{100 * float(np.mean(~good)):.0f} % marked</span>"
+    scale = "".join(f"<span>{_number(value, 2, True)} m</span>" for value in (limit, -limit))
     return (
-        f"<figure><figcaption>{escape(anchor_id)} {marked}</figcaption><div class=plot><div class=scale>{scale}</div>"
-        '<svg class="residuals" viewBox="0 0 1000 120" preserveAspectRatio="none" role="img"'
-        f' aria-label="residuals of {escape(anchor_id)}"><path class="axis" d="M0 60H1000"/>{dots}</svg></div>'
-        f"<div class=ends>{''.join(f'<span>{end}</span>' for end in ends)}</div></figure>"
+        f"<figure><figcaption>{name} <span class=hint>{100 * float(np.mean(~good)):.0f} % marked</span></figcaption>"
+        f'<div class=plot><div class=scale>{scale}</div><svg class="residuals" viewBox="0 -5 {width} {2 * middle + 10}"'
+        f' preserveAspectRatio="none" role="img" aria-label="residuals of {name}"><path class="axis" d="M0 {middle}H{width}"/>'
+        f"{dots}</svg></div><div class=ends>{''.join(f'<span>{end}</span>' for end in ends)}</div></figure>"
     )

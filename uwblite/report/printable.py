@@ -2,10 +2,15 @@
 
 import math
 import re
+from html import escape as escape_markup
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..map_result import AnchorEstimate, CalibrationEstimate
+
+_MOST_DIGITS = 9
+_WORTH_SAYING = 0.005
+"""Share of an anchor's ranges that do not agree with the map."""
 
 
 def printable(text: str) -> str:
@@ -13,12 +18,17 @@ def printable(text: str) -> str:
 
     Control characters, line ends, marks that turn the direction of writing, and bytes of file names that are not UTF-8.
     """
-    return text if text.isprintable() else "".join(c if c.isprintable() else _escape(c) for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else _code(c) for c in text)
+
+
+def escape(text: str) -> str:
+    """Return text for a page, without markup and without what cannot be printed."""
+    return escape_markup(printable(text))
 
 
 def encodable(text: str) -> str:
     """Return text that UTF-8 can hold: bytes of file names that are not UTF-8 written as escapes."""
-    return text if text.isascii() else re.sub("[\ud800-\udfff]", lambda match: _escape(match[0]), text)
+    return text if text.isascii() else re.sub("[\ud800-\udfff]", lambda match: _code(match[0]), text)
 
 
 def csv_field(text: str) -> str:
@@ -26,22 +36,20 @@ def csv_field(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
 
 
-def _escape(character: str) -> str:
-    code = ord(character)
-    if 0xDC80 <= code <= 0xDCFF:
+def _code(character: str) -> str:
+    if "\udc80" <= character <= "\udcff":
         # So Python keeps the byte of a name that is not UTF-8.
-        return f"\\x{code - 0xDC00:02x}"
+        return f"\\x{character.encode(errors='surrogateescape').hex()}"
     return character.encode("unicode_escape", "surrogatepass").decode()
 
 
 def duration(seconds: float) -> str:
     """Return a time span in words, such as 3.2 s, 4 min 05 s or 1 h 02 min."""
-    if seconds < 59.95:
+    if round(seconds, 1) < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
+    hours, left = divmod(minutes, 60)
+    return f"{hours} h {left:02d} min" if hours else f"{minutes} min {rest:02d} s"
 
 
 def sigma_text(sigma: float, digits: int) -> str:
@@ -51,12 +59,7 @@ def sigma_text(sigma: float, digits: int) -> str:
     """
     if not math.isfinite(sigma):
         return "?"
-    if sigma <= 0.0:
-        return "0"
-    return f"{sigma:.{max(digits, min(1 - math.floor(math.log10(sigma)), _MOST_DIGITS))}f}"
-
-
-_MOST_DIGITS = 9
+    return f"{sigma:.{max(digits, min(1 - math.floor(math.log10(sigma)), _MOST_DIGITS))}f}" if sigma > 0.0 else "0"
 
 
 def anchor_line(anchor: "AnchorEstimate") -> str:
@@ -64,24 +67,26 @@ def anchor_line(anchor: "AnchorEstimate") -> str:
 
     ``anchor 5C0B: x 12.31 ±0.04 m, y -3.20 ±0.05 m, bias +0.46 ±0.02 m, 812 ranges, 6 % down-weighted (NLOS?)``.
     """
-    x, y = (float(v) for v in anchor.position)
-    if x != x or y != y:
-        place = "no position"
-    else:
-        sigma_x, sigma_y = (max(float(anchor.covariance[k, k]), 0.0) ** 0.5 for k in (0, 1))
-        place = f"x {signed(x)} \u00b1{sigma_text(sigma_x, 2)} m, y {signed(y)} \u00b1{sigma_text(sigma_y, 2)} m"
-    parts = [f"anchor {anchor.id}: {place}"]
+    (x, y), (sigma_x, sigma_y) = anchor.position.tolist(), sigmas(anchor)
+    place = f"x {signed(x)} \u00b1{sigma_text(sigma_x, 2)} m, y {signed(y)} \u00b1{sigma_text(sigma_y, 2)} m"
+    parts = [f"anchor {anchor.id}: {place if math.isfinite(x + y) else 'no position'}"]
     if anchor.bias_sigma > 0:
         parts.append(f"bias {signed(anchor.bias, plus=True)} \u00b1{sigma_text(anchor.bias_sigma, 2)} m")
     parts.append(f"{anchor.ranges} ranges")
-    lost = 100 * (1 - anchor.used_share) if anchor.used_share == anchor.used_share else 0.0
-    if lost >= 0.5:
-        parts.append(f"{lost:.0f} % down-weighted (NLOS?)")
+    if 1.0 - anchor.used_share >= _WORTH_SAYING:
+        parts.append(f"{100 * (1.0 - anchor.used_share):.0f} % down-weighted (NLOS?)")
     if anchor.status != "ok":
         parts.append(f"{anchor.status.upper()}: {anchor.reason}" if anchor.reason else anchor.status.upper())
     if anchor.alternative is not None:
-        parts.append(f"or at x {signed(float(anchor.alternative[0]))} m, y {signed(float(anchor.alternative[1]))} m")
+        x, y = anchor.alternative.tolist()
+        parts.append(f"or at x {signed(x)} m, y {signed(y)} m")
     return ", ".join(parts)
+
+
+def sigmas(anchor: "AnchorEstimate") -> tuple[float, float]:
+    """Return the standard deviations of an anchor along x and y, m."""
+    x, y = (max(variance, 0.0) ** 0.5 for variance in anchor.covariance.diagonal().tolist())
+    return x, y
 
 
 def calibration_line(value: "CalibrationEstimate") -> str:

@@ -12,19 +12,22 @@ from ..lidar.scan_odometry import scan_steps
 from ..odometry.attached import OUTSIDE
 from ..sensor_log import LaserScans, Odometry, SensorLog, UwbRanges, odometry_in_bursts, stand_still
 from ..sensor_log import in_bursts as stamps_in_bursts
+from .wheel_motion import PairPolicy
 
-_FEW_STAMPS = 20
-"""Stamps that may be equal by chance."""
-_COARSE = 0.4
-"""s; sensors of moving robots are faster."""
-_SAME_STEP = 1e-4
-"""s; no clock is more regular than this."""
+_ENOUGH = 20
+"""Stamps that may be equal by chance, or too few to show a rhythm."""
+_COARSE, _EXACT = 0.4, 1e-4
+"""s; sensors of moving robots are faster than the one, and no clock is more regular than the other."""
 _JUMP = 10.0
 """A clock that was set forward by less cannot be distinguished from a sensor that was silent, s."""
 _SAME_END = 2.0
 """Sensors of one recording end within so much of each other, s."""
 _SOME = 0.02
 """Share of scans outside the odometry's time from which on it is reported."""
+_BURST, _LEAST_BURSTS = 4, 5
+"""Readings with one stamp that make a burst (two or three are a coarse clock), and bursts that must be."""
+_SIGMAS = 5.0
+"""Typical differences between lidar and odometry over a step, beyond which a scan is elsewhere."""
 
 
 def refuse_without_stamps(log: SensorLog) -> None:
@@ -42,13 +45,11 @@ def refuse_without_stamps(log: SensorLog) -> None:
 
 def made_up(log: SensorLog) -> list[Fact]:
     """Report stamps on a grid too coarse for a sensor's clock: they were made by counting messages."""
-    if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
+    if log.scans is None or min(len(log.scans.stamps), len(log.odometry.stamps)) < _ENOUGH:
         return []
     steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
     period = min(float(np.median(s)) for s in steps)
-    if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
-        return []
-    return [Fact.of("made-up-stamps", period=period)]
+    return [Fact.of("made-up-stamps", period=period)] if period >= _COARSE and max(map(np.ptp, steps)) <= _EXACT else []
 
 
 def in_bursts(log: SensorLog) -> tuple[tuple[str, ...], list[Fact]]:
@@ -61,6 +62,32 @@ def in_bursts(log: SensorLog) -> tuple[tuple[str, ...], list[Fact]]:
 def set_back(log: SensorLog) -> list[Fact]:
     """Return each sensor whose clock was set back."""
     return [Fact.of("clock-set-back", sensor=sensor, by=by) for sensor, by in log.notes.set_back.items() if by > 1.0]
+
+
+def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
+    """Spread readings of odometry and lidar that share one stamp because they waited in a buffer.
+
+    Each burst is spread evenly over the time since the one before; the remaining delay is calibrated.
+    """
+    facts = []
+    for name, what, sensor in (("odometry", "odometry readings", log.odometry), ("scans", "scans", log.scans)):
+        if sensor is not None and (spread := _spread(sensor.stamps)) is not None:
+            log = replace(log, **{name: replace(sensor, stamps=spread[0])})  # type: ignore[arg-type]
+            facts.append(Fact.of("stamps-in-bursts", readings=what, size=spread[1], period=spread[2]))
+    return log, facts
+
+
+def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
+    """Return stamps (n,) with bursts spread, s, usual size of a burst and time between two; None without bursts."""
+    distinct, group, size = np.unique(stamps, return_inverse=True, return_counts=True)
+    usual = float(np.median(size[group])) if len(stamps) else 0.0
+    if len(distinct) < _LEAST_BURSTS or usual < _BURST:
+        return None
+    gap = np.diff(distinct)
+    between = float(np.median(gap))
+    gap = np.minimum(np.concatenate([[between], gap]), between)
+    place = np.arange(len(stamps)) - np.searchsorted(stamps, distinct)[group]
+    return stamps - gap[group] * (1.0 - (place + 1.0) / size[group]), usual, between
 
 
 def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
@@ -85,10 +112,9 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
 def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
     """Return the stamp before a jump of the clock and its size, s, where stamps (n,) end with the others without it alone.
 
-    A jump replaces a usual step: the one in which half of the time passes, between bursts where readings come in
-    bursts.
+    A jump replaces a usual step: the one in which half of the time passes, between bursts where readings come in bursts.
     """
-    if len(stamps) < _FEW_STAMPS or stamps[-1] - end < _JUMP:
+    if len(stamps) < _ENOUGH or stamps[-1] - end < _JUMP:
         return None
     steps = np.diff(stamps)
     longest = int(np.argmax(steps))
@@ -122,16 +148,6 @@ def _sensors(log: SensorLog) -> list[tuple[str, str, UwbRanges | LaserScans]]:
     return [(name, what, s) for name, what, s in sensors if s is not None and len(s.stamps)]
 
 
-_MATCHING = 0.6
-"""Pairs that match less measure nothing."""
-_ARM = 2.0
-"""Distance of what a scan sees, m: by it a turn moves the readings."""
-_SIGMAS = 5.0
-"""Typical differences between lidar and odometry over a step, beyond which a scan is elsewhere."""
-_CANCELS = 0.5
-"""Share of either step's difference that is left in their sum where a scan alone is displaced, at most."""
-
-
 def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Give the scans that came late the poses at which they were taken; only where scans came through a queue, in bursts.
 
@@ -141,39 +157,28 @@ def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     scans = log.scans
     if scans is None or not stamps_in_bursts(scans.stamps):
         return log, []
-    steps, wheels = _steps(log)
+    times, rows = scans.middles, np.arange(len(scans.stamps) - 1)
+    wheels = log.odometry.motion(times[:-1], times[1:])
+    steps, share = scan_steps(scans, log.mounting, rows, rows + 1, wheels)
+    steps = np.where((share >= PairPolicy.matching)[:, None], steps, wheels)
     late = 1 + np.flatnonzero(displaced(se2.between(wheels, steps)))
     if not len(late):
         return log, []
-    times = scans.middles
-    poses = se2.compose(log.odometry.at(times[late - 1]), steps[late - 1])
-    log = replace(log, odometry=_with_poses(log.odometry, times[late], poses))
+    kept = ~np.isin(log.odometry.stamps, times[late])
+    stamps = np.concatenate([log.odometry.stamps[kept], times[late]])
+    poses = np.concatenate([log.odometry.poses[kept], se2.compose(log.odometry.at(times[late - 1]), steps[late - 1])])
+    order = np.argsort(stamps, kind="stable")
+    log = replace(log, odometry=Odometry(stamps[order], poses[order]))
     return log, [Fact.of("late-scans", count=len(late), total=len(times))]
 
 
-def _steps(log: SensorLog) -> tuple[Floats, Floats]:
-    """Return the motions (k - 1, 3) from each scan to the next by the lidar, where it measures one, and by the odometry."""
-    assert log.scans is not None
-    times = log.scans.middles
-    wheels = log.odometry.motion(times[:-1], times[1:])
-    rows = np.arange(len(wheels))
-    steps, share = scan_steps(log.scans, log.mounting, rows, rows + 1, wheels)
-    steps = np.where((share >= _MATCHING)[:, None], steps, wheels)
-    return steps, wheels
-
-
 def displaced(off: Floats) -> Bools:
-    """Return which scans (k - 1,) between two steps, of which each is off by (k, 3), m, m, rad, are alone displaced."""
-    off = off * np.array([1.0, 1.0, _ARM])
+    """Return which scans (k - 1,) between two steps, of which each is off by (k, 3), m, m, rad, are alone displaced.
+
+    What is left in the sum of both steps is at most half of either; a turn moves what a scan sees, two metres away.
+    """
+    off = off * np.array([1.0, 1.0, 2.0])
     limit = _SIGMAS * MAD_TO_SIGMA * float(np.linalg.norm(np.median(np.abs(off), axis=0)))
     into, out = off[:-1], off[1:]
     least = np.minimum(np.linalg.norm(into, axis=1), np.linalg.norm(out, axis=1))
-    return np.asarray((least > limit) & (np.linalg.norm(into + out, axis=1) < _CANCELS * least))
-
-
-def _with_poses(odometry: Odometry, stamps: Floats, poses: Floats) -> Odometry:
-    """Return the odometry with poses (m, 3) at stamps (m,), s, in place of those that it has there."""
-    kept = ~np.isin(odometry.stamps, stamps)
-    together = np.concatenate([odometry.stamps[kept], stamps])
-    order = np.argsort(together, kind="stable")
-    return Odometry(together[order], np.concatenate([odometry.poses[kept], poses])[order])
+    return np.asarray((least > limit) & (np.linalg.norm(into + out, axis=1) < 0.5 * least))

@@ -1,58 +1,154 @@
-"""Times at which the robot is suddenly elsewhere: it was carried, or the log was cut, and no sensor measured the motion.
+"""Times at which the robot is elsewhere: it was carried, or the log was cut, and no sensor measured the motion.
 
-Neighbouring scans differ little. Where one differs from the next by far more than its neighbours do, and no motion
-near that of the wheels aligns the two, the robot is at another place; so it is where ranges to several anchors jump and
-the scans do not contradict them: along a smooth tunnel every scan matches every other one.
-After a fast turn two scans may overlap little: the surfaces of the one then stand beside or behind those of the other.
-For scans from different places, many points stand in the free space of the other.
+After a silence of the odometry in which the wheels stood, or suddenly: neighbouring scans differ little. Where one differs from
+the next by far more than its neighbours do, and no motion near that of the wheels aligns the two, the robot is at another
+place; so it is where ranges to several anchors jump and the scans do not contradict them: along a smooth tunnel every scan
+matches every other one. After a fast turn two scans may overlap little: the surfaces of the one then stand beside or behind
+those of the other. For scans from different places, many points stand in the free space of the other.
 """
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, in_free_space, scan_steps
-from ..sensor_log import SensorLog
+from ..sensor_log import Odometry, OdometryBreaks, SensorLog
 from . import range_motion
-
-_NEIGHBOURS = 8
-"""Scans on either side from which the usual difference of scans is computed."""
-_LEAST_CHANGE = 0.25
-"""Mean difference of readings, m, below which nothing happened."""
-_TIMES_USUAL = 2.0
-"""Factor relative to the 90 % quantile of the neighbours."""
-_SILENCE = 6.0
-"""Usual periods of the lidar after which two scans do not count as neighbours."""
-_MOST = 40
-"""Most candidates that are tested, the largest first."""
-_SAME_PLACE = 0.55
-"""Scans that match by a larger share are of one place."""
-_EVERYWHERE = 0.5
-"""Least share of matching points, in the direction that fewest points face, for scans of one place."""
-_ONE_CUT = 3.0
-"""Uncertainty of the time of a cut found by ranges, s."""
-_THROUGH = 0.12
-"""Share in free space that is too large for a true place; people and doors cause less."""
-_MOST_CHANGE = 1.0
-"""Limit to which the difference of a reading is clipped, m."""
+from .wheel_motion import show_motion
 
 
-def found(log: SensorLog, jumps: Floats) -> Floats:
-    """Return the times (c,) of cuts, s.
+@dataclass(frozen=True, slots=True)
+class CutPolicy:
+    """Silences of the odometry, and changes from scan to scan."""
+
+    gap: ClassVar[float] = 2.0
+    periods: ClassVar[float] = 20.0
+    """Silence of the odometry that is a gap, s; or so many periods, where that is longer."""
+    margin: ClassVar[float] = 0.2
+    """Time at either end of a silence in which other sensors still have a place, s."""
+    stands: ClassVar[float] = 0.05
+    """Distance, m, and turn, rad, by the wheels, below which the robot stood meanwhile."""
+    usual: ClassVar[float] = 0.99
+    """Share of steps up to whose largest a step is usual."""
+    anywhere: ClassVar[tuple[float, float, float]] = (20.0, 20.0, 3.0)
+    """Standard deviation of a step that no sensor measured, m, m, rad."""
+    one_cut: ClassVar[float] = 3.0
+    """Cuts and breaks nearer than this in time are the same, s."""
+    neighbours: ClassVar[int] = 8
+    """Scans on either side from which the usual difference of scans is computed: the 90 % quantile, or twice that."""
+    silence: ClassVar[float] = 6.0
+    """Usual periods of the lidar after which two scans do not count as neighbours."""
+    least_change: ClassVar[float] = 0.25
+    most_change: ClassVar[float] = 1.0
+    """Mean difference of readings, m, below which nothing happened, and the most of a single one that counts."""
+    tested: ClassVar[int] = 40
+    """Most candidates that are tested, the largest first."""
+    same_place: ClassVar[float] = 0.55
+    """Scans that match by a larger share are of one place."""
+    through: ClassVar[float] = 0.12
+    """Share in free space that is too large for a true place; people and doors cause less."""
+
+
+def gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Fact]]:
+    """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?
+
+    A gap in the messages is none in the odometry: the pose after it counts, with the noise of the way and turn that it shows,
+    unless other sensors find the robot elsewhere. What they measured while it drove has no place between the two poses.
+    """
+    stamps = log.odometry.stamps
+    span, (way, turn) = np.diff(stamps), _ways(log.odometry)
+    period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
+    long = span > max(CutPolicy.gap, CutPolicy.periods * period)
+    at, facts, silent = list[float](), list[Fact](), list[tuple[float, float]]()
+    for k in np.flatnonzero(long & ~_as_between_others(log.odometry)).tolist():
+        a, b = float(stamps[k]), float(stamps[k + 1])
+        held = bool(way[k] < CutPolicy.stands)
+        stood = held and bool(turn[k] < CutPolicy.stands)
+        # A gyro may have turned with the robot while no sensor measured its distance.
+        if held and _elsewhere_after(log, a, b):
+            at.append(a)
+            facts.append(Fact.of("carried", at=[a - float(stamps[0])], silent=b - a))
+        elif stood:
+            continue
+        elif any(_inside(sensor.stamps, a, b).any() for sensor in (log.ranges, log.scans) if sensor is not None):
+            facts.append(Fact.of("odometry-gap", begin=a - float(stamps[0]), seconds=b - a))
+        silent.append((a, b))
+    return _without(log, silent), _anywhere(np.array(at)), facts
+
+
+def _ways(odometry: Odometry) -> tuple[Floats, Floats]:
+    """Return way, m, and turn, rad, of each step (n-1,)."""
+    steps = np.abs(odometry.steps)
+    return np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
+
+
+def _anywhere(stamps: Floats) -> OdometryBreaks:
+    """Return breaks after readings (b,), s, from which the robot may be anywhere."""
+    return OdometryBreaks(stamps, np.tile(CutPolicy.anywhere, (len(stamps), 1)))
+
+
+def _as_between_others(odometry: Odometry) -> Bools:
+    """Return over which steps (n-1,) the robot moved no farther than over most others.
+
+    A log thinned by motion holds a reading each so many centimetres, and none while the robot stands: the wheels counted all
+    the same, and the reading after a pause has the noise of the way that it shows.
+    """
+    (way, turn), moved = _ways(odometry), np.diff(odometry.stamps) > 0.0
+    usual = [float(np.quantile(part[moved], CutPolicy.usual)) if moved.any() else 0.0 for part in (way, turn)]
+    return np.asarray((way > CutPolicy.stands) & (way <= usual[0]) & (turn <= usual[1]))
+
+
+def _elsewhere_after(log: SensorLog, a: float, b: float) -> bool:
+    """Return whether lidar or radio find the robot elsewhere after a time in which the wheels stood."""
+    same = same_place(log, a, b)
+    return not same if same is not None else range_motion.excess(log, a, b) > 0.0
+
+
+def _inside(stamps: Floats, a: float, b: float) -> Bools:
+    """Return which stamps (n,) are well within a silence of the odometry."""
+    return np.asarray((stamps > a + CutPolicy.margin) & (stamps < b - CutPolicy.margin))
+
+
+def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
+    """Leave out scans and ranges of times at which the robot's place is unknown."""
+    for a, b in silent:
+        ranges, scans = log.ranges, log.scans
+        kept = None if ranges is None else ranges.rows(~_inside(ranges.stamps, a, b))
+        ranges = None if kept is None or not len(kept.stamps) else kept
+        log = replace(log, ranges=ranges, scans=None if scans is None else scans.rows(~_inside(scans.stamps, a, b)))
+    return log
+
+
+def cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Fact]]:
+    """Find moments at which the robot is suddenly elsewhere.
 
     Parameters
     ----------
-    jumps : (b,) times at which the odometry jumps, s.
+    jumps : (b,) times at which the odometry jumps, s; they may be such moments.
+    others : (c,) times of breaks that are known, s: near these there are none.
     """
+    times, stamps = found(log, jumps), log.odometry.stamps
+    ends = stamps[np.minimum(np.searchsorted(stamps, others, "right"), len(stamps) - 1)]
+    near = (times[:, None] > others - CutPolicy.one_cut) & (times[:, None] < ends + CutPolicy.one_cut)
+    times = times[~near.any(axis=1)]
+    facts = [Fact.of("carried", at=(times - stamps[0]).tolist())] if len(times) else []
+    return _anywhere(stamps[np.clip(np.searchsorted(stamps, times) - 1, 0, len(stamps) - 1)]), facts
+
+
+def found(log: SensorLog, jumps: Floats) -> Floats:
+    """Return the times (c,) of cuts, s; jumps : (b,) times at which the odometry jumps, s."""
     by_lidar = _by_lidar(log)
     by_ranges = [_nearest(jumps, t) for t in range_motion.cuts(log, jumps)]
-    more = [t for t in by_ranges if not same_place(log, t, t) and np.all(np.abs(by_lidar - t) > _ONE_CUT)]
+    more = [t for t in by_ranges if not same_place(log, t, t) and np.all(np.abs(by_lidar - t) > CutPolicy.one_cut)]
     return np.sort(np.concatenate([by_lidar, more]))
 
 
 def _nearest(jumps: Floats, time: float) -> float:
     """Return the jump that is the same moment as a cut by ranges, s; the cut's own time where there is none."""
-    near = jumps[np.abs(jumps - time) < _ONE_CUT]
-    return float(near[np.argmin(np.abs(near - time))]) if len(near) else time
+    return float(min(jumps[np.abs(jumps - time) < CutPolicy.one_cut], key=lambda jump: abs(jump - time), default=time))
 
 
 def same_place(log: SensorLog, before: float, after: float) -> bool | None:
@@ -64,28 +160,28 @@ def same_place(log: SensorLog, before: float, after: float) -> bool | None:
         return None
     middle = log.scans.middles
     first, second = int(np.searchsorted(middle, before, "right")) - 1, int(np.searchsorted(middle, after))
-    if first < 0 or second >= len(middle) or middle[second] - after > 2.0 or before - middle[first] > 2.0:
+    if first < 0 or second >= len(middle) or max(middle[second] - after, before - middle[first]) > CutPolicy.gap:
         return None
     pair = np.array([first]), np.array([second])
     motion, share = _matched(log, *pair)
-    if not 0.0 < share[0] < _SAME_PLACE:
-        everywhere = share[0] > 0.0 and directional_shares(log.scans, log.mounting, *pair, motion)[0] >= _EVERYWHERE
-        return True if everywhere else None
-    return False
+    if 0.0 < share[0] < CutPolicy.same_place:
+        return False
+    everywhere = share[0] > 0.0 and directional_shares(log.scans, log.mounting, *pair, motion)[0] >= 0.5
+    return True if everywhere else None
 
 
 def _by_lidar(log: SensorLog) -> Floats:
-    scans = log.scans
-    if scans is None or len(scans.stamps) < 2 * _NEIGHBOURS + 2 or scans.ranges.shape[1] < 30:
+    """Return the times (c,) between scans from two places, s."""
+    scans, half = log.scans, CutPolicy.neighbours
+    if scans is None or not show_motion(scans):
         return np.zeros(0)
     change = _changes(log)
-    padded = np.pad(change, _NEIGHBOURS, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1).copy()
-    windows[:, _NEIGHBOURS] = 0.0
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(change, half, mode="edge"), 2 * half + 1).copy()
+    windows[:, half] = 0.0
     span = np.diff(scans.stamps)
-    change = np.where(span > _SILENCE * max(float(np.median(span)), 1e-3), 0.0, change)
-    jumps = np.flatnonzero((change > _LEAST_CHANGE) & (change > _TIMES_USUAL * np.quantile(windows, 0.9, axis=1)))
-    jumps = np.sort(jumps[np.argsort(-change[jumps], kind="stable")[:_MOST]])
+    change = np.where(span > CutPolicy.silence * max(float(np.median(span)), 1e-3), 0.0, change)
+    jumps = np.flatnonzero((change > CutPolicy.least_change) & (change > 2.0 * np.quantile(windows, 0.9, axis=1)))
+    jumps = np.sort(jumps[np.argsort(-change[jumps], kind="stable")[: CutPolicy.tested]])
     if not len(jumps):
         return np.zeros(0)
     apart, share = _elsewhere(log, jumps, jumps + 1)
@@ -98,21 +194,21 @@ def _by_lidar(log: SensorLog) -> Floats:
 
 
 def _changes(log: SensorLog) -> Floats:
-    """Return the mean difference of readings between each scan and the next (k-1,), m."""
+    """Return the mean difference of readings, of a hundred beams or so, between each scan and the next (k-1,), m."""
     assert log.scans is not None
     every = max(1, log.scans.ranges.shape[1] // 120)
     reach = min(log.scans.range_max, 30.0)
     readings = np.nan_to_num(log.scans.ranges[:, ::every], nan=reach, posinf=reach)
-    return np.minimum(np.abs(np.diff(readings, axis=0)), _MOST_CHANGE).mean(axis=1)
+    return np.minimum(np.abs(np.diff(readings, axis=0)), CutPolicy.most_change).mean(axis=1)
 
 
 def _elsewhere(log: SensorLog, first: Ints, second: Ints) -> tuple[Bools, Floats]:
     """Return which pairs of scans (e,) no motion near the wheels' brings together, and what share of them matches (e,)."""
     assert log.scans is not None
     motion, share = _matched(log, first, second)
-    apart = share < _SAME_PLACE
+    apart = share < CutPolicy.same_place
     through = in_free_space(log.scans, log.mounting, first[apart], second[apart], motion[apart])
-    apart[apart] &= through > _THROUGH
+    apart[apart] &= through > CutPolicy.through
     return apart, share
 
 

@@ -8,18 +8,16 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..findings import Fact
 from ..lidar import laser_mounting
-from ..sensor_log import Odometry, SensorLog
+from ..sensor_log import SensorLog
 from .units import CLEARLY, heading_reading
-from .wheel_motion import Pairs
+from .wheel_motion import PairPolicy, Pairs
 
 _TURNS = 300
 """Pairs of scans, at most, by whose turns it is decided whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
-"""Angle by which a laser points elsewhere than given, difference up to which directions of motion agree, both rad, and share
-of them that must agree. Along bare walls a match stays at the wheels' guess, whichever way the laser looks."""
-_CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
-"""Pairs of scans with a longer distance, m, and a smaller turn, rad, show the direction of driving."""
-_LEAST_PAIRS = 15
+"""Angle by which a laser points elsewhere than given, and turn up to which a pair of scans shows the direction of driving;
+difference up to which directions of motion agree, all rad; and share of them that must agree. Along bare walls a match stays at
+the wheels' guess, whichever way the laser looks."""
 
 
 def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
@@ -28,14 +26,12 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     if reading.sound or reading.mirrored < reading.plain + CLEARLY:
         return log, []
     mirrors = {"the sign of its heading": np.array([1.0, 1.0, -1.0]), "the sign of its y": np.array([1.0, -1.0, 1.0])}
-    tried = {what: replace(log, odometry=_scaled(log.odometry, sign)) for what, sign in mirrors.items()}
+    tried = {
+        what: replace(log, odometry=replace(log.odometry, poses=log.odometry.poses * signs)) for what, signs in mirrors.items()
+    }
     fits = {what: _fits_laser(other) for what, other in tried.items()}
     best = max(fits, key=lambda what: fits[what])
     return tried[best], [Fact.of("heading-against-path", inverted=best, settled=fits[best] > 0.0)]
-
-
-def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
-    return Odometry(odometry.stamps, odometry.poses * factor)
 
 
 def _fits_laser(log: SensorLog) -> float:
@@ -63,8 +59,8 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
 def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the direction of the laser that the driving shows, where that is far from the given one."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
-    clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
-    if clear.sum() < _LEAST_PAIRS:
+    clear = pairs.measured & (np.minimum(*way) > PairPolicy.clear[0]) & (np.abs(pairs.lidar[:, 2]) < _LEAST_TURNED)
+    if clear.sum() < PairPolicy.enough:
         return log, []
     by_wheels, by_lidar = (m[clear, 0] + 1j * m[clear, 1] for m in (pairs.wheels, pairs.lidar))
     turns = by_wheels * by_lidar.conj() / np.abs(by_wheels * by_lidar)

@@ -6,39 +6,55 @@ distance driven, and their difference varies, two anchors have one name: multipa
 and a motion that the wheels miss makes ranges jump, but not back.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Bools, Floats, white_noise
 from ..findings import Fact
 from ..sensor_log import SensorLog, plausible
-from .odometry_chain import Motion
-from .stuck_sensors import quiet_noise, resolution_of
-
-_WINDOW = 3
-"""Readings whose median is taken."""
-_MIDDLE = _WINDOW // 2 + 1
-"""The middle one of them."""
-_LONG = 8
-"""Number of readings for which a jump must last."""
-_SILENCE = 6.0
-"""Usual periods of an anchor after which a jump does not show the time of the motion."""
-_STRETCH = 1.5
-"""Factor by which wheels may count too little."""
-_MARGIN = 0.5
-"""Change, m, that a blocked line of sight explains."""
-_TIMES_NOISE = 5.0
-"""Error that a median never has, in standard deviations of one reading."""
-_FEW, _STRETCH_WAY = 20, 2.0
-"""Readings of an anchor, and length of the stretches, m, in which their change is compared with the distance."""
-_LEAST_VOTES = 2
-"""Anchors that must agree, where so many are in reach."""
+from .odometry_chain import usual_speed
+from .repeats import RepeatPolicy, quiet_noise, resolution_of
 
 
-def _most_change(way: Floats, noise: float) -> Floats:
+@dataclass(frozen=True, slots=True)
+class MotionPolicy:
+    """Changes of ranges against the distance driven."""
+
+    window: ClassVar[int] = 3
+    """Readings whose median is taken."""
+    lasting: ClassVar[int] = 8
+    """Number of readings for which a jump must last."""
+    silence: ClassVar[float] = 6.0
+    """Usual periods of an anchor after which a jump does not show the time of the motion."""
+    stretch: ClassVar[float] = 1.5
+    """Factor by which wheels may count too little."""
+    margin: ClassVar[float] = 0.5
+    """Change, m, that a blocked line of sight explains."""
+    sigmas: ClassVar[float] = 5.0
+    """Error that a median never has, in standard deviations of one reading."""
+    votes: ClassVar[int] = 2
+    """Anchors that must agree, where so many are in reach."""
+    apart: ClassVar[float] = 10.0
+    """Cuts nearer than this in time are one, s."""
+    enough: ClassVar[int] = 20
+    way: ClassVar[float] = 2.0
+    """Readings of an anchor, and length of the stretches, m, in which their change is compared with the distance."""
+    leaps: ClassVar[int] = 12
+    leaping: ClassVar[float] = 0.1
+    """Least number of jumps, and their least share of the ranges' differences, for two places; one place has 3 % at most."""
+    near: ClassVar[float] = 0.6
+    """Distance, m, over which a jump is compared with the next one."""
+    steady: ClassVar[float] = 0.9
+    varies: ClassVar[float] = 0.7
+    """Share of leaps whose ends are where the next one's are, and by how much all differ (10 to 90 %, by their median). Two
+    places have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
+
+
+def _most_change(way: Floats | float, noise: float) -> Floats:
     """Return by how much ranges to one place differ at most between two points of the way (n,), m."""
-    return _STRETCH * way + _MARGIN + _TIMES_NOISE * noise
+    return np.asarray(MotionPolicy.stretch * way + MotionPolicy.margin + MotionPolicy.sigmas * noise)
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
@@ -48,21 +64,22 @@ def excess(log: SensorLog, start: float, end: float) -> float:
     ----------
     start, end : s; the readings before start and those after end are compared, and those between with each other.
     """
-    by_anchor = _by_anchor(log)
+    by_anchor, size = _by_anchor(log), MotionPolicy.window
+    middle = size // 2 + 1
     count = max((int(np.sum((stamps > start) & (stamps < end))) for stamps, _ in by_anchor), default=0)
-    edges = np.linspace(start, end, max(1, min(2, count // _WINDOW), count // (2 * _WINDOW)) + 1)
+    edges = np.linspace(start, end, max(1, min(2, count // size), count // (2 * size)) + 1)
     found = []
     for stamps, ranges in by_anchor:
         inside = np.searchsorted(edges, stamps) - 1
         parts = [ranges[(inside == k) & (stamps > start) & (stamps < end)] for k in range(len(edges) - 1)]
-        parts = [ranges[stamps <= start][-_WINDOW:], *parts, ranges[stamps >= end][:_WINDOW]]
-        level = np.array([np.median(part) if len(part) >= _WINDOW else np.nan for part in parts])
+        parts = [ranges[stamps <= start][-size:], *parts, ranges[stamps >= end][:size]]
+        level = np.array([np.median(part) if len(part) >= size else np.nan for part in parts])
         # From the middle one of the readings before, and to that of those after, the robot may have driven; wherever the median
         # is another one of the three, it lies between two that are nearer in time.
-        before, after = stamps[stamps <= start][-_MIDDLE:], stamps[stamps >= end][:_MIDDLE]
+        before, after = stamps[stamps <= start][-middle:], stamps[stamps >= end][:middle]
         extra = np.zeros(len(level))
         extra[[0, -1]] = _way(log, np.append(before, start)), _way(log, np.append(after, end))
-        change = np.abs(level[:, None] - level) - extra[:, None] - extra - _MARGIN - _TIMES_NOISE * _noise(ranges)
+        change = np.abs(level[:, None] - level) - extra[:, None] - extra - _most_change(0.0, _noise(ranges))
         if np.isfinite(level).sum() >= 2:
             found.append(np.where(np.isfinite(change), change, -np.inf))
     if not found:
@@ -83,11 +100,11 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
     """
     spans, by_anchor = [np.zeros((0, 3))], _by_anchor(log)
     for stamps, ranges in by_anchor:
-        if len(ranges) < 4 * _LONG:
+        if len(ranges) < 4 * MotionPolicy.lasting:
             continue
-        way, margin = log.odometry.travelled_at(stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
-        over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in (_WINDOW, _LONG))) - margin
-        close = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
+        way, windows = log.odometry.travelled_at(stamps), (MotionPolicy.window, MotionPolicy.lasting)
+        over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in windows)) - _most_change(0.0, _noise(ranges))
+        close = np.isfinite(over) & (np.diff(stamps) <= MotionPolicy.silence * np.median(np.diff(stamps)))
         spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[close])
     return _together(spans, jumps)
 
@@ -95,22 +112,21 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
 def change_by_way(log: SensorLog) -> float:
     """Return by how much the ranges change where the robot drives 2 m, by its wheels, by that way; nan without enough.
 
-    It is the median over the anchors of the 90 % quantile over such stretches, about 1 (0.88 to 1.13 in simulated rooms)
-    for any path, since the robot drives towards every anchor at times. It is nan, too, where ranges change that fast only
-    rarely.
+    It is the median over the anchors of the 90 % quantile over such stretches, about 1 for any path, since the robot drives
+    towards every anchor at times. It is nan, too, where ranges change that fast only rarely.
     """
     found = []
     for stamps, ranges in _by_anchor(log):
-        if len(ranges) < _FEW:
+        if len(ranges) < MotionPolicy.enough:
             continue
         way = log.odometry.travelled_at(stamps)[1:-1]
-        level = np.median(np.lib.stride_tricks.sliding_window_view(ranges, 3), axis=1)
-        last = np.searchsorted(way, way + _STRETCH_WAY)
+        level = np.median(np.lib.stride_tricks.sliding_window_view(ranges, MotionPolicy.window), axis=1)
+        last = np.searchsorted(way, way + MotionPolicy.way)
         first = np.flatnonzero(last < len(way))
         last = last[first]
         driven = way[last] - way[first]
-        rate = (np.abs(level[last] - level[first]) / driven)[driven < 1.5 * _STRETCH_WAY]
-        if len(rate) >= _FEW:
+        rate = (np.abs(level[last] - level[first]) / driven)[driven < 1.5 * MotionPolicy.way]
+        if len(rate) >= MotionPolicy.enough:
             found.append(np.quantile(rate, [0.5, 0.9]))
     usual, most = np.median(found, axis=0) if found else (np.nan, np.nan)
     return float(most) if usual > 0.5 * most else float("nan")
@@ -122,7 +138,7 @@ def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
     centres = np.mean(np.lib.stride_tricks.sliding_window_view(way, window), axis=1)
     found = np.full(len(ranges), -np.inf)
     driven = centres[window:] - centres[:-window]
-    found[window - 1 : len(ranges) - window] = np.abs(medians[window:] - medians[:-window]) - _STRETCH * driven
+    found[window - 1 : len(ranges) - window] = np.abs(medians[window:] - medians[:-window]) - MotionPolicy.stretch * driven
     return found
 
 
@@ -140,15 +156,15 @@ def _together(spans: list[Floats], jumps: Floats) -> list[float]:
         during = [own[(own[:, 0] <= end) & (own[:, 1] >= start)] for own in spans]
         agreeing = [own[own[:, 2] > 0.0] for own in during]
         same, (anchors, reached) = np.concatenate(agreeing), (sum(len(own) > 0 for own in k) for k in (agreeing, during))
-        least = 1 if np.any((jumps >= start) & (jumps <= end)) else _LEAST_VOTES
-        if anchors >= max(least, reached // 2) and all(abs(0.5 * (start + end) - t) > 10.0 for t in found):
+        least = 1 if np.any((jumps >= start) & (jumps <= end)) else MotionPolicy.votes
+        if anchors >= max(least, reached // 2) and all(abs(0.5 * (start + end) - t) > MotionPolicy.apart for t in found):
             found.append(0.5 * float(same[:, 0].max() + same[:, 1].min()))
     return sorted(found)
 
 
 def _agreed(over: Floats) -> Floats:
     """Return the value that enough of the anchors exceed, from the excess (a, ...) of each."""
-    needed = min(max(_LEAST_VOTES, len(over) // 2), len(over))
+    needed = min(max(MotionPolicy.votes, len(over) // 2), len(over))
     return np.asarray(np.sort(over, axis=0)[-needed])
 
 
@@ -158,28 +174,17 @@ def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
     if ranges is None:
         return []
     usable = plausible(ranges.ranges) & (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
-    return [(ranges.stamps[own], ranges.ranges[own]) for _, own in ranges.by_pair(usable) if len(own) >= _WINDOW]
+    return [(ranges.stamps[own], ranges.ranges[own]) for _, own in ranges.by_pair(usable) if len(own) >= MotionPolicy.window]
 
 
 def _noise(ranges: Floats) -> float:
     """Return the standard deviation of one reading by second differences, m."""
-    if len(ranges) < 5:
-        return 0.1
-    return max(white_noise(ranges), 0.03)
+    return max(white_noise(ranges), RepeatPolicy.usual_noise) if len(ranges) > 4 else 0.1
 
 
 def _way(log: SensorLog, stamps: Floats) -> float:
     """Return the distance driven between the first and the last stamp, m."""
     return float(np.ptp(log.odometry.travelled_at(stamps))) if len(stamps) else 0.0
-
-
-_LEAST_LEAPS, _LEAPS = 12, 0.1
-"""Least number of jumps, and their least share of the ranges' differences, for two places; one place has 3 % at most."""
-_NEXT = 0.6
-"""Distance, m, over which a jump is compared with the next one."""
-_STEADY, _VARIES = 0.9, 0.7
-"""Share of leaps whose ends are where the next one's are, and by how much all differ (10 to 90 %, by their median). Two places
-have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
 
 
 def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
@@ -192,7 +197,9 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     if not each:
         return log, []
     noise = quiet_noise([ranges.ranges[own] for _, own in each], resolution_of(ranges.ranges[usable]))
-    driven = np.interp(ranges.stamps, log.odometry.stamps, _driven(log))
+    # The robot may drive as fast as usual wherever its wheels count less.
+    steps = np.maximum(np.diff(log.odometry.travelled), usual_speed(log.odometry) * np.diff(log.odometry.stamps))
+    driven = np.interp(ranges.stamps, log.odometry.stamps, np.append(0.0, np.cumsum(steps)))
     wrong, facts = np.zeros(len(ranges.stamps), dtype=bool), []
     for anchor, own in each:
         leaps = np.abs(np.diff(ranges.ranges[own])) > _most_change(np.diff(driven[own]), noise)
@@ -200,26 +207,18 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
             name = ranges.anchor_ids[anchor]
             facts.append(Fact.of("shared-name", anchor=name, jumps=int(leaps.sum()), total=len(leaps)))
             wrong |= ranges.anchor == anchor
-    if not facts:
-        return log, []
-    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), facts
-
-
-def _driven(log: SensorLog) -> Floats:
-    """Return how far the robot may have driven until each reading of the odometry (n,), m: at least as fast as usual."""
-    usual = float(Motion.of(log.odometry).speed[0]) / 4.0
-    steps = np.maximum(np.diff(log.odometry.travelled), usual * np.diff(log.odometry.stamps))
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return (replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)) if facts else log), facts
 
 
 def _two_distances(values: Floats, driven: Floats, leaps: Bools, noise: float) -> bool:
     """Return whether the shorter and the longer ends of an anchor's leaps are distances to a place each, no constant apart."""
     at = np.flatnonzero(leaps)
-    if len(at) < max(_LEAST_LEAPS, _LEAPS * len(leaps)):
+    if len(at) < max(MotionPolicy.leaps, MotionPolicy.leaping * len(leaps)):
         return False
     ends = np.sort(np.column_stack([values[at], values[at + 1]]), axis=1)
     way = np.diff(0.5 * (driven[at] + driven[at + 1]))
     steady = np.abs(np.diff(ends, axis=0)).max(axis=1) < _most_change(way, noise)
     low, middle, high = np.quantile(ends[:, 1] - ends[:, 0], [0.1, 0.5, 0.9])
-    close = way < _NEXT
-    return bool(close.sum() >= _LEAST_LEAPS and steady[close].mean() > _STEADY and high - low > _VARIES * middle)
+    steady = steady[way < MotionPolicy.near]
+    enough = len(steady) >= MotionPolicy.leaps and steady.mean() > MotionPolicy.steady
+    return bool(enough and high - low > MotionPolicy.varies * middle)

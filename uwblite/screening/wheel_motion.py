@@ -2,21 +2,76 @@
 
 Pairs of scans a short time apart, spread over the recording, are matched and compared with the odometry of the same time.
 One factor for all distances and one for all turns are calibration, and removed before. A remaining difference over a stretch is
-a fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other lasting
+a fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; any other lasting
 difference is a doubt.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
-from ..sensor_log import Odometry, SensorLog
+from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
 
-_LEAST_RATIOS = 12
-"""Clear motions whose median is a factor."""
+
+@dataclass(frozen=True, slots=True)
+class PairPolicy:
+    """Comparison of wheels and lidar over pairs of scans."""
+
+    beams: ClassVar[int] = 30
+    scans: ClassVar[int] = 20
+    """Least number of beams and scans that show motion."""
+    pairs: ClassVar[int] = 250
+    """Compared over the whole recording."""
+    per_stand: ClassVar[int] = 8
+    """Further pairs in each stretch in which the wheels stand."""
+    stands: ClassVar[int] = 30
+    """Such stretches that are tested, the longest first."""
+    apart: ClassVar[float] = 0.1
+    """Usual distance between the scans of a pair, m."""
+    spans: ClassVar[tuple[float, float]] = (0.1, 1.0)
+    """Least and longest time between them, s."""
+    still: ClassVar[tuple[float, float]] = (0.005, 0.01)
+    """Distance, m, and turn, rad, within a second below which wheels stand."""
+    least_stand: ClassVar[float] = 1.5
+    """Shorter stands do not matter, s."""
+    matching: ClassVar[float] = 0.6
+    """Pairs that share less of their points measure nothing."""
+    clear_share: ClassVar[float] = 0.9
+    """Pairs that match so well from the wheels' guess are not also matched from zero motion."""
+    gain: ClassVar[float] = 0.03
+    """Share by which rest must explain a pair better than the wheels do."""
+    noise_share: ClassVar[float] = 0.4
+    """Share of matching points that one pair of scans in ten exceeds in any place; noise gives 0.1 to 0.2."""
+    noise: ClassVar[float] = 0.02
+    """Rms distance of matches of two scans from one place, m: lidars of robots have 1 to 2 cm."""
+    worse: ClassVar[float] = 1.2
+    """Factor between mean square distances of matches from which the better motion is shown; twice is clear."""
+    moving: ClassVar[float] = 0.03
+    """Motion between the scans of a pair that is larger than noise, m and rad."""
+    clear: ClassVar[tuple[float, float]] = (0.05, 0.1)
+    """Distance, m, and turn, rad, that are large enough for a ratio."""
+    enough: ClassVar[int] = 12
+    """Pairs whose median is a figure."""
+    lasting: ClassVar[int] = 6
+    """Pairs in a row, and seconds, of a lasting difference; half as many show whether the robot moves."""
+    allowed: ClassVar[tuple[float, float]] = (0.05, 0.06)
+    relative: ClassVar[float] = 0.35
+    """Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
+    replaced: ClassVar[float] = 0.25
+    """Time between the scans whose motion replaces the wheels, s."""
+    step_sigma: ClassVar[tuple[float, float, float]] = (0.02, 0.02, 0.01)
+    unknown_sigma: ClassVar[tuple[float, float, float]] = (0.3, 0.3, 0.3)
+    """Standard deviations of such a step, m, m, rad, and of one where scans do not match either."""
+    searches: ClassVar[int] = 100
+    """Steps of a stretch that are searched for, where they match badly."""
+
+
+_NAN = float("nan")
 
 
 def ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
@@ -29,7 +84,7 @@ def ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
 def factor(wheels: Floats, lidar: Floats, clear: float, otherwise: float = 1.0) -> float:
     """Return the factor of the wheels' motions (e, d) that most agree on; `otherwise` where there are too few."""
     ratio = ratios(wheels, lidar, clear)[1]
-    return float(np.median(ratio)) if len(ratio) >= _LEAST_RATIOS else otherwise
+    return float(np.median(ratio)) if len(ratio) >= PairPolicy.enough else otherwise
 
 
 def undiluted(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
@@ -38,43 +93,10 @@ def undiluted(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
-    nan = float("nan")
-    ratio, inverse = factor(wheels, lidar, clear, nan), factor(lidar, wheels, clear, nan)
+    ratio, inverse = factor(wheels, lidar, clear, _NAN), factor(lidar, wheels, clear, _NAN)
     if not (ratio > 0.0 and inverse > 0.0):
         return otherwise if np.isnan(ratio) else ratio
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
-
-
-_PAIRS = 250
-"""Pairs of scans compared over the whole recording."""
-_PAIRS_STANDING = 8
-"""Further pairs in each stretch in which the wheels stand."""
-_STRETCHES = 30
-"""Number of such stretches that are tested, the longest first."""
-_STILL = (0.005, 0.01)
-"""Distance, m, and turn, rad, within a second below which wheels stand."""
-_HALF, _EDGE = 0.5, 0.45
-"""Half of that second, and how much of it belongs to the stretch on either side, s."""
-_LEAST_STANDING = 1.5
-"""Shorter stretches do not matter, s."""
-_APART = 0.1
-"""Usual distance between the scans of a pair, m."""
-_CLEAR_SHARE = 0.9
-"""Pairs that match so well from the wheels' guess are not also matched from zero motion."""
-_GAIN = 0.03
-"""Share by which rest must explain a pair better than the wheels do, of all points and of those that face the way fewest do."""
-_EVERYWHERE = 0.5
-"""Least share of the points that face the way fewest do by which a match is right: of two neighbouring scans most match."""
-_SHARE = 0.6
-"""Pairs that match less measure nothing."""
-_ABSOLUTE, _RELATIVE = (0.05, 0.06), 0.35
-"""Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
-_SEEN_MOVING = (0.03, 0.03)
-"""Motion between the scans of a pair that is larger than noise, m and rad."""
-_MOST = 0.6
-"""Share of a stretch's pairs from which it is reported."""
-_LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
-"""Pairs and seconds of a lasting difference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,28 +117,53 @@ class Pairs(Table):
     @property
     def measured(self) -> Bools:
         """Which pairs measure a motion."""
-        return self.share >= _SHARE
+        return self.share >= PairPolicy.matching
+
+    def within(self, start: float, end: float) -> Bools:
+        """Return which pairs (e,) measure a motion between two times, s."""
+        return self.measured & (self.start >= start) & (self.end <= end)
+
+    def seen(self, start: float, end: float) -> bool:
+        """Return whether scans show if the robot moves between two times, s."""
+        return 2 * int(self.within(start, end).sum()) >= PairPolicy.lasting
+
+    @property
+    def way_ratio(self) -> float:
+        """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
+        own = self.rows(self.measured)
+        return undiluted(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0], _NAN)
+
+    @property
+    def turn_ratio(self) -> tuple[float, float]:
+        """The turn by the lidar / the turn by the wheels, and its standard deviation; nan where clear turns are too few."""
+        own = self.rows(self.measured)
+        each = ratios(own.wheels[:, 2:], own.lidar[:, 2:], PairPolicy.clear[1])[1]
+        ratio = undiluted(own.wheels[:, 2:], own.lidar[:, 2:], PairPolicy.clear[1], _NAN)
+        return ratio, sigma_of_median(each) if len(each) else _NAN
 
 
-def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[float, float]]:
+def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
     """Return the stretches (first and last stamp, s) in which the wheels count nothing."""
     steps, stamps = odometry.steps, odometry.stamps
-    way, turn = (np.concatenate([[0.0], np.cumsum(s)]) for s in (np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])))
-    before, after = (np.interp(stamps + d, stamps, np.arange(len(stamps))) for d in (-_HALF, _HALF))
-    number = np.arange(len(stamps))
+    before, after = (np.interp(stamps + d, stamps, np.arange(len(stamps))) for d in (-0.5, 0.5))
     moving = np.zeros(len(stamps), dtype=bool)
-    for sums, still in ((way, _STILL[0]), (turn, _STILL[1])):
+    for size, still in zip((np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])), PairPolicy.still, strict=True):
+        sums, number = np.concatenate([[0.0], np.cumsum(size)]), np.arange(len(stamps))
         moving |= np.interp(after, number, sums) - np.interp(before, number, sums) > still
     # Half a second before and after a stretch without motion around it there was none either.
-    runs = [(float(stamps[a]) - _EDGE, float(stamps[b - 1]) + _EDGE) for a, b in runs_of(~moving)]
-    runs = [(max(a, float(stamps[0])), min(b, float(stamps[-1]))) for a, b in runs]
-    return [(a, b) for a, b in runs if b - a >= least]
+    runs = [(max(stamps[a] - 0.5, stamps[0]), min(stamps[b - 1] + 0.5, stamps[-1])) for a, b in runs_of(~moving)]
+    return [(float(a), float(b)) for a, b in runs if b - a >= least]
+
+
+def show_motion(scans: LaserScans | None) -> bool:
+    """Return whether scans are enough, and have beams enough, to show motion."""
+    return scans is not None and len(scans.stamps) >= PairPolicy.scans and scans.ranges.shape[1] >= PairPolicy.beams
 
 
 def compare(log: SensorLog) -> Pairs | None:
     """Match pairs of scans spread over the recording; None where there are too few scans."""
     scans = log.scans
-    if scans is None or len(scans.stamps) < 20 or scans.ranges.shape[1] < 30:
+    if scans is None or not show_motion(scans):
         return None
     middle = scans.middles
     first, second = _chosen(log, middle)
@@ -124,9 +171,9 @@ def compare(log: SensorLog) -> Pairs | None:
         return None
     wheels = log.odometry.motion(middle[first], middle[second])
     by_wheels, good = scan_steps(scans, log.mounting, first, second, wheels)
-    poor = np.flatnonzero(good < _CLEAR_SHARE)
+    poor = np.flatnonzero(good < PairPolicy.clear_share)
     by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], np.zeros((len(poor), 3)))
-    better = rest > good[poor] + _GAIN
+    better = rest > good[poor] + PairPolicy.gain
     better[better] = _fit_better(log, first[poor[better]], second[poor[better]], by_rest[better], by_wheels[poor[better]])
     by_wheels[poor[better]], good[poor[better]] = by_rest[better], rest[better]
     return Pairs(middle[first], middle[second], by_wheels, wheels, good)
@@ -141,81 +188,66 @@ def _fit_better(log: SensorLog, first: Ints, second: Ints, one: Floats, other: F
     assert log.scans is not None
     a, b = (directional_shares(log.scans, log.mounting, first, second, motion) for motion in (one, other))
     near, far = (misfits(log.scans, log.mounting, first, second, motion) for motion in (one, other))
-    return np.asarray((a > b + _GAIN) & (a > _EVERYWHERE) & _clearly_worse(far, near))
+    return np.asarray((a > b + PairPolicy.gain) & (a > 0.5) & _clearly_worse(far, near))
+
+
+def _clearly_worse(one: Floats, other: Floats) -> Bools:
+    """Return which pairs (e,) match worse at mean square distances one than at the other, m^2, by more than noise.
+
+    Two scans of a robot at rest differ by the noise of its lidar, and some motion fits that better.
+    """
+    return one > np.maximum(2.0 * other, PairPolicy.noise**2)
 
 
 def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
     """Choose the pairs: some everywhere, some in every stretch in which the wheels stand."""
     odometry = log.odometry
     inside = (middle >= odometry.stamps[0]) & (middle <= odometry.stamps[-1])
-    period = max(float(np.median(np.diff(middle))), 1e-3)
+    period = _period(middle)
     apart = max(1, round(_span(odometry) / period))
     first = np.flatnonzero(inside[:-apart] & inside[apart:] & (middle[apart:] - middle[:-apart] < 3.0 * apart * period))
-    spread = first[:: max(1, len(first) // _PAIRS)]
-    extra = [np.zeros(0, dtype=np.intp)]
-    for a, b in sorted(standing(odometry), key=lambda run: run[0] - run[1])[:_STRETCHES]:
+    chosen = [first[:: max(1, len(first) // PairPolicy.pairs)]]
+    for a, b in sorted(standing(odometry), key=lambda run: run[0] - run[1])[: PairPolicy.stands]:
         own = first[(middle[first] > a) & (middle[first + apart] < b)]
-        extra.append(own[:: max(1, len(own) // _PAIRS_STANDING)])
-    chosen = np.unique(np.concatenate([spread, *extra]))
-    return chosen, chosen + apart
+        chosen.append(own[:: max(1, len(own) // PairPolicy.per_stand)])
+    first = np.unique(np.concatenate(chosen))
+    return first, first + apart
 
 
-_SPEED_OVER = 1.0
-"""Time over which speeds are taken, s: over shorter ones rounded odometry stands, or leaps."""
+def _period(middle: Floats) -> float:
+    """Return the usual time between scans, s; a millisecond at least."""
+    return max(float(np.median(np.diff(middle))), 1e-3)
 
 
 def _span(odometry: Odometry) -> float:
-    """Return the time between the scans of a pair, s, in which the robot usually drives a little way."""
+    """Return the time between the scans of a pair, s, in which the robot usually drives a little way.
+
+    Speeds are taken over a second: over shorter times rounded odometry stands, or leaps.
+    """
     stamps = odometry.stamps
     # Not every second of the time from first to last: one false stamp may lie years away.
-    at = stamps[0] + np.unique((stamps - stamps[0]) // _SPEED_OVER) * _SPEED_OVER
+    at = stamps[0] + np.unique((stamps - stamps[0]) // 1.0)
     at = at[at < stamps[-1]]
     place = np.column_stack([np.interp(at, stamps, column) for column in odometry.poses[:, :2].T])
-    speeds = (np.hypot(*np.diff(place, axis=0).T) / _SPEED_OVER)[np.diff(at) < 1.5 * _SPEED_OVER]
-    moving = speeds > _STILL[0]
-    speed = float(np.median(speeds[moving])) if moving.any() else 0.3
-    return float(np.clip(_APART / max(speed, 1e-3), 0.1, 1.0))
-
-
-def seen(pairs: Pairs, start: float, end: float) -> bool:
-    """Return whether scans show if the robot moves between two times, s."""
-    return int(_within(pairs, start, end).sum()) >= _FEW
-
-
-def _within(pairs: Pairs, start: float, end: float) -> Bools:
-    """Return which pairs (e,) measure a motion between two times, s."""
-    return pairs.measured & (pairs.start >= start) & (pairs.end <= end)
-
-
-_FEW = 3
-"""Least number of pairs of scans for a result."""
+    speeds = np.hypot(*np.diff(place, axis=0).T)[np.diff(at) < 1.5]
+    moving = speeds > PairPolicy.still[0]
+    least, most = PairPolicy.spans
+    return float(np.clip(PairPolicy.apart / np.median(speeds[moving]), least, most)) if moving.any() else most
 
 
 def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
-    """Return the stretches in which the wheels stand and the scans move."""
-    moving = (np.hypot(*pairs.lidar[:, :2].T) > _SEEN_MOVING[0]) | (np.abs(pairs.lidar[:, 2]) > _SEEN_MOVING[1])
+    """Return the stretches in which the wheels stand and the scans move, and match clearly worse if the robot stood."""
+    moving = (np.hypot(*pairs.lidar[:, :2].T) > PairPolicy.moving) | (np.abs(pairs.lidar[:, 2]) > PairPolicy.moving)
     found = []
     for a, b in standing(log.odometry):
-        own = _within(pairs, a, b)
-        if own.sum() < _FEW or np.mean(moving[own]) <= _MOST:
+        own = pairs.within(a, b)
+        if not pairs.seen(a, b) or np.mean(moving[own]) <= 0.5:
             continue
-        if np.mean(_not_at_rest(log, pairs.rows(own & moving))) * np.mean(moving[own]) > _MOST:
+        moved = pairs.rows(own & moving)
+        by_lidar, at_rest = (_misfits(log, moved, motion) for motion in (moved.lidar, 0.0 * moved.lidar))
+        if np.mean(_clearly_worse(at_rest, by_lidar)) * np.mean(moving[own]) > 0.5:
             found.append((a, b))
     return found
-
-
-def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
-    """Return which pairs (e,) match clearly worse if the robot stood: about a single column it may turn as well.
-
-    Two scans of a robot at rest differ by the noise of its lidar, and some motion fits that better.
-    """
-    moving, rest = (_misfits(log, pairs, motion) for motion in (pairs.lidar, 0.0 * pairs.lidar))
-    return _clearly_worse(rest, moving)
-
-
-def _clearly_worse(one: Floats, other: Floats) -> Bools:
-    """Return which pairs (e,) match worse at mean square distances one than at the other, m^2, by more than noise."""
-    return one > np.maximum(_CLEARLY_WORSE * other, _NOISE**2)
 
 
 def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
@@ -225,67 +257,76 @@ def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
     return misfits(log.scans, log.mounting, first, second, motion)
 
 
-_NOISE = 0.02
-"""Rms distance of matches of two scans from one place, m: lidars of robots have 1 to 2 cm."""
-_CLEARLY_WORSE = 2.0
-"""Factor between the mean square distances of matches at two motions from which one of them is wrong."""
-
-
 def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> list[Fact]:
     """Tell where wheels and lidar measure different motions for long, one factor for all taken out.
 
     Along a bare wall any motion matches two scans of few rays, that of the wheels as well as that which the lidar seems to
     measure; such pairs show nothing, where the log with their scans is given.
     """
-    own = pairs.rows(pairs.measured)
-    if len(own.start) < 4 * _LEAST_PAIRS:
+    own, lasting = pairs.rows(pairs.measured), PairPolicy.lasting
+    if len(own.start) < 2 * PairPolicy.enough:
         return []
-    parts = slice(0, 2), slice(2, 3)
-    way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], _CLEAR_MOTION, 1.0) for p in parts)
+    parts = slice(0, 2), slice(2, None)
+    way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
-    off, larger = own.lidar - wheels, np.maximum(np.abs(own.lidar), np.abs(wheels))
-    bad = np.hypot(off[:, 0], off[:, 1]) > _ABSOLUTE[0] + _RELATIVE * np.hypot(larger[:, 0], larger[:, 1])
-    bad |= np.abs(off[:, 2]) > _ABSOLUTE[1] + _RELATIVE * larger[:, 2]
+    bad = np.zeros(len(own.start), dtype=bool)
+    for part, allowed in zip(parts, PairPolicy.allowed, strict=True):
+        off, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
+        bad |= off > allowed + PairPolicy.relative * np.maximum(*sizes)
     if log is not None and bad.any():
         by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
-        bad[bad] = by_wheels > _WORSE_BY_WHEELS * by_lidar
-    smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
-    runs = [(own.start[a], own.end[b - 1]) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
-    stretches = [(float(a), float(b)) for a, b in runs]
-    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches)] if runs else []
-
-
-_WORSE_BY_WHEELS = 1.2
-"""Factor between the mean square distances of matches as wheels and lidar measure the motion from which the lidar shows it."""
+        bad[bad] = by_wheels > PairPolicy.worse * by_lidar
+    smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
+    runs = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs_of(smooth)]
+    stretches = [(a, b) for a, b in runs if b - a >= lasting]
+    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches)] if stretches else []
 
 
 def unmatched(pairs: Pairs) -> list[Fact]:
     """Tell where scans a short time apart hardly ever match; pairs with too few readings do not count."""
     seen = pairs.share[pairs.share > 0.0]
-    if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
+    if len(seen) < 2 * PairPolicy.enough or (most := float(np.quantile(seen, 0.9))) >= PairPolicy.noise_share:
         return []
     return [Fact.of("scans-do-not-match", share=most)]
 
 
-_NOISE_SHARE = 0.4
-"""Share of matching points that one pair of scans in ten exceeds in any place; noise gives 0.1 to 0.2."""
+def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odometry, OdometryBreaks]:
+    """Return the odometry with the motion from scan to scan in stretches in which the wheels were lost."""
+    odometry, scans = log.odometry, log.scans
+    assert scans is not None
+    stamps, breaks, middle = odometry.stamps, [OdometryBreaks.none()], scans.middles
+    for a, b in stretches:
+        begin, end = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
+        inside = np.append(np.arange(begin, end, max(1, round(PairPolicy.replaced / _period(middle)))), end)
+        inside = inside[(middle[inside] >= stamps[0]) & (middle[inside] <= stamps[-1])]
+        if len(inside) < 2:
+            continue
+        steps, matched = _smooth_steps(log, inside)
+        at = middle[inside]
+        own = np.flatnonzero((stamps > at[0]) & (stamps <= at[-1]))
+        moved = se2.interpolate_trajectory(at, se2.chain(np.zeros_like(steps[0]), steps), stamps[own])
+        moved = se2.compose(odometry.poses[max(own[0] - 1, 0)], moved)
+        rest = se2.compose(moved[-1], se2.between(odometry.poses[own[-1]], odometry.poses[own[-1] + 1 :]))
+        odometry = Odometry(stamps, np.concatenate([odometry.poses[: own[0]], moved, rest]))
+        before = np.clip(np.searchsorted(stamps, at[1:]) - 1, 0, len(stamps) - 1)
+        sigma = np.where(matched[:, None], PairPolicy.step_sigma, PairPolicy.unknown_sigma)
+        breaks.append(OdometryBreaks(stamps[before], sigma))
+    return odometry, OdometryBreaks.of_all(breaks)
 
 
-def way_ratio(pairs: Pairs) -> float:
-    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
-    own = pairs.rows(pairs.measured)
-    return undiluted(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY, float("nan"))
+def _smooth_steps(log: SensorLog, chosen: Ints) -> tuple[Floats, Bools]:
+    """Return the motions between chosen scans, and which of them match; the others go on as those before and after.
 
-
-def turn_ratio(pairs: Pairs) -> tuple[float, float]:
-    """Return the turn by the lidar / the turn by the wheels, and its standard deviation; nan where clear turns are too few."""
-    own = pairs.rows(pairs.measured)
-    each = ratios(own.wheels[:, 2:], own.lidar[:, 2:], _CLEAR_TURN)[1]
-    ratio = undiluted(own.wheels[:, 2:], own.lidar[:, 2:], _CLEAR_TURN, float("nan"))
-    return ratio, sigma_of_median(each) if len(each) else float("nan")
-
-
-_CLEAR_MOTION = 0.03
-"""Way, m, or turn, rad, of most pairs of a robot that drives or turns."""
-_CLEAR_WAY, _CLEAR_TURN = 0.05, 0.1
-"""Distances, m, and turns, rad, that are large enough for a ratio."""
+    They are measured twice: the second time directions that scans do not measure continue the motion before and after.
+    """
+    assert log.scans is not None
+    first, second = chosen[:-1], chosen[1:]
+    steps, share = scan_steps(log.scans, log.mounting, first, second, np.zeros((len(first), 3)), PairPolicy.searches)
+    half = PairPolicy.lasting // 2
+    padded = np.pad(steps, ((half, half), (0, 0)), mode="edge")
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=2)
+    again, better = scan_steps(log.scans, log.mounting, first, second, usual)
+    taken = np.where((better >= share - PairPolicy.gain)[:, None], again, steps)
+    # No step is longer than a metre: that is 4 m/s.
+    matched = (np.maximum(share, better) >= 0.5) & (np.hypot(taken[:, 0], taken[:, 1]) <= 1.0)
+    return np.where(matched[:, None], taken, usual), matched

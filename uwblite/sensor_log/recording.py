@@ -5,11 +5,11 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, require_finite, require_index, require_type
+from ..arrays import Floats, Table, concatenated, require_finite, require_index, require_type
 from ..config import documented
 from ..errors import DataError
 from ..findings import Fact
@@ -43,7 +43,7 @@ class LogNotes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryBreaks:
+class OdometryBreaks(Table):
     """Steps of the odometry that were predicted, not measured."""
 
     stamps: Floats
@@ -59,9 +59,8 @@ class OdometryBreaks:
     @staticmethod
     def of_all(parts: "Sequence[OdometryBreaks]") -> "OdometryBreaks":
         """Return the breaks of one or more parts, in the order of time."""
-        stamps, sigma = np.concatenate([b.stamps for b in parts]), np.concatenate([b.sigma for b in parts])
-        order = np.argsort(stamps, kind="stable")
-        return OdometryBreaks(stamps[order], sigma[order])
+        whole = concatenated(parts)
+        return whole.rows(np.argsort(whole.stamps, kind="stable"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,9 +76,6 @@ class Screening:
     """Turn by the lidar / turn by the wheels, and its standard deviation; nan where nothing shows it."""
     in_bursts: tuple[str, ...] = ()
     """Sensors whose stamps are times of receipt in bursts: no clock offset can be estimated against them."""
-
-
-_Sensor = TypeVar("_Sensor", Odometry, UwbRanges, LaserScans, Gyro)
 
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20
@@ -148,9 +144,9 @@ class SensorLog:
         if self.scans is not None:
             _check_geometry(self.scans)
         for name, places in (("laser", self.mounting.T_base_laser[:2]), ("tag", self.mounting.tags)):
-            if not np.all(np.abs(places) <= _FARTHEST_ON_ROBOT):
-                away = f"{np.abs(places).max():.3g} m from the base, on which it is mounted"
-                raise DataError(f"the {name} stands {away}; lengths are in m, not mm")
+            if not (away := float(np.abs(places).max())) <= _FARTHEST_ON_ROBOT:
+                where = f"{away:.3g} m from the base, on which it is mounted"
+                raise DataError(f"the {name} stands {where}; lengths are in m, not mm")
         require_finite(self.mounting.T_base_laser, "mounting.T_base_laser")
         require_finite(self.mounting.tags, "mounting.tag_position and more_tags")
         for name in (*(() if self.ranges is None else self.ranges.anchor_ids), *self.mounting.anchor_heights):
@@ -163,12 +159,11 @@ class SensorLog:
 
     def with_odometry_times(self, factor: float) -> "SensorLog":
         """Return the same recording with the odometry's lengths multiplied by a factor."""
-        lengths = np.array([factor, factor, 1.0])
-        odometry, screening = replace(self.odometry, poses=self.odometry.poses * lengths), self.screening
+        lengths, screening = np.array([factor, factor, 1.0]), self.screening
         if screening is not None:
             breaks = replace(screening.breaks, sigma=screening.breaks.sigma * lengths)
             screening = replace(screening, breaks=breaks, lidar_by_wheels=screening.lidar_by_wheels / factor)
-        return replace(self, odometry=odometry, screening=screening)
+        return replace(self, odometry=replace(self.odometry, poses=self.odometry.poses * lengths), screening=screening)
 
     def with_time_unit(self, unit: float) -> "SensorLog":
         """Return the same recording with its stamps multiplied by the seconds of their unit."""
@@ -183,7 +178,7 @@ class SensorLog:
     def crop(self, start: float = -np.inf, end: float = np.inf) -> "SensorLog":
         """Return the part of the recording with start <= stamp <= end, s."""
 
-        def cut(sensor: _Sensor) -> _Sensor:
+        def cut(sensor: Any) -> Any:
             first, last = np.searchsorted(sensor.stamps, start, "left"), np.searchsorted(sensor.stamps, end, "right")
             return sensor.rows(slice(int(first), int(last)))
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,14 +53,14 @@ SHORTEST_RANGE, LONGEST_RANGE = 0.02, 200.0
 """m; no radio of this kind reaches farther, and one that reports zero has missed its partner."""
 
 
-def plausible(ranges: Floats) -> Bools:
+def plausible(ranges: Floats, longest: float = LONGEST_RANGE) -> Bools:
     """Return which readings (m,) of a radio, m, can be distances."""
-    return (ranges > SHORTEST_RANGE) & (ranges < LONGEST_RANGE)
+    return (ranges > SHORTEST_RANGE) & (ranges < longest)
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class UwbRanges:
+class UwbRanges(Table):
     """Distances between the tag on the robot and fixed anchors."""
 
     stamps: Floats
@@ -97,10 +97,9 @@ class UwbRanges:
 
     def rows(self, which: slice | Ints | Bools) -> "UwbRanges":
         """Return some of the ranges, with the anchors that they are to."""
-        used, anchor = np.unique(self.anchor[which], return_inverse=True)
-        ids = tuple(self.anchor_ids[k] for k in used)
-        tag = None if self.tag is None else self.tag[which]
-        return UwbRanges(self.stamps[which], anchor.astype(np.intp), self.ranges[which], self.quality[which], ids, tag)
+        some = Table.rows(self, which)
+        used, anchor = np.unique(some.anchor, return_inverse=True)
+        return replace(some, anchor=anchor.astype(np.intp), anchor_ids=tuple(self.anchor_ids[k] for k in used))
 
 
 @documented

@@ -1,33 +1,24 @@
 """The requests and answers of `uwblite view`, without a socket."""
 
+import itertools
 import json
-import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..constraints import Constraints
-from ..errors import ConfigError, UwbliteError
+from ..errors import ConfigError
 from ..io.files import write_text
 from ..io.results import is_of_result
 from ..io.source import read_settings
 from ..io.stored_result import StoredResult, read_result
-from .edits import edits_text, parse_edits, with_anchor, with_closure
-from .page import page
-from .remap import remap_command
-from .requests import HTML, PNG, Response, json_response, path_of, refusal, text_response
+from .edits import edits_text, parse_edits, remap_command, with_anchor, with_closure
+from .pages import view_page
 from .shown_results import ShownResult, described, shown_result
+from .web import HTML, JSON, PNG, REPORT_POLICY, TEXT, Page, Response, json_response
 
-_TYPES = {
-    ".html": HTML,
-    ".png": PNG,
-    ".json": "application/json",
-    ".csv": "text/plain; charset=utf-8",
-    ".toml": "text/plain; charset=utf-8",
-    ".tum": "text/plain; charset=utf-8",
-    ".yaml": "text/plain; charset=utf-8",
-}
+_TYPES = {".html": HTML, ".png": PNG, ".json": JSON, **dict.fromkeys((".csv", ".toml", ".tum", ".yaml"), TEXT)}
 _FARTHEST = 1e7
 """m; no anchor is pinned beyond it."""
 
@@ -41,68 +32,60 @@ class Job(Protocol):
     def output(self) -> str:
         """Return the last line of its output."""
 
+    def stop(self) -> None:
+        """End it."""
 
-@dataclass(slots=True)
-class App:
-    """The state behind the page."""
 
-    results: list[ShownResult]
-    recordings: dict[str, Path]
-    """Recordings at hand, by the SHA-256 of their bytes."""
-    constraints: Path
-    """The file that edits go to."""
-    launch: Callable[[Sequence[str]], Job]
-    """Starts `uwblite` with these arguments."""
-    token: str
-    host: str = ""
-    """Name and port under which the page is asked for, such as 127.0.0.1:8000."""
-    names: tuple[str, ...] | None = None
-    own: str = ""
-    """The user's part of the constraints file."""
-    edits: Constraints = field(default_factory=Constraints)
-    job: Job | None = None
-    making: Path | None = None
+class App(Page):
+    """The page of `uwblite view`: results, recordings by the SHA-256 of their bytes, and the file that edits go to.
 
-    def load(self) -> None:
-        """Read the constraints file, where there is one."""
-        if self.constraints.is_file():
-            self.own, self.edits = parse_edits(read_settings(str(self.constraints)), str(self.constraints))
+    Raises
+    ------
+    ConfigError : the constraints file is there and is none.
+    """
 
-    def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
-        """Answer a request.
+    def __init__(
+        self,
+        results: Sequence[StoredResult],
+        recordings: dict[str, Path],
+        constraints: Path,
+        launch: Callable[[Sequence[str]], Job],
+    ) -> None:
+        super().__init__()
+        self.recordings, self.constraints, self._launch = recordings, constraints, launch
+        self.results: list[ShownResult] = []
+        self.own, self.edits = "", Constraints()
+        """The user's part of the constraints file, and what the page changed."""
+        self.job: Job | None = None
+        self._making: Path | None = None
+        for result in results:
+            self._show(result)
+        if constraints.is_file():
+            self.own, self.edits = parse_edits(read_settings(str(constraints)), str(constraints))
 
-        Parameters
-        ----------
-        headers : with names in lower case.
-        """
-        if refused := refusal(self, self.token, method, headers):
-            return refused
-        path = path_of(target)
-        try:
-            return self._post(path, body) if method == "POST" else self._get(path)
-        except UwbliteError as error:
-            return json_response({"error": str(error)}, 400)
+    def _show(self, result: StoredResult) -> None:
+        self.results.append(shown_result(result, f"/result/{len(self.results)}/grid.png"))
 
-    def _get(self, path: str) -> Response:
+    def get(self, path: str) -> Response | None:
+        """Return the page, its state or a file of a result."""
         if path == "/":
-            return Response(200, _TYPES[".html"], page(self.token).encode())
+            return Response(HTML, view_page(self.token).encode())
         if path == "/state":
             return json_response(self._state())
-        parts = path.strip("/").split("/")
-        results = {str(k): shown for k, shown in enumerate(self.results)}
-        if len(parts) == 3 and parts[0] == "result" and parts[1] in results:
-            return self._file(results[parts[1]], parts[2])
-        return text_response("there is no such page", 404)
+        files = {f"/result/{k}/": shown for k, shown in enumerate(self.results)}
+        folder, slash, name = path.rpartition("/")
+        return self._file(files[folder + slash], name) if folder + slash in files else None
 
-    def _file(self, shown: ShownResult, name: str) -> Response:
+    def _file(self, shown: ShownResult, name: str) -> Response | None:
         """Return a file of a result; nothing but the names that a result may hold is looked for."""
         if name == "grid.png" and shown.grid_png is not None:
-            return Response(200, PNG, shown.grid_png)
+            return Response(PNG, shown.grid_png)
         file = shown.result.folder / name
         kind = _TYPES.get(file.suffix)
         if not is_of_result(name) or kind is None or not file.is_file() or file.is_symlink():
-            return text_response("there is no such file in this result", 404)
-        return Response(200, kind, file.read_bytes(), framed=file.suffix == ".html")
+            return None
+        answer = Response(kind, file.read_bytes())
+        return replace(answer, policy=REPORT_POLICY) if kind == HTML else answer
 
     def _state(self) -> dict[str, Any]:
         self._collect()
@@ -114,7 +97,8 @@ class App:
             "job": None if self.job is None else {"code": self.job.code(), "output": self.job.output()},
         }
 
-    def _post(self, path: str, body: bytes) -> Response:
+    def post(self, path: str, body: bytes) -> Response | None:
+        """Write a wish for a closure or an anchor into the constraints file, or map again."""
         wish = _parsed(body)
         if path == "/closure":
             closures = self._chosen(wish).result.closures
@@ -125,7 +109,7 @@ class App:
         elif path == "/map":
             self._start(self._chosen(wish))
         else:
-            return text_response("there is no such page", 404)
+            return None
         return json_response(self._state())
 
     def _chosen(self, wish: dict[str, Any]) -> ShownResult:
@@ -137,12 +121,11 @@ class App:
             raise ConfigError("there is no such anchor in this result")
         if place is None:
             return with_anchor(self.edits, str(name), None)
-        sigma = wish.get("sigma", 0.05)
-        numbers = [*place, sigma] if isinstance(place, list) and len(place) == 2 else []
-        good = all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _FARTHEST for v in numbers)
-        if not numbers or not good or sigma <= 0:
-            raise ConfigError("an anchor is pinned at two numbers, x and y in metres, with a positive sigma")
-        return with_anchor(self.edits, str(name), (float(place[0]), float(place[1])), float(sigma))
+        good = isinstance(place, list) and len(place) == 2
+        good = good and all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _FARTHEST for v in place)
+        if not good:
+            raise ConfigError("an anchor is pinned at two numbers, x and y in metres")
+        return with_anchor(self.edits, str(name), (float(place[0]), float(place[1])))
 
     def _keep(self, edits: Constraints) -> None:
         """Write the constraints file, then hold the edits to be true."""
@@ -154,33 +137,19 @@ class App:
         if self.job is not None and self.job.code() is None:
             raise ConfigError("a map is being made already")
         folder = shown.result.folder.resolve()
-        out = next(p for k in range(2, 10_000) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
+        out = next(p for k in itertools.count(2) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
         if not self.constraints.exists():
             self._keep(self.edits)
-        self.job = self.launch(remap_command(shown.result.report, folder, self.recordings, self.constraints, out))
-        self.making = out
+        self.job = self._launch(remap_command(shown.result.report, folder, self.recordings, self.constraints, out))
+        self._making = out
 
     def _collect(self) -> None:
         """Put a result that has been finished beside the others."""
-        if self.job is None or self.making is None or self.job.code() is None:
+        if self.job is None or self._making is None or self.job.code() is None:
             return
-        made, self.making = self.making, None
+        made, self._making = self._making, None
         if self.job.code() in (0, 3):
-            self.results.append(shown_result(read_result(made)))
-
-
-def app_of(
-    results: Sequence[StoredResult], recordings: dict[str, Path], constraints: Path, launch: Callable[[Sequence[str]], Job]
-) -> App:
-    """Return the page's state, with a token of its own.
-
-    Raises
-    ------
-    ConfigError : the constraints file is there and is none.
-    """
-    app = App([shown_result(r) for r in results], recordings, constraints, launch, secrets.token_urlsafe(24))
-    app.load()
-    return app
+            self._show(read_result(made))
 
 
 def _parsed(body: bytes) -> dict[str, Any]:

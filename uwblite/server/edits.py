@@ -1,10 +1,14 @@
-"""What the page changes: closures that are rejected or forced and anchors that are pinned, as a constraints file.
+"""What the page of `uwblite view` changes: closures rejected or forced and anchors pinned, and the command that maps so.
 
 The file may hold constraints of the user's own. They stay as they are, above a line that marks where the page's begin.
 """
 
 import json
+import shlex
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from ..constraints import Constraints, ForbiddenClosure, GivenAnchor, GivenClosure
 from ..errors import ConfigError
@@ -14,8 +18,19 @@ from ..io.stored_result import StoredClosure
 MARK = "# Below this line: made by uwblite view, which writes it again. Constraints of your own belong above."
 _FORCED_SIGMA = (0.1, 0.1, 0.05)
 """m, m, rad; of a closure that was forced: its match is taken at its word."""
+_PINNED_SIGMA = 0.05
+"""m; of an anchor that was pinned."""
+_SAME = 1e-4
+"""s by which stamps that were written and read again may differ."""
 _REJECTED_WITHIN = 1.0
 """s; a rejected closure forbids its own pair of places and not those driven through before and after."""
+_REPEATED = {
+    *("--every-nth-scan", "--laser-pose", "--laser-flipped", "--tag", "--anchor-height", "--anchors-from", "--odometry-topic"),
+    *("--scan-topic", "--imu-topic", "--uwb-topic", "--uwb-mapping", "--base-frame"),
+}
+"""Options of the earlier command that hold again."""
+_FLAG = "--laser-flipped"
+"""The one without a value."""
 
 
 def parse_edits(text: str, path: str = "") -> tuple[str, Constraints]:
@@ -68,21 +83,20 @@ def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Const
     return replace(left, closures=(*left.closures, forced))
 
 
-def with_anchor(edits: Constraints, name: str, position: tuple[float, float] | None, sigma: float = 0.05) -> Constraints:
+def with_anchor(edits: Constraints, name: str, place: tuple[float, float] | None) -> Constraints:
     """Return the edits with an anchor pinned at a place, m, or with None no longer pinned."""
     others = tuple(a for a in edits.anchors if a.id != name)
-    return replace(edits, anchors=others if position is None else (*others, GivenAnchor(name, position, sigma)))
+    return replace(edits, anchors=others if place is None else (*others, GivenAnchor(name, place, _PINNED_SIGMA)))
 
 
 def wish_for(edits: Constraints, closure: StoredClosure) -> str:
-    """Return the edit of a closure: 'reject', 'force' or 'leave'."""
     if any(_same(c, closure) for c in edits.forbidden):
         return "reject"
     return "force" if any(_same(c, closure) for c in edits.closures) else "leave"
 
 
 def _same(one: GivenClosure | ForbiddenClosure, closure: StoredClosure) -> bool:
-    near = all(abs(a - b) < 1e-4 for a, b in zip(one.stamps, closure.stamps, strict=True))
+    near = all(abs(a - b) < _SAME for a, b in zip(one.stamps, closure.stamps, strict=True))
     return near and tuple(one.recordings) == closure.recordings
 
 
@@ -92,3 +106,33 @@ def _ends(c: GivenClosure | ForbiddenClosure) -> str:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+
+
+def remap_command(report: dict[str, Any], folder: Path, recordings: dict[str, Path], constraints: Path, out: Path) -> list[str]:
+    """Return the arguments of `uwblite` that map a result's recordings again, in their order.
+
+    Recordings at hand go by the SHA-256 of their bytes; config.toml in the result's folder holds the settings.
+
+    Raises
+    ------
+    ConfigError : a recording is not at hand.
+    """
+    inputs = report.get("inputs") or ()
+    lost = [str(i.get("source", "?")) for i in inputs if i.get("sha256") not in recordings]
+    if lost or not inputs:
+        raise ConfigError(f"the recording is not at hand: {', '.join(lost) or '?'}; name it: uwblite view DIR RECORDING")
+    words, config = ["map", *(str(recordings[i["sha256"]]) for i in inputs)], folder / "config.toml"
+    words += ["--config", str(config)] if config.is_file() else []
+    return [*words, *_repeated(str(report.get("command", ""))), "--constraints", str(constraints), "--out", str(out)]
+
+
+def _repeated(command: str) -> list[str]:
+    """Return the options of an earlier command that hold again, as --option=value."""
+    try:
+        words: Sequence[str] = shlex.split(command)
+    except ValueError:
+        return []
+    pairs = [(word, word.partition("="), value) for word, value in zip(words, [*words[1:], ""], strict=True)]
+    return [
+        word if equals or name == _FLAG else f"{word}={value}" for word, (name, equals, _), value in pairs if name in _REPEATED
+    ]

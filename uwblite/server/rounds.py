@@ -4,11 +4,9 @@ The cost of a round is processor time, expected from the last one by the law
 
     c(T, n) ~ (T0 + T) share(n),    share(n) = min(1, (8 / n)^0.4)
 
-for T seconds of recording and every n-th scan; T0 stands for what any round takes. Up to every 8th scan the same keyframes
-are mapped, whence the 8. (Measured: a hall of 15 minutes takes 10 s with every 8th scan and 5.8 s with every 30th, one of
-5 minutes 4.6 s.) Scans are thinned out until a round fits into a tenth of PATIENCE; where that is not enough, rounds become
-rarer. In either case a round is expected to take a tenth of the time since the last one at most, so that mapping takes a
-tenth of one core and the recorder keeps the rest.
+for T seconds of recording and every n-th scan; T0 stands for what any round takes, and up to every 8th scan the same keyframes
+are mapped. Scans are thinned out until a round fits into a tenth of PATIENCE; where that is not enough, rounds become rarer.
+In either case a round is expected to take a tenth of the time since the last one at most.
 """
 
 from dataclasses import dataclass
@@ -52,10 +50,8 @@ def next_thinning(last: Round | None, recorded: float, now: float, at_rest: floa
 
     Parameters
     ----------
-    last : the last round; None = this would be the first.
-    recorded : s of recording that there are.
+    recorded, at_rest : s of recording that there are, and since the log has grown.
     now : s, on the clock of the rounds.
-    at_rest : s since the log has grown.
     """
     if last is None:
         return 1 if recorded >= FIRST_AFTER else None

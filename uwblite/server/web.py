@@ -1,4 +1,9 @@
-"""A page on a socket: the standard library's HTTP server, on the loopback address where nothing else is asked for.
+"""Pages on a socket: answers, the rules for access, and the standard library's HTTP server.
+
+A page is for this computer alone unless it is opened to the network on purpose. In either case a request must name the
+server as its Host by an address or a name that it has: a page elsewhere whose own name is resolved to this computer cannot
+(DNS rebinding). A request of another page carries a foreign Origin and is refused. What changes anything must be a POST
+with JSON and the token that only the served page knows.
 
 Connections, threads and what a request may bring are bounded. Where all places are taken, the connection that has asked for
 nothing for the longest time gives way: neither half requests nor streams that nobody reads keep others out, and a browser whose
@@ -6,13 +11,21 @@ stream was ended opens it again.
 """
 
 import io
+import ipaddress
+import json
+import secrets
 import socket
 import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import unquote
 
-from .requests import Page, Response, text_response
+from ..errors import UwbliteError
 
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 1 << 16
@@ -24,14 +37,106 @@ _MOST_HEAD = 1 << 15
 _PATIENCE = 10.0
 """s that a connection may stay silent, or not take what is sent to it."""
 _FULL = b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 5\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
-_PAGE = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src 'self' data:; connect-src 'self';"
-    " frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-)
-_REPORT = (
-    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:;"
-    " base-uri 'none'; form-action 'none'"
-)
+_INLINE = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+HTML, TEXT, PNG, JSON = "text/html; charset=utf-8", "text/plain; charset=utf-8", "image/png", "application/json"
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What is sent back."""
+
+    kind: str
+    body: bytes
+    status: HTTPStatus = HTTPStatus.OK
+    policy: str = f"{_INLINE}img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'"
+    stream: Callable[[], Iterator[bytes]] | None = None
+    """In place of a body: what goes out piece by piece for as long as somebody listens."""
+
+
+REPORT_POLICY = f"sandbox allow-scripts; {_INLINE}img-src data:"
+"""Of a report, which brings its own styles and scripts and may do nothing else."""
+
+
+class Page(ABC):
+    """What a server answers for."""
+
+    def __init__(self) -> None:
+        self.token = secrets.token_urlsafe(24)
+        self.host = ""
+        """Name and port under which the page is asked for, such as 127.0.0.1:8000."""
+        self.names: tuple[str, ...] | None = None
+        """Under which other computers may ask, beside addresses; None = this computer alone may."""
+
+    @abstractmethod
+    def get(self, path: str) -> Response | None:
+        """Return what is found at a path."""
+
+    def post(self, path: str, body: bytes) -> Response | None:
+        """Change something, and return the answer; by default nothing can be changed."""
+        return None
+
+    def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
+        """Answer a request; names of headers are in lower case."""
+        if refused := refusal(self, self.token, method, headers):
+            return refused
+        path = unquote(target.partition("?")[0].partition("#")[0]) if target.startswith("/") else ""
+        try:
+            found = self.post(path, body) if method == "POST" else self.get(path)
+        except UwbliteError as error:
+            return json_response({"error": str(error)}, HTTPStatus.BAD_REQUEST)
+        return found or text_response("there is no such page", HTTPStatus.NOT_FOUND)
+
+
+def refusal(page: Page, token: str, method: str, headers: dict[str, str]) -> Response | None:
+    """Return the answer to a request that must not be answered; None where it may be."""
+    host, why, status = headers.get("host", ""), "", HTTPStatus.FORBIDDEN
+    kind = headers.get("content-type", "").partition(";")[0].strip()
+    if not _is_ours(page, host):
+        why = "this page is for this computer only" if page.names is None else "no such name here"
+    elif headers.get("origin") not in (None, f"http://{host}") or headers.get("sec-fetch-site") not in _OWN_SITES:
+        why = "another page may not ask"
+    elif method not in ("GET", "HEAD", "POST"):
+        why, status = "only GET, HEAD and POST are answered", HTTPStatus.METHOD_NOT_ALLOWED
+    elif method == "POST" and not secrets.compare_digest(headers.get("x-token", "").encode(), token.encode()):
+        why = "the token is missing: reload the page"
+    elif method == "POST" and kind != JSON:
+        why, status = "a POST must be application/json", HTTPStatus.UNSUPPORTED_MEDIA_TYPE
+    return text_response(why, status) if why else None
+
+
+_OWN_SITES = (None, "same-origin", "none")
+
+
+def _is_ours(page: Page, host: str) -> bool:
+    """Return whether a host and port are the server's; of one that is open every address is: no foreign name is one."""
+    if host.endswith("]") or ":" not in host:
+        host += ":80"  # which browsers leave out
+    name, _, port = host.rpartition(":")
+    if port != page.host.rpartition(":")[2]:
+        return False
+    return host == page.host or name == "localhost" or (page.names is not None and (name in page.names or _is_address(name)))
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True
+
+
+def json_response(value: Any, status: HTTPStatus = HTTPStatus.OK) -> Response:
+    return Response(JSON, json.dumps(value, allow_nan=False).encode(), status)
+
+
+def text_response(text: str, status: HTTPStatus) -> Response:
+    return Response(TEXT, text.encode(), status)
 
 
 class _Server(ThreadingHTTPServer):
@@ -119,12 +224,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a request, or close the connection: where a request ends must not be a matter of opinion."""
         length = self.headers.get("Content-Length", "0" if self.command != "POST" else "")
         number = length.isascii() and length.isdigit()
-        if fault := self._fault(number and not int(length[:9])) or ("" if number else "a length is a number"):
-            self._refuse(400, fault)
-        elif len(length) > 9 or int(length) > MOST_BYTES:
-            self._refuse(413, "too long")
+        # No number of more digits is looked at: reading it may take long.
+        size = int(length) if number and len(length) <= len(str(MOST_BYTES)) else MOST_BYTES + 1
+        if fault := self._fault(empty=size == 0) or ("" if number else "a length is a number"):
+            self._refuse(HTTPStatus.BAD_REQUEST, fault)
+        elif size > MOST_BYTES:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long")
         else:
-            self._answer(self.rfile.read(int(length)))
+            self._answer(self.rfile.read(size))
 
     do_POST = do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
 
@@ -137,7 +244,7 @@ class _Handler(BaseHTTPRequestHandler):
             return "a body is sent with its length"
         return "" if empty or self.command == "POST" else "only a POST has a body"
 
-    def _refuse(self, status: int, why: str) -> None:
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
         self.close_connection = True
         self._send(text_response(why, status))
 
@@ -156,11 +263,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection |= response.stream is not None
         if self.close_connection:
             self.send_header("Connection", "close")
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Referrer-Policy", "no-referrer")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-        self.send_header("Content-Security-Policy", _REPORT if response.framed else _PAGE)
+        for name, value in (*_HEADERS.items(), ("Content-Security-Policy", response.policy)):
+            self.send_header(name, value)
         self.end_headers()
         if self.command == "HEAD":
             return

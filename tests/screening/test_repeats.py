@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from helpers.told import told
 
-from uwblite.assessment.repairs import spans
-from uwblite.screening.stuck_sensors import (
-    _in_runs,
+from uwblite.assessment.facts import spans
+from uwblite.screening.repeats import (
     _mark,
-    _repeats,
-    _spread,
     _when,
-    without_bursts,
     without_lidar_marks,
     without_marks,
     without_own_body,
@@ -38,62 +34,6 @@ def scans(readings, stamps=None, nearest=0.05, farthest=30.0):
     readings = np.asarray(readings, dtype=np.float32)
     stamps = np.arange(float(len(readings))) if stamps is None else np.asarray(stamps, float)
     return LaserScans(stamps, readings, 0.0, 0.01, 0.0, nearest, farthest)
-
-
-@pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (3, 5, False), (4, 4, False), (7, 30, True)])
-def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spread):
-    """The last of each keeps its stamp; after a pause they are spread over the usual time."""
-    at = 10.0 + np.arange(bursts) * 2.0 + 30.0 * (np.arange(bursts) >= 3)
-    late = np.repeat(at, size)
-    found = _spread(late)
-    assert (found is not None) == spread
-    if found:
-        stamps, usual, between = found
-        assert (usual, between) == (size, 2.0)
-        np.testing.assert_allclose(stamps, (at[:, None] - 2.0 + 2.0 * np.arange(1, size + 1) / size).ravel())
-
-
-def test_bursts_of_both_sensors_are_named_and_single_stamps_stay():
-    late = np.repeat(np.arange(1.0, 11.0), 5)
-    odometry = Odometry(late, np.zeros((50, 3)))
-    done, facts = without_bursts(SensorLog(odometry, None, scans(np.ones((50, 3)), late)))
-    remarks = told(facts)
-    np.testing.assert_allclose(done.odometry.stamps, 0.2 * np.arange(1, 51))
-    np.testing.assert_allclose(done.scans.stamps, 0.2 * np.arange(1, 51))
-    assert [r.text.split(",")[0] for r in remarks] == [
-        "odometry readings come in bursts of about 5 with one stamp", "scans come in bursts of about 5 with one stamp",
-    ]  # fmt: skip
-    assert "every 1.00 s" in remarks[0].text
-    even = SensorLog(driving(), None, scans(np.ones((50, 3))))
-    assert without_bursts(even) == (even, [])
-
-
-@pytest.mark.parametrize("beams", [3, 32, 200])
-def test_scans_are_the_same_to_the_last_digit_or_not(beams):
-    rng = np.random.default_rng(beams)
-    readings = np.round(rng.uniform(1.0, 1.3, (300, beams)), 1)
-    readings[rng.random(readings.shape) < 0.1] = np.nan
-    again = rng.random(300) < 0.6
-    for k in np.flatnonzero(again[1:]) + 1:
-        readings[k] = readings[k - 1]
-        if k % 4 == 0:
-            readings[k, rng.integers(beams)] = 7.0
-    expected = [k > 0 and np.array_equal(readings[k], readings[k - 1], equal_nan=True) for k in range(300)]
-    assert _repeats(readings).tolist() == expected
-
-
-@pytest.mark.parametrize("least", [1, 2, 4])
-def test_runs_of_at_least_so_many(least):
-    flags = np.random.default_rng(least).random(200) < 0.7
-    text = "".join("x" if f else "." for f in flags)
-    expected = "".join(run if len(run) >= least else "." * len(run) for run in _runs(text))
-    assert "".join("x" if f else "." for f in _in_runs(flags, least)) == expected
-
-
-def _runs(text):
-    import re
-
-    return re.findall(r"x+|\.+", text)
 
 
 @pytest.mark.parametrize(("repeats", "seen", "left_out"), [(2, 10, 2), (1, 10, 0), (2, 9, 0), (5, 40, 5)])
@@ -130,11 +70,9 @@ def test_a_scan_written_twice_is_left_out_without_a_word():
     remarks = told(facts)
     np.testing.assert_array_equal(done.scans.stamps, np.arange(10.0))
     assert remarks == []
-    few = SensorLog(driving(), None, scans(np.ones((2, 40)), [1.0, 1.0]))
-    assert without_repeated_scans(few) == (few, [])
-    assert (
-        len(without_repeated_scans(SensorLog(driving(), None, scans(np.ones((3, 40)), [1.0, 1.0, 2.0])))[0].scans.stamps) == 2
-    )
+    for stamps in ([1.0], [1.0, 1.0], [1.0, 1.0, 2.0]):
+        few, _ = without_repeated_scans(SensorLog(driving(), None, scans(np.ones((len(stamps), 40)), stamps)))
+        np.testing.assert_array_equal(few.scans.stamps, np.unique(stamps))
 
 
 @pytest.mark.parametrize(

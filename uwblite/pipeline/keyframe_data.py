@@ -1,34 +1,85 @@
-"""Keyframes that are moved in time or added after the first optimisation, and the edges made from them before.
+"""What is made of a recording at its keyframes: clouds, and again, where keyframes are moved in time or added, all edges.
 
 The lidar's clock is known only once scans have been matched, and so is where the odometry needs more keyframes. Poses are
-then interpolated on the trajectory; the edges of odometry and ranges are made from the recording again.
+then interpolated on the trajectory.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Ints
+from ..arrays import Bools, Ints
 from ..graph.graph import Edges, PriorEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..graph.range_edges import RangeEdges
-from ..odometry.attached import attach_ranges
+from ..graph.work import POINTS, Work
+from ..lidar import cloud_rasters, clouds
+from ..lidar.cloud_rasters import ScanClouds
+from ..lidar.clouds import Clouds
+from ..odometry.attached import ScanPoints, attach_ranges, choose_scans, scan_points
 from ..odometry.wheels import drift_time
 from .estimate import Estimate
-from .recordings import Recordings
+from .mapping_config import MappingConfig
+from .recordings import Recording, Recordings
 
+_AT_ONCE = 128
+"""Keyframes whose rays are in memory at once."""
+_LEAST_REACH = 0.2
+"""m; least reach of the rasters."""
 _STANDING = 1e-3
 """m/s or rad/s; a robot that stands spreads the odometry's noise evenly in time."""
+_LEAST_SHARE = 1e-6
+"""Of the variance of a step that was cut, for each of its pieces."""
+
+
+def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
+    """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
+    built = clouds.joined([part for recording in recordings.each for part in _clouds_of(recording, config, delay)])
+    return _with_raster(replace(built, work=work), config, delay, len(built.points))
+
+
+def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
+    """Return the clouds with some of their points (p,) alone."""
+    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay, int(kept.sum()))
+
+
+def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
+    """Return clouds with rasters, and count so many points of them as made."""
+    built.work[POINTS] += new
+    raster = cloud_rasters.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, _LEAST_REACH))
+    return ScanClouds(built, raster, delay)
+
+
+def _clouds_of(recording: Recording, config: MappingConfig, delay: float) -> Iterator[Clouds]:
+    """Yield the clouds of the keyframes of a recording, some at a time; empty ones without lidar."""
+    if not recording.has_scans:
+        none, offsets = np.zeros(0, dtype=np.intp), np.zeros(len(recording.frames) + 1, dtype=np.intp)
+        yield Clouds(offsets, np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))
+    for some, rays in rays_of(recording, config, delay):
+        yield clouds.build(replace(rays, keyframe=rays.keyframe - some.start), some.stop - some.start, config.clouds)
+
+
+def rays_of(
+    recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None
+) -> Iterator[tuple[slice, ScanPoints]]:
+    """Yield some keyframes of a recording at a time, and the rays of those wanted (k,), None = of all."""
+    log, frames = recording.log.with_later_scans(delay), recording.frames
+    if log.scans is None:
+        return
+    owner, chosen = choose_scans(log.scans, frames, config.keyframes)
+    if wanted is not None:
+        owner, chosen = owner[wanted[owner]], chosen[wanted[owner]]
+    for first in range(0, len(frames), _AT_ONCE):
+        some = slice(first, min(first + _AT_ONCE, len(frames)))
+        own = (owner >= some.start) & (owner < some.stop)
+        if wanted is None or own.any():
+            yield some, scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
 
 
 def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) -> Estimate:
-    """Return the estimate for recordings whose keyframes were moved in time or added.
-
-    Parameters
-    ----------
-    before, after : the recordings with the estimate's keyframes and with the new ones: as many, or more in between.
-    """
+    """Return the estimate for recordings whose keyframes were moved in time, or to which some were added in between."""
     pairs = list(zip(before.each, after.each, strict=True))
     poses, number, odometry = estimate.graph.poses, np.arange(len(before.stamps)), estimate.odometry
     if len(after.stamps) != len(before.stamps):
@@ -56,14 +107,13 @@ def _cut(odometry: OdometryEdges, number: Ints, after: Recordings) -> OdometryEd
     begins = np.concatenate([r.first + np.arange(len(r.frames) - 1) for r in after.each])
     way = np.concatenate([r.frames.path + r.frames.turned + _STANDING * r.frames.duration for r in after.each])
     origin = np.searchsorted(number[odometry.i], begins, "right") - 1
-    share = np.maximum(way / np.maximum(np.bincount(origin, way)[origin], 1e-12), 1e-6)
+    share = way / np.maximum(np.bincount(origin, way)[origin], np.finfo(np.float64).tiny)
     pieces = odometry.rows(origin)
-    root = pieces.sqrt_information / np.sqrt(share)[:, None, None]
+    root = pieces.sqrt_information / np.sqrt(np.maximum(share, _LEAST_SHARE))[:, None, None]
     return replace(pieces, i=begins, j=begins + 1, sqrt_information=root)
 
 
 def _renumbered(edges: Edges, number: Ints) -> Edges:
-    """Return edges of keyframes that have got other numbers."""
     if isinstance(edges, PriorEdges) and edges.block == "poses":
         return replace(edges, index=number[edges.index])
     return replace(edges, i=number[edges.i], j=number[edges.j]) if isinstance(edges, RelativePoseEdges) else edges

@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import ndtr
 
 from uwblite import se2
-from uwblite.localization import hypotheses, range_likelihood
-from uwblite.localization.range_update import gross_share
-from uwblite.localization.window import Ranges
+from uwblite.localization import hypotheses, range_model
+from uwblite.localization.range_model import Ranges
+from uwblite.radio.nlos_mixture import RangeMixture
 from uwblite.radio.range_errors import RangeErrors
 from uwblite.radio.range_noise import RangeNoise
 
@@ -28,46 +27,38 @@ def test_factors_of_ranges_are_the_numeric_gradient_of_their_cost():
         pose = pose + np.array([0.1, -0.05, 0.03])
 
         def cost(x, ranges=ranges):
-            error = range_likelihood.range_errors(x[None], ranges)[0][0]
-            share = range_likelihood.series(ranges).share
+            error = range_model.range_errors(x[None], ranges)[0][0]
+            share = range_model.series(ranges).share
             return 2.0 * (share * np.log1p(np.square(error / (2.0 * ranges.sigma)))).sum()
 
         steps = np.eye(3) * 1e-6
         gradient = [(cost(pose + s) - cost(pose - s)) / 2e-6 for s in steps]
-        np.testing.assert_allclose(range_likelihood.range_factors(pose[None], ranges)[1][0], gradient, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(range_model.range_factors(pose[None], ranges)[1][0], gradient, rtol=1e-4, atol=1e-5)
 
 
 def test_moments_are_wide_where_the_ranges_say_little_and_hold_the_truth():
     pose, ranges = some_ranges(4)
-    mean, covariance = range_likelihood.range_moments(range_likelihood.refined_by_ranges(pose[None], ranges)[0], ranges)
+    mean, covariance = range_model.range_moments(hypotheses.refined(pose[None], ranges)[0], ranges)
     off = mean - pose
     assert off @ np.linalg.solve(covariance, off) < 16.0
     near = np.abs(ranges.anchor) == 0
-    less = range_likelihood.range_moments(pose, ranges.rows(np.flatnonzero(near)))[1]
+    less = range_model.range_moments(pose, ranges.rows(np.flatnonzero(near)))[1]
     assert np.trace(less) > 2.0 * np.trace(covariance)
-
-
-def test_the_errors_alone_are_those_of_the_factors():
-    pose, ranges = some_ranges(5)
-    poses = pose + np.random.default_rng(5).normal(0.0, 1.0, (20, 3))
-    np.testing.assert_allclose(
-        range_likelihood._misfits(poses, ranges), range_likelihood.range_errors(poses, ranges)[0], atol=1e-12
-    )
 
 
 def test_likelihoods_in_single_precision_are_those_in_double_to_a_thousandth():
     pose, ranges = some_ranges(6)
     poses = pose + np.random.default_rng(6).normal(0.0, 2.0, (200, 3))
-    error = range_likelihood._misfits(poses, ranges)
-    z = error / ranges.sigma
-    terms = 0.7 * np.exp(-0.5 * z**2) + 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z) + gross_share(ranges.sigma)
+    error, law = range_model.range_errors(poses, ranges)[0], range_model.NEW_PLACE
+    mixtures = [RangeMixture(0.0, s, law.share, law.mean, 0.05, 60.0) for s in ranges.sigma]
+    terms = np.stack([m.density(e) * m.sigma * np.sqrt(2.0 * np.pi) for m, e in zip(mixtures, error.T, strict=True)], axis=1)
     # One after another: the error stays what it was, or is drawn anew.
-    chain = range_likelihood.series(ranges)
+    chain = range_model.series(ranges)
     for k in range(3, 12):
         jump, stay = (error[:, k] - error[:, k - 3]) / chain.change[k], chain.stay[k]
         terms[:, k] = (1.0 - stay) * terms[:, k] + stay * ranges.sigma[k] / chain.change[k] * np.exp(-0.5 * jump**2)
     expected = np.log(terms).sum(axis=1)
-    np.testing.assert_allclose(range_likelihood.range_likelihood(poses, ranges), expected, rtol=1e-3, atol=0.01)
+    np.testing.assert_allclose(range_model.range_likelihood(poses, ranges), expected, rtol=1e-3, atol=0.01)
 
 
 def test_an_error_that_lasts_costs_once_and_one_that_jumps_costs_each_time():
@@ -76,8 +67,8 @@ def test_an_error_that_lasts_costs_once_and_one_that_jumps_costs_each_time():
     costs = []
     for times in ((0,), (0, 3, 6, 9), (3, 9)):
         late = np.isin(np.arange(12), times) * 0.8
-        costs.append(float(range_likelihood.range_likelihood(pose[None], replace(near, values=near.values + late))[0]))
-    exact = float(range_likelihood.range_likelihood(pose[None], near)[0])
+        costs.append(float(range_model.range_likelihood(pose[None], replace(near, values=near.values + late))[0]))
+    exact = float(range_model.range_likelihood(pose[None], near)[0])
     # It comes and goes once; it comes once; it comes and goes twice.
     once, lasting, twice = (exact - cost for cost in costs)
     assert 0.0 < lasting < once < 0.6 * twice
@@ -87,10 +78,10 @@ def test_the_stay_is_the_renewal_law_whatever_the_steps_are():
     """The probability that an error has lasted over several ranges is that over their whole way, less gross errors."""
     _, ranges = some_ranges(1)
     still = replace(ranges, tags=np.zeros((12, 2)))
-    many = range_likelihood.series(still).stay[3::3].prod()
-    one = range_likelihood.series(still.rows(np.array([0, 9]))).stay[1]
+    many = range_model.series(still).stay[3::3].prod()
+    one = range_model.series(still.rows(np.array([0, 9]))).stay[1]
     np.testing.assert_allclose(many / 0.95**3, one / 0.95, rtol=1e-9)
-    first = range_likelihood.series(replace(still, way=0.1 * still.way))
+    first = range_model.series(replace(still, way=0.1 * still.way))
     np.testing.assert_array_equal(first.before[:4], [0, 1, 2, 0])
     np.testing.assert_array_equal(first.share[:3], 1.0)
     assert (first.share[3:] < 1.0).all()
@@ -99,7 +90,7 @@ def test_the_stay_is_the_renewal_law_whatever_the_steps_are():
 def test_two_tags_that_measure_at_once_are_two_places():
     _, ranges = some_ranges(1)
     two = replace(ranges.rows(np.array([0, 3])), way=np.zeros(2), tags=np.array([[0.0, 0.0], [0.4, 0.0]]))
-    np.testing.assert_allclose(range_likelihood.series(two).stay[1], 0.95 * np.exp(-0.4 / 1.5))
+    np.testing.assert_allclose(range_model.series(two).stay[1], 0.95 * np.exp(-0.4 / 1.5))
 
 
 def test_a_common_error_moves_the_pose_as_its_effect_says():
@@ -107,11 +98,11 @@ def test_a_common_error_moves_the_pose_as_its_effect_says():
     pose, ranges = some_ranges(2)
     true = np.hypot(*(pose[:2] + se2.rotate(pose[2], ranges.tags) - ranges.places).T)
     exact = replace(ranges, values=true, sigma=np.full(12, 0.02))
-    effect = range_likelihood.bias_effect(pose[None], exact, 4)[0]
+    effect = range_model.bias_effect(pose[None], exact, 4)[0]
     np.testing.assert_array_equal(effect[:, 3], 0.0)
     for anchor in range(3):
         shifted = replace(exact, values=true + 1e-4 * (exact.anchor == anchor))
-        found = range_likelihood.refined_by_ranges(pose[None], shifted)[0] - pose
+        found = hypotheses.refined(pose[None], shifted)[0] - pose
         np.testing.assert_allclose(found, 1e-4 * effect[:, anchor], atol=2e-6)
 
 
@@ -136,15 +127,15 @@ def test_errors_that_the_map_s_own_ranges_had_at_a_place_are_expected_there():
     noise = RangeNoise(0.05, 0.08, 2.0)
     fields = tuple(RangeErrors(np.array([-3.0, -3.0]), 0.5, rng.normal(0.1, 0.2, (15, 15)), noise) for _ in range(3))
     poses = pose + np.array([[0.0, 0.0, 0.0], [0.7, -0.2, 1.0]])
-    expected = range_likelihood.expected_errors(poses, ranges, fields)
+    expected = range_model.expected_errors(poses, ranges, fields)
     tags = pose[:2] + se2.rotate(pose[2], ranges.tags)
     one_by_one = [float(fields[a].at(tag)) for a, tag in zip(ranges.anchor, tags, strict=True)]
     np.testing.assert_allclose(expected[0], one_by_one, atol=1e-12)
     late = replace(ranges, values=exact + one_by_one)
-    best = range_likelihood.range_likelihood(pose[None], late, expected=expected[:1])
-    none = range_likelihood.range_likelihood(pose[None], replace(ranges, values=exact), expected=np.zeros((1, 12)))
+    best = range_model.range_likelihood(pose[None], late, expected=expected[:1])
+    none = range_model.range_likelihood(pose[None], replace(ranges, values=exact), expected=np.zeros((1, 12)))
     np.testing.assert_allclose(best, none, rtol=1e-4)
-    assert best[0] > range_likelihood.range_likelihood(pose[None], late)[0] + 1.0
+    assert best[0] > range_model.range_likelihood(pose[None], late)[0] + 1.0
 
 
 def test_a_long_detour_is_less_likely_where_the_map_s_own_robot_has_measured():
@@ -153,7 +144,7 @@ def test_a_long_detour_is_less_likely_where_the_map_s_own_robot_has_measured():
     costs = []
     for expected in (None, np.zeros((1, 12))):
         one, late = (
-            range_likelihood.range_likelihood(pose[None], replace(ranges, values=exact + off), expected=expected)[0]
+            range_model.range_likelihood(pose[None], replace(ranges, values=exact + off), expected=expected)[0]
             for off in (np.zeros(12), 1.4 * (np.arange(12) == 0))
         )
         costs.append(one - late)

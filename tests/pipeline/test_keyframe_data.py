@@ -10,7 +10,7 @@ from helpers.planted import box, ranges, recording, scans, wander
 from uwblite import se2
 from uwblite.graph.graph import PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.pipeline.keyframe_changes import with_keyframes
+from uwblite.pipeline.keyframe_data import with_keyframes
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.radio_stages import dead_reckoning
 from uwblite.pipeline.recordings import denser, gather, later

@@ -1,0 +1,458 @@
+"""Rules over facts: what the screening saw and repaired, and what the stages of mapping decided; one finding for each.
+
+Most are a row of ``TEXTS``; a kind whose severity or words depend on its figures is a function of its name.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from string import Formatter
+from typing import Any
+
+from ..findings import DOUBT, WARNING, Fact, Finding, doubt, warning
+from ..screening.units import likely_unit
+from ..sensor_log import SensorLog
+
+Rule = Callable[..., Finding]
+
+
+def say(facts: Iterable[Fact]) -> Iterator[Finding]:
+    """Yield the finding of each fact, with the fact's figures where the rule gives none."""
+    for fact in facts:
+        finding = RULES[fact.kind](**fact.figures)
+        yield finding if finding.figures else replace(finding, figures=dict(fact.figures))
+
+
+def check_recording(log: SensorLog) -> list[Finding]:
+    """Return what the screening found in one recording; nothing before it is screened."""
+    return [] if log.screening is None else list(say(log.screening.facts))
+
+
+def check_recordings(logs: Sequence[SensorLog]) -> list[Finding]:
+    """Return what the screening found in recordings, each with its recording's number and, where there are several, name."""
+    found = []
+    for number, log in enumerate(logs):
+        where = f"recording {number + 1}: " if len(logs) > 1 else ""
+        found += [replace(f, text=where + f.text, recording=number + 1) for f in check_recording(log)]
+    return found
+
+
+def listed(times: Sequence[float], digits: int = 0, most: int = 5) -> str:
+    """Return the first of some times, s, as words."""
+    return ", ".join(f"{time:.{digits}f}" for time in times[:most]) + (" ..." if len(times) > most else "")
+
+
+def spans(stretches: Sequence[tuple[float, float]]) -> str:
+    """Return the first three stretches, s, as words, and how many more there are."""
+    more = f", and {len(stretches) - 3} more stretches" if len(stretches) > 3 else ""
+    words = (f"t = {a:.0f} to {b:.0f} s" if round(a) < round(b) else f"t = {a:.0f} s" for a, b in stretches[:3])
+    return ", ".join(words) + more
+
+
+def shown(value: float, sigma: float) -> str:
+    """Return the factor 1 + value with its standard deviation."""
+    return f"{1.0 + value:.2f} \u00b1 {sigma:.2f}"
+
+
+class _Words(Formatter):
+    """Formats figures; beside Python's formats there are `times`, `spans` and `names` of lists, and `yes|no` of a truth."""
+
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        lists = {"times": lambda times: listed(times, 1), "spans": spans, "names": " and ".join}
+        if "|" in format_spec:
+            return format_spec.split("|")[0 if value else 1]
+        return lists[format_spec](value) if format_spec in lists else super().format_field(value, format_spec)
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """What is said of a fact."""
+
+    says: str
+    """What the finding is about, for docs/findings.md."""
+    text: str
+    """For people, with the fact's figures in braces."""
+    severity: str = WARNING
+    sensor: str = ""
+    """As text; see Finding."""
+    anchor: str = ""
+    """As text; see Finding."""
+
+    def finding(self, kind: str, figures: Mapping[str, Any]) -> Finding:
+        """Return the finding with the figures of a fact."""
+        text, sensor, anchor = (_Words().vformat(words, (), figures) for words in (self.text, self.sensor, self.anchor))
+        return Finding(kind, self.severity, text, sensor=sensor, anchor=anchor)
+
+
+TEXTS: Mapping[str, Text] = {
+    "made-up-stamps": Text(
+        "Warn of stamps on a grid too coarse for a sensor's clock: they were made by counting messages.",
+        "odometry and scans are stamped exactly every {period:g} s: these stamps were generated, not measured, so speeds, "
+        "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock",
+    ),
+    "stamps-of-receipt": Text(
+        "Warn of stamps that are times of receipt behind a queue: no clock offset can be estimated against them.",
+        "the stamps of {sensors:names} come in bursts: they are times of receipt behind a queue, not of measurement, "
+        "so no clock offset is estimated, and speeds mean little; stamp each reading when it is measured",
+    ),
+    "clock-set-back": Text(
+        "Doubt a recording in which a sensor's clock was set back: its readings are in another order than they were made.",
+        "the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there",
+        DOUBT,
+        "{sensor}",
+    ),
+    "clock-jump": Text(
+        "Warn of a clock that was set forward, as the ends of the sensors show; the stamps were moved back.",
+        "the clock of the {clock} was set forward by {by:.1f} s at t = {at:.0f} s, as the ends of the sensors show: the "
+        "{sensor}'s later stamps were moved by {moved:+.1f} s",
+    ),
+    "late-ranges": Text(
+        "Doubt ranges whose clock is off by seconds, as the path by the wheels shows: what is left of that bends the map.",
+        "the ranges are stamped about {late:.0f} s late for the odometry, whose path they fit then: their stamps were "
+        "corrected by that; use one clock",
+        DOUBT,
+        "radio",
+    ),
+    "stamps-in-bursts": Text(
+        "Warn of readings that share a stamp because they waited in a buffer; they were spread over the time since the last.",
+        "{readings} come in bursts of about {size:.0f} with one stamp, every {period:.2f} s: they were spread over the time "
+        "since the previous burst; stamp each reading when it is made",
+    ),
+    "repeated-odometry": Text(
+        "Warn of readings of the odometry that are in the log twice.",
+        "odometry readings that are in the log twice: {count}; one of each was left out",
+    ),
+    "odometry-glitches": Text(
+        "Warn of readings of the odometry whose removal makes the path continuous again.",
+        "{count} odometry readings lie far from the path (the first at t = {first:.1f} s) and were left out",
+    ),
+    "odometry-breaks": Text(
+        "Warn of steps of the odometry that no motion explains: the path was joined there by the motion before and after.",
+        "the odometry jumps at t = {at:times} s (by up to {largest:.2f} m): only other sensors connect the path before and "
+        "after",
+    ),
+    "odometry-gap": Text(
+        "Warn of a silence of the odometry in which the robot drove on: the pose after it counts, with the noise of the way.",
+        "the odometry is silent for {seconds:.0f} s from t = {begin:.0f} s, while the robot drove on; ranges and scans of "
+        "that time were left out",
+    ),
+    "hardly-moving": Text(
+        "Doubt a recording of a robot that stands: nothing can be placed from one spot.",
+        "the robot hardly moves: {way:.2f} m in {seconds:.0f} s (turning {turned:.1f} rad); does the base "
+        "report its wheels, in metres? Drive through the building",
+        DOUBT,
+    ),
+    "laser-turned-away": Text(
+        "Warn of a laser that looks elsewhere than its pose says, by the motion that it and the wheels measure.",
+        "the laser's direction differs by {degrees:+.0f} degrees from its given pose, by the motion that both "
+        "measure; corrected: `mounting.T_base_laser={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}`",
+    ),
+    "late-scans": Text(
+        "Warn of scans that a queue delivered late: between neighbours that agree with the odometry, they show another place.",
+        "{count} of {total} scans came late: they show where the robot was before, as their neighbours prove; their "
+        "poses are those that they show",
+    ),
+    "scans-do-not-match": Text(
+        "Doubt a recording whose scans a short time apart hardly ever match: the readings are noise.",
+        "successive scans do not match (nine of ten pairs share less than {share:.0%} of their "
+        "points): the readings are noise, or beam order or angles are not as stated; check the lidar's driver",
+        DOUBT,
+    ),
+    "repeated-ranges": Text(
+        "Warn of an anchor whose range stands still while the robot moves, more often than noise allows.",
+        "anchor {anchor} repeats one range while the robot moves ({stretches:spans}); these were left out",
+        anchor="{anchor}",
+    ),
+    "shared-name": Text(
+        "Warn of a name that two anchors have: its ranges alternate between two distances while the robot drives on.",
+        "two anchors seem to have the name {anchor}: its ranges jump between two distances "
+        "({jumps} of {total} times by more than the robot drove); they were left out, give each anchor its own name",
+        anchor="{anchor}",
+    ),
+    "heading-against-path": Text(
+        "Warn of a heading that turns against the path: its sign was inverted, as the lidar shows where there is one.",
+        "the odometry's heading turns against its path: {inverted} was inverted"
+        "{settled:|; nothing in the recording shows whether the map is mirrored, so compare it with the building}",
+    ),
+    "laser-turned-over": Text(
+        "Doubt a recording whose laser and wheels turn in opposite directions: one of the two is the other way round.",
+        "laser and wheels turn in opposite directions: the laser was taken as mounted {flipped:upside down|upright}, not as "
+        "given; if the wheels are swapped instead, the map is mirrored: settle it by {flipped:|leaving out }"
+        "`mounting.laser_flipped`, or by the odometry's sign",
+        DOUBT,
+    ),
+    "repeated-scans": Text(
+        "Warn of scans that repeat the one before to the last digit.",
+        "{count} of {total} scans equal the scan before ({stretches:spans}): "
+        "{often:the driver sends scans again|the lidar or its driver was stuck}; they were left out",
+    ),
+    "repeated-readings": Text(
+        "Warn of a reading of the lidar that stands for no distance: it is the same wherever the robot is.",
+        "{count} of {total} readings of the lidar are exactly {value:g} m, wherever the robot is: "
+        "{reach:the lidar reports its reach where it sees nothing|a code, or a part of the robot in view}; "
+        "they are not taken as walls",
+    ),
+    "anchor-heights": Text(
+        "Doubt a map without lidar where the ranges do not decide how high the anchors are, and the map depends on it.",
+        "the ranges fit anchors {height:.1f} m above the tag about as well as low ones: taken as {taken:high|low}; if they "
+        "are {taken:low|high}, the trajectory differs by {apart:.1f} m (rms); give the anchors' heights "
+        "(`mounting.anchor_height`)",
+        DOUBT,
+    ),
+    "landmark-distance": Text(
+        "Warn of a measured distance between landmarks that all other measurements contradict.",
+        "the distance {landmarks} is {map:.3f} m in the map, not the {measured:.3f} m that were measured: "
+        "all other measurements contradict it",
+    ),
+    "clock-offset": Text(
+        "Warn of an offset of the lidar's clock that each correction only makes larger.",
+        "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
+    ),
+    "free-space-violation": Text(
+        "Doubt a map in which points of one visit to a place stand in the free space of another visit.",
+        "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
+        "parts of the map are misplaced to each other; look at the closures in report.html",
+        DOUBT,
+    ),
+    "open-loops": Text(
+        "Doubt a map in which stretches that may show the same place are still too uncertain for any search.",
+        "the scans at t = {first:.0f} s and at t = {second:.0f} s may show the same place, but their relative position is "
+        "known to {sigma:.1f} m only and no scan match confirms it ({pairs} such pairs): drive there once more in the same "
+        "direction, or force the closure",
+        DOUBT,
+    ),
+}
+"""By the kind of fact, where one text says it."""
+
+
+def _of_text(kind: str) -> Rule:
+    return lambda **figures: TEXTS[kind].finding(kind, figures)
+
+
+RULES: dict[str, Rule] = {kind: _of_text(kind) for kind in TEXTS}
+"""By the kind of fact."""
+
+
+def _rule(function: Rule) -> Rule:
+    """Make a function the rule of the kind of its name."""
+    RULES[function.__name__.replace("_", "-")] = function
+    return function
+
+
+@_rule
+def exchanged_names(begin: float, at: float, end: float, what: str, anchors: Sequence[str]) -> Finding:
+    """Warn of ranges that fit the path by the wheels under other names from a moment on, or under none."""
+    which = f"those of {', '.join(anchors)} fit the places of others" if what == "exchanged" else "fit no places at all"
+    text = (
+        f"from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
+        f"wheels, but {which}: check the anchors' ids in the radio and in what reads them"
+    )
+    return Finding("exchanged-names", WARNING, text, sensor="radio")
+
+
+@_rule
+def wheels_against_ranges(begin: float, at: float, end: float, what: str, value: float) -> Finding:
+    """Warn of wheels that the ranges to the anchors contradict, more than clocks, names and moved anchors would explain."""
+    text = {
+        "ways": f"from t = {begin:.0f} to {end:.0f} s the wheels count {value:.2f} times the way that they count otherwise",
+        "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
+        "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
+        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
+        "turns": f"about t = {at:.0f} s no path that the wheels count fits: one of them, or the heading, is stuck or slips",
+    }[what]
+    return Finding("wheels-against-ranges", WARNING, f"{text}, by the ranges to the anchors in reach", sensor="odometry")
+
+
+@_rule
+def outside_odometry(sensor: str, count: int, total: int, off: float) -> Finding:
+    """Warn of readings outside the odometry's time; doubt a recording of which most are: its clocks differ."""
+    most = 2 * count > total
+    text = (
+        f"{count} of {total} {sensor} were stamped outside the odometry's time and left out: "
+        f"{f'the clocks differ by about {off:.0f} s; ' if most else ''}"
+        "start the odometry first and stop it last, and use one clock"
+    )
+    return Finding(f"{sensor}-outside-odometry", DOUBT if most else WARNING, text)
+
+
+@_rule
+def carried(at: Sequence[float], silent: float = 0.0) -> Finding:
+    """Doubt a recording in which the robot is suddenly elsewhere: it was carried, or the log was cut.
+
+    Other sensors find it at another place after a silence of the odometry in which the wheels stood, or from one reading to
+    the next.
+    """
+    if silent:
+        text = (
+            f"the odometry is silent for {silent:.0f} s from t = {at[0]:.0f} s, but the robot was moved meanwhile; only other "
+            "sensors connect the path before and after"
+        )
+        return doubt("carried", text)
+    text = (
+        f"at t = {listed(at)} s the robot is suddenly elsewhere: it was carried, or the log was cut; only other sensors "
+        "connect the path before and after"
+    )
+    return doubt("carried", text)
+
+
+@_rule
+def wheels_stand_still(begin: float, end: float, by_scans: bool) -> Finding:
+    """Warn of wheels that count nothing while other sensors move, where the scans replace them; doubt where ranges alone do."""
+    outcome = "the motion between scans is used instead" if by_scans else "the trajectory there rests on ranges alone"
+    text = f"the wheels count nothing from t = {begin:.0f} to {end:.0f} s while the robot moves: {outcome}"
+    return Finding("wheels-stand-still", WARNING if by_scans else DOUBT, text)
+
+
+@_rule
+def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "") -> Finding:
+    """Say in which share of the odometry the heading is the gyro's, and its bias; or why it is not used."""
+    how = "by the robot's rests" if rests else "against the wheels"
+    text = f"the heading is the gyro's in {used:.0%} of the odometry; its bias is {bias:+.5f} rad/s {how}" if used else why
+    if used and why:
+        text += f"; {why}"
+    return warning("gyro", text)
+
+
+@_rule
+def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]]) -> Finding:
+    """Doubt a recording whose wheels and lidar measure different motions for long, one factor for all taken out."""
+    text = (
+        f"wheels and lidar measure different motions ({spans([(a - start, b - start) for a, b in stretches])}): one of the two "
+        "is stuck, slips or has another scale there than elsewhere; cut that part off, or drive it again"
+    )
+    return Finding("wheels-against-lidar", DOUBT, text, stretches=tuple(stretches))
+
+
+@_rule
+def own_body(count: int, total: int, sectors: Sequence[tuple[float, float]]) -> Finding:
+    """Warn of beams that see the robot itself: the same nearby at all places and headings."""
+    parts = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in sectors[:3]) + " ..." * (len(sectors) > 3)
+    text = (
+        f"{count} of {total} beams of the lidar (at {parts} degrees) see the same nearby however the robot is "
+        "turned: the robot itself; they were left out"
+    )
+    return warning("own-body", text)
+
+
+@_rule
+def marked_ranges(count: int, total: int, value: float, lidar: bool) -> Finding:
+    """Warn of a value that a radio reports where it has no measurement; doubt where most are so and there is no lidar."""
+    text = (
+        f"{count} of {total} ranges are exactly {value:g} m, wherever the robot is: the radio reports "
+        "this value where it has no measurement; they were left out"
+    )
+    return Finding("marked-ranges", DOUBT if not lidar and 2 * count > total else WARNING, text)
+
+
+@_rule
+def odometry_unit(recording: int, name: str, factor: float, checked: bool, high: float | None) -> Finding:
+    """Warn of wheels in another unit by the ranges, which are times of flight.
+
+    It is a doubt where something else explains the factor as well and neither a lidar nor given places decide: wheels whose
+    radius and diameter were mistaken for each other, ranges in yards, anchors high above the tag.
+    """
+    double, unit = 2.0 / _DOUBLE < max(factor, 1.0 / factor) < 2.0 * _DOUBLE, likely_unit(factor)
+    unclear = (double or "yards" in unit) and not checked
+    reason = _TWICE if unclear and double else "the odometry has a wrong unit and was multiplied by that"
+    text = (
+        f"{f'{name}: ' if name else ''}by the ranges (times of flight) the robot drove {factor:.3f} times the distance that "
+        f"its odometry counts: {reason}{unit}"
+    )
+    if high is not None:
+        text += f"; or the odometry is right and the anchors are {high:.1f} m above the tag: give their heights"
+    severity, figures = DOUBT if unclear or high is not None else WARNING, {"recording": recording, "factor": round(factor, 4)}
+    return Finding("odometry-unit", severity, text, recording=recording, figures=figures)
+
+
+_DOUBLE = 1.07
+"""A factor is 2 or 1/2 up to this one: radii of wheels are known to some per cent."""
+_TWICE = (
+    "either the wheels' radius and diameter were mistaken for each other, or the radio reports twice or half "
+    "the distance, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
+    "between two anchors"
+)
+
+
+@_rule
+def moved_anchor(
+    anchor: str, distance: float, recording: int = 0, new_id: str = "", between: Sequence[float] = (), several: bool = False
+) -> Finding:
+    """Warn of an anchor that stands elsewhere from some time on, in another recording, or than in an earlier map.
+
+    `between` holds the last time at the one place, the first at the other, s, and the number of ranges meanwhile.
+    """
+    if not recording:
+        text = f"anchor {anchor} stands {distance:.2f} m from its earlier place: it was moved"
+    elif not between:
+        text = f"anchor {anchor} was moved: in recording {recording} it stands {distance:.2f} m away, and is called {new_id}"
+    else:
+        begin, end, way = between
+        when = f"between t = {begin:.0f} and {end:.0f} s" if way else f"at about t = {end:.0f} s"
+        less = f" (its {way:.0f} ranges meanwhile were left out)" if way else ""
+        where = f"recording {recording}: " if several else ""
+        text = f"{where}anchor {anchor} was moved by {distance:.1f} m {when}{less}; from then on it is called {new_id}"
+    return Finding("moved-anchor", WARNING, text, recording=recording, anchor=anchor)
+
+
+@_rule
+def path_displaced(
+    recording: int, stretch: tuple[float, float], start: float, anchors: Sequence[str], apart: float, turned: float
+) -> Finding:
+    """Doubt a map with a stretch that the ranges to all anchors in reach show elsewhere: a step of the path is broken there."""
+    begin, end = (time - start for time in stretch)
+    text = (
+        f"from t = {begin:.0f} to {end:.0f} s the ranges to {', '.join(anchors)} fit a path that lies {apart:.1f} m and "
+        f"{turned:.0f} deg from the map's: a step is broken at the beginning, by slip or a wrong match of scans; drive "
+        "there again, or map the parts before and after separately"
+    )
+    figures = {"recording": recording, "begin": stretch[0], "end": stretch[1], "apart": apart}
+    return Finding("path-displaced", DOUBT, text, stretches=(stretch,), recording=recording, figures=figures)
+
+
+@_rule
+def new_anchor(anchor: str, recording: int, silent: Sequence[int]) -> Finding:
+    """Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges."""
+    text = f"anchor {anchor} has ranges only from recording {recording} on: {_drove_there(silent)}, so it is new or was off"
+    return Finding("new-anchor", WARNING, text, anchor=anchor)
+
+
+@_rule
+def absent_anchor(anchor: str, recording: int, silent: Sequence[int]) -> Finding:
+    """Warn of an anchor to which recordings after the last with ranges (1, 2, ...) should have ranges."""
+    text = f"anchor {anchor} has no ranges after recording {recording}: {_drove_there(silent)}, so it was taken away or is off"
+    return Finding("absent-anchor", WARNING, text, anchor=anchor)
+
+
+def _drove_there(numbers: Sequence[int]) -> str:
+    which = ", ".join(map(str, numbers))
+    return f"recording{'s' if len(numbers) > 1 else ''} {which} drove within its reach without hearing it"
+
+
+@_rule
+def turn_scale(name: str, by_steps: float, sigma: float, by_all: float) -> Finding:
+    """Warn of a scale of turns that the lidar's steps contradict: single turns of the odometry are wrong."""
+    text = (
+        f"from step to step the lidar turns {shown(by_steps, sigma)} times as much as the odometry, but the whole fits best "
+        f"with {1.0 + by_all:.2f}: single turns of the odometry are wrong; the steps' scale is used"
+    )
+    return warning("turn-scale", text)
+
+
+@_rule
+def scans_astray(scans: int, used: int) -> Finding:
+    """Doubt a map of which scans lie so far from the others that no grid can hold both."""
+    text = f"{scans} of {scans + used} scans are so far from the others that no grid can hold both; they are not drawn"
+    return doubt("scans-astray", text)
+
+
+@_rule
+def coarse_grid(resolution: float, asked: float, cells: float) -> Finding:
+    """Warn where the map is drawn with larger cells than requested; a map larger than any building is a doubt."""
+    text = (
+        f"the map is drawn with cells of {resolution:g} m instead of {asked:g} m: there would be more than {cells:g} million; "
+        "raise grid.max_cells where there is memory (12 bytes each), or set `crop` or a smaller grid.max_range"
+    )
+    return Finding("coarse-grid", WARNING if resolution <= _COARSEST * asked else DOUBT, text)
+
+
+_COARSEST = 10.0
+"""Ratio of the cell size to the requested one, up to which a map counts as large; beyond it, poses or readings are wrong."""

@@ -1,0 +1,282 @@
+"""Ranges at poses of the map: their errors, the likelihood of a window of them, and the pose that they determine."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..arrays import Floats, Ints, Table
+from ..radio.range_errors import RangeErrors
+from ..radio.range_noise import RangeNoiseConfig
+from .walls import UNIFORM_VARIANCE
+
+PER_RANGE, PER_EXPECTED = 35, 50
+"""Operations on elements of arrays for the likelihood of a range at a pose, and for the error of the map's own ranges there."""
+FEW = 40
+"""Most ranges that many poses are compared by, to bound the work."""
+DRIFT = 0.03
+"""m of drift per metre driven: scale and heading of wheels that are not calibrated."""
+ANYWHERE = 30.0
+"""m over which ranges are distributed where the place is unknown: the reach of the radio indoors."""
+_WILD, _WIDTH = 0.05, 2.0 * ANYWHERE
+"""Share of gross errors, and their width, m."""
+_SAME_PLACE = 0.01
+"""m; way below which nothing is new in a range."""
+_NOISE = RangeNoiseConfig()
+"""Of a map that does not state it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Detours:
+    """How ranges are late: share of those with a detour, 0..1, and its mean, m."""
+
+    share: float
+    mean: float
+
+
+NEW_PLACE = Detours(0.3, 0.5)
+"""Where nothing is known of the place: 10 to 46 % of the ranges in twelve drives, by 0.2 to 0.7 m (means)."""
+VISITED = Detours(0.12, 0.4)
+"""Of ranges from which the map's own errors at the place are taken off: 6 to 18 % of them in the same drives."""
+
+
+def mixture(error: NDArray[Any], sigma: NDArray[Any], detours: Detours = NEW_PLACE) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the densities (...) of errors with standard deviations (...), m: those without a detour, and all of them.
+
+    The mixture of radio.nlos_mixture, a normal error of 0 having the density 1, for thousands of poses: the normal distribution
+    is that of Page, Applied Statistics 1977 (off by 2e-4).
+    """
+    z, ratio = error / sigma, sigma / detours.mean
+    over = z - ratio
+    core = (1.0 - detours.share - _WILD) * np.exp(-0.5 * z * z)
+    longer = np.exp(np.minimum(ratio * (0.5 * ratio - z), _LARGEST))
+    longer *= 1.0 + np.tanh(over * (_PAGE[0] + _PAGE[1] * over * over))
+    weight = float(np.sqrt(2.0 * np.pi))
+    return core, core + (0.5 * weight * detours.share) * ratio * longer + (weight * _WILD / _WIDTH) * sigma
+
+
+_PAGE = (float(np.sqrt(2.0 / np.pi)), 0.0356774)
+_LARGEST = 50.0
+"""Exponent that both kinds of numbers hold."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeFacts:
+    """One range and its parameters."""
+
+    anchor: int
+    """Number of the anchor in the map."""
+    place: Floats
+    """(2,) of the anchor, m."""
+    range: float
+    """m, as measured, less the anchor's bias."""
+    square: float
+    """m^2, squared height of the anchor above the tag."""
+    sigma: float
+    """m, white part of the noise."""
+    scale: float
+    """Relative error of all ranges."""
+    errors: RangeErrors | None = None
+    """By the tag's place, from the map."""
+
+    @property
+    def white(self) -> float:
+        """Standard deviation of the part of the noise that is new in every range, m."""
+        if self.errors is None:
+            return float(np.sqrt(1.0 - _NOISE.slow_share)) * self.sigma
+        return min(self.errors.noise.white, self.sigma)
+
+    @property
+    def length(self) -> float:
+        """Correlation length of the rest, m."""
+        return _NOISE.correlation_length if self.errors is None else self.errors.noise.length
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges(Table):
+    """The ranges (m,) of a window."""
+
+    anchor: Ints
+    places: Floats
+    """(m, 2) of the anchors, m."""
+    tags: Floats
+    """(m, 2) of the tag, in the present frame of the base, m."""
+    values: Floats
+    """Horizontal distances, m."""
+    sigma: Floats
+    """m; including the drift since then."""
+    way: Floats
+    """Odometer at each, m; ascending."""
+    white: Floats
+    """m; the part of it that is new in every range."""
+    length: Floats
+    """Correlation length of the rest, m."""
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def spread(self) -> "Ranges":
+        """Return FEW of them, evenly spread, for the time that all would take."""
+        return self.rows(np.unique(np.linspace(0, len(self) - 1, FEW).astype(np.intp)))
+
+
+def repeated(white: Floats | float, length: Floats | float, driven: Floats | float) -> Floats:
+    """Return how many ranges (...) to one anchor have the information of one independent one.
+
+    Multipath and shadows are the same until the tag has moved: the mean of errors with covariance ``exp(-d / length)`` every d
+    has the variance of independent ones every ``2 length``. The white part of the noise is new every time.
+
+    Parameters
+    ----------
+    white : (...) share of the variance that is new in every range, 0..1. length : (...) correlation length of the rest, m.
+    driven : (...) m since the last range to the anchor.
+    """
+    return np.asarray(white + (1.0 - white) * np.maximum(2.0 * length / np.maximum(driven, _SAME_PLACE), 1.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """Each range (m,) beside the one before it to the same anchor."""
+
+    before: Ints
+    """Its number; a first range's own."""
+    stay: Floats
+    """Probability that its error is still the same but for the white noise; 0 of a first one. Gross errors do not last."""
+    change: Floats
+    """m, standard deviation of the difference then."""
+    share: Floats
+    """Of the information of an independent range that it has, 0..1; 1 of a first one."""
+
+
+def series(ranges: Ranges) -> Series:
+    """Return how the ranges to each anchor follow one another: errors by multipath and shadows last for some metres."""
+    order = np.argsort(ranges.anchor, kind="stable")
+    follows = np.diff(ranges.anchor[order], prepend=-1) == 0
+    before = np.arange(len(ranges))
+    before[order[follows]] = order[np.flatnonzero(follows) - 1]
+    again = before != np.arange(len(ranges))
+    # Two tags are apart where the robot has not moved.
+    driven = np.maximum(ranges.way - ranges.way[before], np.hypot(*(ranges.tags - ranges.tags[before]).T))
+    stay = np.where(again, (1.0 - _WILD) * np.exp(-driven / ranges.length), 0.0)
+    change = np.sqrt(2.0 * ranges.white**2 + (DRIFT * driven) ** 2)
+    many = repeated((ranges.white / ranges.sigma) ** 2, ranges.length, driven)
+    return Series(before, stay, change, np.where(again, 1.0 / many, 1.0))
+
+
+def expected_errors(poses: Floats, ranges: Ranges, errors: tuple[RangeErrors, ...]) -> Floats:
+    """Return by how much the map's own ranges to its anchors (a,) were off where the tag was (h, m), at poses (h, 3), m."""
+    late = np.zeros((len(poses), len(ranges)))
+    for anchor in np.unique(ranges.anchor):
+        own = np.flatnonzero(ranges.anchor == anchor)
+        late[:, own] = errors[anchor].at(poses[:, None, :2] + se2.rotate(poses[:, None, 2], ranges.tags[own][None]))
+    return late
+
+
+def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None) -> Floats:
+    """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
+
+    The error of ranges to one anchor stays what it was, with a probability that fades with the way, or is drawn anew.
+
+    Parameters
+    ----------
+    wider : added to every sigma, m: the poses are those of a grid. expected : (h, m) errors of the map's own ranges there, m.
+    """
+    if not len(ranges):
+        return np.zeros(len(poses))
+    error, fresh = _drawn(poses, ranges, wider, expected)
+    chain = series(ranges)
+    again = np.flatnonzero(chain.stay)
+    change = (chain.change + wider)[again]
+    jump = (error[:, again] - error[:, chain.before[again]]) / change.astype(np.float32)
+    stay = chain.stay[again].astype(np.float32)
+    same = ((ranges.sigma + wider)[again] / change).astype(np.float32) * np.exp(-0.5 * jump * jump)
+    fresh[:, again] += stay * (same - fresh[:, again])
+    return np.asarray(np.log(fresh).sum(axis=1, dtype=np.float64))
+
+
+def shared_likelihood(poses: Floats, ranges: Ranges) -> Floats:
+    """Return the log-likelihoods (h,) of the ranges, each drawn anew and counted with its share of an independent one's."""
+    return np.asarray(np.log(_drawn(poses, ranges)[1]) @ series(ranges).share)
+
+
+def _drawn(
+    poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the errors (h, m) of ranges, m, and their likelihoods (h, m), each drawn anew; in single precision."""
+    c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+    x, y = ranges.tags.T
+    dx = c * x - s * y + (poses[:, :1] - ranges.places[:, 0])
+    dy = s * x + c * y + (poses[:, 1:2] - ranges.places[:, 1])
+    error = ranges.values - np.sqrt(dx * dx + dy * dy) - (0.0 if expected is None else expected)
+    single, sigma = error.astype(np.float32), (ranges.sigma + wider).astype(np.float32)
+    return single, mixture(single, sigma, NEW_PLACE if expected is None else VISITED)[1]
+
+
+def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return errors (h, m), m, measured minus expected, and the expected ranges' Jacobian (h, m, 3) by the pose."""
+    lever = se2.rotate(poses[:, None, 2], ranges.tags[None])
+    offset = poses[:, None, :2] + lever - ranges.places
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    unit = offset / np.maximum(distance, _SAME_PLACE)[..., None]
+    turned = unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1]
+    return ranges.values - distance, np.concatenate([unit, turned[..., None]], axis=-1)
+
+
+def cauchy(error: Floats, sigma: Floats | float) -> Floats:
+    """Return the weights of errors with a Cauchy kernel of two standard deviations."""
+    return np.asarray(1.0 / (1.0 + np.square(error / (2.0 * sigma))))
+
+
+def _weighted(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
+    """Return the errors (h, m), the Jacobian (h, m, 3) and the same times the robust weights of the ranges."""
+    error, jacobian = range_errors(poses, ranges)
+    weight = series(ranges).share * cauchy(error, ranges.sigma) / ranges.sigma**2
+    return error, jacobian, jacobian * weight[..., None]
+
+
+def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
+    error, jacobian, weighted = _weighted(poses, ranges)
+    return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)
+
+
+def bias_effect(poses: Floats, ranges: Ranges, anchors: int) -> Floats:
+    """Return by how much (h, 3, a) poses (h, 3) by ranges move with an error that all ranges to an anchor have in common."""
+    _, jacobian, weighted = _weighted(poses, ranges)
+    own = (ranges.anchor[:, None] == np.arange(anchors)).astype(np.float64)
+    return np.linalg.solve(weighted.transpose(0, 2, 1) @ jacobian + POOR, weighted.transpose(0, 2, 1) @ own)
+
+
+POOR = np.diag(np.square([0.1, 0.1, 0.3]))
+"""Information of a pose of which nothing is known within 10 m and 3 rad."""
+_REACH, _STEPS = np.array([1.5, 1.5, 0.6]), (17, 17, 9)
+"""m, m, rad about a pose, several times what a start may be off by, and poses along each axis of the lattice."""
+_AT_ONCE = 512
+"""Poses of the lattice whose ranges fit into the processor's cache."""
+MOMENTS = PER_RANGE * FEW * int(np.prod(_STEPS))
+"""Operations for the moments."""
+
+
+def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
+
+    With NLOS the likelihood is flat where its curvature, without the late ranges, would give a sharp peak: so the
+    moments are summed over a lattice of poses.
+    """
+    axes = [np.linspace(-reach, reach, count) for reach, count in zip(_REACH, _STEPS, strict=True)]
+    off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    some, parts = ranges.spread(), np.array_split(pose + off, len(off) // _AT_ONCE)
+    # Errors that change with the direction of driving neither last nor are drawn anew: each range counts with its share.
+    weight = np.concatenate([shared_likelihood(part, some) for part in parts])
+    weight *= series(ranges).share.sum() / series(some).share.sum()
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    mean = weight @ off
+    off -= mean
+    # Each point of the lattice represents a cell: the variance within the cell is added.
+    cell = np.array([axis[1] - axis[0] for axis in axes])
+    covariance = (off * weight[:, None]).T @ off + np.diag(cell**2 * UNIFORM_VARIANCE)
+    mean = pose + mean
+    return np.append(mean[:2], se2.wrap_angle(mean[2])), covariance

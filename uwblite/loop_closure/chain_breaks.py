@@ -1,0 +1,127 @@
+"""Steps of the chain that scans do not fix: what they leave untied, and what closures shift between two of them.
+
+Doors and pillars repeat. Closures that confuse one with the next agree with each other, and a robust odometry allows jumps at
+the two ends of the stretch that they move. A wheel may slip once; it does not slip back by the same distance metres later.
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, connected
+from ..graph.graph import Edges, Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from .closures import LoopClosureConfig
+
+
+@dataclass(frozen=True, slots=True)
+class TiePolicy:
+    """Scan edges that fix a step, and jumps of the odometry where none does."""
+
+    near: ClassVar[int] = 4
+    """Most keyframes that a scan edge of the same visit spans."""
+    another_visit: ClassVar[float] = 10.0
+    """Travelled distance between two visits, m."""
+    views: ClassVar[int] = 6
+    """Keyframes of a part of the map; fewer belong to the part before."""
+    clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
+    """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""
+    jump: ClassVar[float] = 0.5
+    torn: ClassVar[float] = 10.0
+    """m, and standard deviations, from which an error of one step of the odometry is more than noise."""
+    made_good: ClassVar[float] = 0.3
+    """Share of a jump that may remain after the opposite jump."""
+
+
+def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
+    """Return the steps (b,) that no odometry measured (e,) and scan edges, of all visits, leave free in some direction.
+
+    Along a bare corridor a lidar alone does not measure the distance. Clouds that are neither neighbours nor of another
+    visit were matched at the poses of the chain, and add no information to it.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m.
+    """
+    part = tied_parts(wheels, replace(graph, edges=tuple(_near_or_again(e, path) for e in graph.edges)), measured)
+    large = np.flatnonzero(np.bincount(part)[part] >= TiePolicy.views)
+    if not len(large):
+        return large
+    # A few keyframes between two breaks do not form a part: they belong to the part before.
+    of = part[large[np.maximum(np.searchsorted(large, np.arange(len(part)), "right") - 1, 0)]]
+    return np.flatnonzero(~measured & (of[wheels.i] != of[wheels.j]))
+
+
+def _near_or_again(edges: Edges, path: Floats) -> Edges:
+    """Return the scan edges between neighbours and between visits; other edges as they are."""
+    if not isinstance(edges, ScanEdges):
+        return edges
+    again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
+    return edges.rows(np.flatnonzero((np.abs(edges.i - edges.j) <= TiePolicy.near) | again))
+
+
+def tied_parts(wheels: OdometryEdges, graph: Graph, sound: Bools) -> Ints:
+    """Return the part (k,) of each keyframe: scan edges of any visits connect keyframes, and so do sound steps (e,)."""
+    connecting = sound | steps_fixed(graph)[wheels.i]
+    i, j = [wheels.i[connecting]], [wheels.j[connecting]]
+    for edges in (e for e in graph.edges if isinstance(e, ScanEdges)):
+        fixing = _fixing(edges, graph)
+        i.append(edges.i[fixing])
+        j.append(edges.j[fixing])
+    return connected(np.concatenate(i), np.concatenate(j), len(graph.poses))
+
+
+def steps_fixed(graph: Graph) -> Bools:
+    """Return whether some scan edge of the same visit fixes the step from each keyframe (k,) in all directions."""
+    count = np.zeros(len(graph.poses) + 1, dtype=np.intp)
+    for edges in (e for e in graph.edges if isinstance(e, ScanEdges)):
+        own = (np.abs(edges.i - edges.j) <= TiePolicy.near) & _fixing(edges, graph)
+        np.add.at(count, np.minimum(edges.i, edges.j)[own], 1)
+        np.add.at(count, np.maximum(edges.i, edges.j)[own], -1)
+    return np.asarray(np.cumsum(count)[:-1] > 0)
+
+
+def _fixing(edges: ScanEdges, graph: Graph) -> Bools:
+    """Return which scan edges (e,) agree with the map and fix a pose in all directions."""
+    agrees = np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < LoopClosureConfig.agrees
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    # With the limits as units, an eigenvalue is above 1 where its direction has a sigma below the limit.
+    least = np.linalg.eigvalsh(information * np.outer(TiePolicy.clear, TiePolicy.clear))[:, 0]
+    return np.asarray(agrees & (least > 1.0))
+
+
+def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
+    """Return the steps (s,) at which the graph jumps from what the odometry counts and no scans measure it, and by what.
+
+    Returns
+    -------
+    Rows of the odometry's edges (s,), and jumps (s, 2), m, in the map frame.
+    """
+    away = se2.between(graph.poses[wheels.i], graph.poses[wheels.j])[:, :2] - wheels.corrected(graph)[:, :2]
+    off = np.abs(wheels.residuals(graph))[:, :2].max(axis=1, initial=0.0) > TiePolicy.torn
+    off &= np.hypot(away[:, 0], away[:, 1]) > TiePolicy.jump
+    rows = np.flatnonzero(off & ~steps_fixed(graph)[wheels.i])
+    return rows, se2.rotate(graph.poses[wheels.i[rows], 2], away[rows])
+
+
+def slid(graph: Graph) -> list[tuple[int, int, float]]:
+    """Return stretches: first and last keyframe, and the jump at both ends, m."""
+    found = []
+    for wheels in (e for e in graph.edges if isinstance(e, OdometryEdges)):
+        rows, by = jumps(wheels, graph)
+        size = np.hypot(by[:, 0], by[:, 1])
+        left = np.hypot(*(by[:-1] + by[1:]).T)
+        for k in np.flatnonzero(left < TiePolicy.made_good * np.maximum(size[:-1], size[1:])).tolist():
+            found.append((int(wheels.j[rows[k]]), int(wheels.i[rows[k + 1]]), float(size[k])))
+    return found
+
+
+def moved_by(closures: RelativePoseEdges, graph: Graph) -> Floats:
+    """Return for each closure (e,) the shift of the stretch that it connects with the rest, m; 0 = no shifted stretch."""
+    by = np.zeros(len(closures))
+    for first, last, size in slid(graph):
+        inside = [(k >= first) & (k <= last) for k in (closures.i, closures.j)]
+        by[inside[0] != inside[1]] = size
+    return by
