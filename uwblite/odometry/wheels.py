@@ -51,7 +51,7 @@ def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: 
         drift_time(keyframes),
         variance[:, None] ** -0.5 * np.eye(variance.shape[1]),
         odometry_indices(calibration, n),
-        config.kernel,
+        kernel=config.kernel,
     )
 
 
