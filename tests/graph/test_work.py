@@ -52,7 +52,6 @@ def test_scans_are_gone_through_at_most_thirteen_times_in_ten(mapped):
     if name == "no lidar":
         assert not any(made.values())
     else:
-        # Of points made again where objects that move are left out, only the tables are new.
         assert sum(n for stage, n in made.items() if "clouds" in stage) <= 1.3 * made["clouds"]
     assert result.stages[-1].figures["passes"] <= 1.3
 
