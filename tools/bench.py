@@ -122,8 +122,7 @@ def bench_marginals(repeats: int) -> None:
     """Compute every pose's covariance, and the joint one of 100 poses with the relative covariance of 300 pairs of them."""
     import numpy as np
 
-    from uwblite.graph.joint_covariance import JointCovariance
-    from uwblite.graph.marginals import marginals
+    from uwblite.graph.marginals import JointCovariance, marginals
     from uwblite.graph.solver import optimize
 
     head("Marginal covariances, ms", "graph", "poses", "all blocks", "300 relative ones of 100 poses")

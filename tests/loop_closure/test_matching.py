@@ -70,7 +70,7 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
         return SimpleNamespace(poses=np.tile(guess, (30, 1)))
 
     monkeypatch.setattr(matching, "search", search)
-    monkeypatch.setattr(matching, "_prepare", lambda clouds, k, prepared: k)
+    monkeypatch.setattr(matching, "_prepare", lambda clouds, k: k)
     monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
     spread, sigma = np.array([config.direct, 1.0, 2.0, 9.0]), np.array([1.0, 0.01, 0.1, 9.0])
     candidates = SimpleNamespace(

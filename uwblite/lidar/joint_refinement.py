@@ -161,9 +161,8 @@ def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> S
     # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
-    none, names = np.zeros_like(twist[i]), scan_indices(graph.calibration)
-    roots = np.broadcast_to(0.0, (*none.shape, none.shape[1]))
-    return ScanEdges(i, j, none, roots, twist[i], twist[j], names, delay, RefinementConfig.kernel)
+    none, names = np.broadcast_to(0.0, (len(i), 3, 3)), scan_indices(graph.calibration)
+    return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, kernel=RefinementConfig.kernel)
 
 
 def refine(

@@ -6,6 +6,7 @@ Candidates are matched in batches, each with the sub-maps it needs: by one proce
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
@@ -128,7 +129,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that are searched for."""
     candidates, config = batch.candidates, batch.config
     rows, guesses = [], []
-    prepared: dict[int, Clouds] = {}
+    prepared = cache(partial(_prepare, batch.clouds))
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
@@ -137,7 +138,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
                 search_config, places = _coarse(batch.search), MatchingPolicy.many_places
             turn = CandidatePolicy.sigmas * np.sqrt(candidates.covariance[k, 2, 2])
             turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
-            target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
+            target, source = (prepared(int(of[k])) for of in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
             poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
@@ -186,12 +187,10 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     return best, second
 
 
-def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
+def _prepare(clouds: Clouds, k: int) -> Clouds:
     """Return a sub-map's cloud ready for the search; its normals point to the side of the laser."""
-    if k not in prepared:
-        points, normals = clouds.cloud(k)
-        prepared[k] = make_cloud(points, points + normals, work=clouds.work)
-    return prepared[k]
+    points, normals = clouds.cloud(k)
+    return make_cloud(points, points + normals, work=clouds.work)
 
 
 def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:

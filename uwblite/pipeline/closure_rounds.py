@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..graph.graph import Graph
-from ..graph.joint_covariance import JointCovariance
+from ..graph.marginals import JointCovariance
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
 from ..lidar.submaps import Submaps

@@ -104,7 +104,8 @@ def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     found = scan_to_scan.descended_edges(scans.raster, steps)
     names = scan_indices(estimate.graph.calibration)
     i, j, kernel = found.i, found.j, estimate.odometry.kernel
-    edges = ScanEdges(i, j, found.T_i_j, found.sqrt_information, twist[i], twist[j], names, scans.delay, kernel)
+    root = found.sqrt_information
+    edges = ScanEdges(i, j, found.T_i_j, root, twist[i], twist[j], names, scans.delay, kernel=kernel)
     wheels = reestimate_wheel_noise(estimate.odometry, found, estimate.graph)
     return _with_inflated_ranges(replace(estimate, odometry=wheels, steps=edges)).solved(rough(task.config.solver))[0]
 

@@ -55,6 +55,7 @@ from ..odometry.attached import ScanPoints
 from ..odometry.wheels import noise_at
 from .estimate import Estimate, Task
 from .keyframe_data import rays_of
+from .lidar_stages import STILL
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class SurfacePolicy:
     """Most Gauss-Newton steps."""
     settling: ClassVar[int] = 2
     """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
-    still: ClassVar[float] = 1e-3
+    still: ClassVar[float] = STILL
     """The next change of the poses, rms, m, that ends them once noise and pairs have settled."""
     kernel: ClassVar[float] = 3.0
     wider: ClassVar[float] = 4.0
