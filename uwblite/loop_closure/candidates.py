@@ -16,7 +16,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
-from ..graph.joint_covariance import JointCovariance
+from ..graph.marginals import JointCovariance
 from ..lidar import submaps
 from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps

@@ -49,11 +49,6 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(part.points) for part in parts))
 
 
-def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
-    """Return the clouds with some of their points (p,) alone."""
-    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay, int(kept.sum()))
-
-
 def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
     """Return clouds with rasters, and count so many points of them as made."""
     built.work[POINTS] += new
