@@ -32,8 +32,8 @@ _ROW = 26
 """Pixels of a row of the strip below."""
 _SCALE = 2
 """Pixels per pixel of the font; ticks have one."""
-_TICK_EVERY = 130
-"""Pixels between ticks, about."""
+_TICK_EVERY, _LONGEST_BAR = 130, 220
+"""Pixels between ticks, about, and of the scale bar at most."""
 _AXIS = 34
 """Pixels of the axes at the origin."""
 _LONGEST_NAME = 16
@@ -105,7 +105,7 @@ def draw_map(drawn: DrawnMap, *, caption: str = "", size: int = SIZE, tint: Tint
     scale = _pixels_per_metre(extent, resolution, size)
     low = np.floor(low / resolution) * resolution
     width, height = np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int).tolist()
-    length = round_length(min(220.0, width / 4.0) / scale)
+    length = round_length(min(_LONGEST_BAR, width / 4) / scale)
     keys = [Key(f"{length:g} m", INK, "bar", length * scale), *([Key(caption)] if caption else []), *_legend(drawn)]
     rows = rows_of(width, [*keys, *(tint.keys if tint is not None else ())])
     image = np.full((height + _ROW * len(rows) + _GAP, width, 3), PAPER, dtype=np.uint8)
@@ -164,6 +164,7 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
     pixels = scale * grid.geometry.resolution
     each, together = max(round(pixels), 1), max(round(1.0 / pixels), 1)
     first = np.rint((grid.geometry.origin - low) / grid.geometry.resolution).astype(int)
+    # Rows and columns of cells that share a pixel begin there; where none do, each is one of its own.
     row_starts, col_starts = (
         np.unique((begin + np.arange(n)) // together, return_index=True)[1]
         for begin, n in zip(first[::-1], grid.log_odds.shape, strict=True)
@@ -173,6 +174,7 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
         for extreme in (np.maximum, np.minimum)
     )
     cells = np.where(surest_wall > _WALL_SHOWS, surest_wall, surest_floor)
+    # The block of cells that each row and column of pixels shows; the picture may reach farther than they do.
     row, col = (height - 1 - np.arange(height)) // each - first[1] // together, np.arange(width) // each - first[0] // together
     rows, cols = (np.flatnonzero((place >= 0) & (place < n)) for place, n in zip((row, col), cells.shape, strict=True))
     shown = _SHADES[np.rint(_LEVELS * expit(cells)).astype(np.uint8)]
@@ -222,7 +224,7 @@ def _draw_anchor(canvas: Canvas, anchor: DrawnAnchor, side: str, pixel: Callable
         canvas.polygon(outline[:-1], colour, _FAINT)
         canvas.polyline(outline, _THIN, colour, _STRONG)
     place = pixel(anchor.position)
-    canvas.polygon(place + (_GAP + 4) * _TRIANGLE, FLOOR)
+    canvas.polygon(place + 1.5 * _GAP * _TRIANGLE, FLOOR)
     canvas.polygon(place + _GAP * _TRIANGLE, colour)
     name = anchor.id if len(anchor.id) <= _LONGEST_NAME else anchor.id[: _LONGEST_NAME - 2] + ".."
     (left, _), (_, top) = _SCALE * HEIGHT * name_box(side, len(name))
