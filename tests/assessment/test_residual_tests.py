@@ -11,7 +11,6 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.assessment.residual_tests import (
-    _contradicted_by_ranges,
     check_odometry,
     check_range_scatter,
     check_scales,
@@ -164,8 +163,8 @@ def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, ali
 
 
 @pytest.mark.parametrize(("scale", "placed", "lidar", "said"), [
-    (1.119, True, True, None), (1.121, True, True, "1.12 times the distances on the map: lidar or radio has a wrong unit"),
-    (0.879, True, False, "0.88 times the distances on the map: a radio measures time of flight"), (2.0, False, True, None),
+    (1.149, True, True, None), (1.151, True, True, "1.15 times the distances on the map: lidar or radio has a wrong unit"),
+    (0.849, True, False, "0.85 times the distances on the map: a radio measures time of flight"), (2.0, False, True, None),
 ])  # fmt: skip
 def test_ranges_of_another_scale_are_named_where_anchors_are_placed(scale, placed, lidar, said):
     calibration = Calibration((UnknownKey("bias", "A"), UnknownKey("range_scale")), np.array([5.0, scale - 1.0]))
@@ -236,18 +235,3 @@ def test_ranges_through_walls_may_be_late_where_the_map_shows_the_walls(walled, 
     log_odds = np.zeros((200, 200), dtype=np.float32)
     log_odds[:, 120] = 5.0 * walled
     assert len(scattered(ranges, residuals, poses, grid=OccupancyGrid(geometry, log_odds))) == said
-
-
-@pytest.mark.parametrize(("off", "few", "found"), [
-    ((3.0, 3.0, 0.0, 0.0), 3, [10]), ((3.0, 0.0, 0.0, 0.0), 3, []), ((3.0, 3.0, 0.0, 0.0), 2, []),
-    ((0.8, -0.8, 0.8, 0.8), 3, []), ((3.0, -3.0, 0.0, 0.0), 3, [10]),
-])  # fmt: skip
-def test_a_part_that_half_of_the_anchors_contradict_is_not_tied_by_ranges(off, few, found):
-    """Three parts, which begin at keyframes 0, 10 and 20: in the first one some anchors' ranges are off by so much."""
-    anchors = np.array([[9.0, 0.0], [0.0, 9.0], [-9.0, 0.0], [0.0, -9.0]])
-    pose, anchor = np.repeat(np.arange(30), 4), np.tile(np.arange(4), 30)
-    graph = Graph(np.column_stack([np.linspace(0.0, 3.0, 30), np.zeros((30, 2))]), anchors)
-    measured = np.hypot(*(graph.poses[pose, :2] - anchors[anchor]).T) + np.where(pose < 10, np.array(off)[anchor], 0.0)
-    ranges = plain_ranges(pose, anchor, measured, 0.1)
-    ranges = replace(ranges, weights=np.where((pose < 10) & (pose >= few), 0.0, 1.0))
-    assert _contradicted_by_ranges(np.array([20, 10]), graph, ranges).tolist() == found

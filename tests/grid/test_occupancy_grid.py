@@ -12,7 +12,7 @@ from uwblite.errors import ConfigError, DataError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, from_counts
 from uwblite.grid.ray_counter import WEIGHT_UNIT, RayCounter, mark_rays
-from uwblite.grid.tracing import Sweeps, from_sweeps, in_runs, moved_scans, scan_rays, seen_reach
+from uwblite.grid.tracing import Sweeps, from_sweeps, in_runs, moved_scans
 from uwblite.sensor_log import LaserScans
 
 DEFAULT = GridConfig()
@@ -21,6 +21,10 @@ DEFAULT = GridConfig()
 def from_scans(first, scans, config=DEFAULT, *, last=None, **options):
     """Make the map of one recording's scans."""
     return from_sweeps([Sweeps(scans, first, last)], config, **options)
+
+
+def scan_rays(scans, reach, first, last=None, *, flipped=False):
+    return Sweeps(scans, first, last, flipped).rays(np.arange(len(first)), reach)
 
 
 def bresenham(row, col, row_end, col_end):
@@ -373,7 +377,7 @@ def test_scan_by_scan_insertion_makes_the_same_map():
     whole = from_scans(poses, scans, config)
     counter = RayCounter(whole.geometry, config.clear_weight)
     for k in range(30):
-        rays = scan_rays(scans, seen_reach(scans, np.array([k])), poses[k : k + 1])
+        rays = Sweeps(scans, poses).rays(np.array([k]), scans.ranges[[k]])
         counter.insert_rays(rays.origins, rays.endpoints)
     assert from_counts(counter, config).log_odds.tobytes() == whole.log_odds.tobytes()
 

@@ -70,7 +70,7 @@ def test_tables_that_do_not_fit_are_named(written):
     with pytest.raises(FormatError, match="recording 7"):
         read_result(folder)
     (folder / "trajectory_covariance.csv").write_text(table.replace("1000.000000", "soon"))
-    with pytest.raises(FormatError, match="'soon', not a time"):
+    with pytest.raises(FormatError, match="stamp is 'soon', not a number"):
         read_result(folder)
 
 

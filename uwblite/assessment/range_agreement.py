@@ -1,4 +1,7 @@
-"""Test whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not."""
+"""Whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not.
+
+The table of these rules is MapResult.range_table, empty without ranges; its numbers are those of the anchors.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -11,6 +14,17 @@ from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
 from ..sensor_log.sensors import first_place, name_and_number
 from .facts import check_recordings, spans
+
+DISAGREE = 0.5
+"""Share of an anchor's ranges that agree with the map, below which it is distrusted."""
+_LEAST_AGREEING = 0.3
+"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
+_ENOUGH, _NEAR = 3, 0.3
+"""Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
+half a metre off is not so near to three distances."""
+_MOST_NEAR, _MANY_NEAR = 0.85, 0.6
+"""Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
+0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -31,10 +45,6 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
 
     A line of sight was blocked, or an anchor was moved. Without a lidar, ranges alone determine the path: half of the anchors
     that disagree, or are distrusted or left out, are a doubt as well. An anchor that was moved counts once.
-
-    Parameters
-    ----------
-    anchors : in the order of the table's numbers. table : MapResult.range_table; empty without ranges.
     """
     placed = [a for a in anchors if a.status != "unplaced"]
     of_place = {a.id: name_and_number(a.id)[0] for a in placed}
@@ -61,12 +71,6 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
         yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
 
 
-DISAGREE = 0.5
-"""Share of an anchor's ranges that agree with the map, below which it is distrusted."""
-_LEAST_AGREEING = 0.3
-"""Least share of ranges that agree with a correct map: where a radio reports every other range as 0, it is 0.4."""
-
-
 def _outliers(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
     """Warn of each anchor whose ranges disagree with the map for long, recording by recording."""
     for recording in task.recordings.each:
@@ -91,10 +95,6 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
     question, would not agree with a path that the lidar has bent: then only the wheels are wrong. Anchors that seem to have
     been moved are not used: a bent path could have displaced them.
-
-    Parameters
-    ----------
-    table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
     recorded = check_recordings([recording.log for recording in task.recordings.each])
     against = [finding for finding in recorded if finding.kind == WHEELS_AGAINST_LIDAR]
@@ -113,11 +113,3 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
             text = f"{finding.text}; the ranges agree with the lidar there: check the wheels"
             finding = replace(finding, severity=WARNING, text=text)
         yield finding
-
-
-_ENOUGH, _NEAR = 3, 0.3
-"""Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
-half a metre off is not so near to three distances."""
-_MOST_NEAR, _MANY_NEAR = 0.85, 0.6
-"""Share of all their ranges, and of those in each stretch, even if few, that must be as near. Right maps have 0.9 to
-0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""

@@ -5,7 +5,7 @@ itself shows a fault (heading in degrees, a laser upside down, clocks that diffe
 findings are those of the recording as well.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,20 +15,10 @@ from ..lidar.laser_mounting import Turning
 from ..map_result import MapResult
 from ..screening.screen import screen
 from ..screening.wheel_motion import show_motion
-from ..sensor_log import LogNotes, SensorLog
+from ..sensor_log import SensorLog
+from . import sensor_checks
 from .causes import explained
 from .facts import check_recording
-from .sensor_checks import (
-    calibration_figures,
-    check_lidar,
-    check_odometry,
-    check_radio,
-    check_turning,
-    lidar_figures,
-    odometry_figures,
-    radio_figures,
-    turning_figures,
-)
 
 _BROKEN = 0.001
 """Share of broken lines from which on a disk, cable or writer is bad."""
@@ -65,11 +55,8 @@ class RecordingView:
     """See Diagnosis."""
     turning: Turning | None
     """Turns by laser and wheels."""
-
-    @property
-    def turn_ratio(self) -> tuple[float, float]:
-        """Turn by the laser / turn by the wheels with its standard deviation, as the screening measured it."""
-        return _turn_ratio(self.repaired)
+    turn_ratio: tuple[float, float]
+    """See Screening."""
 
 
 def diagnose(
@@ -84,10 +71,24 @@ def diagnose(
     refused : why no map could be made; empty where it was, or was not tried.
     repaired : the recording screened, where that has been done.
     """
-    view = _view(log, result, refused, repaired)
+    try:
+        repaired = repaired or screen(log)
+    except DataError as error:
+        refused = refused or str(error)
+    screening = None if repaired is None else repaired.screening
+    ratio = (float("nan"), float("nan")) if screening is None else screening.turn_ratio
+    figures: dict[str, Any] = {"odometry": sensor_checks.odometry_figures(log.odometry)}
+    turning = None
+    if log.ranges is not None and len(log.ranges.stamps):
+        figures["uwb"] = sensor_checks.radio_figures(log)
+        made = ((), ()) if result is None else (result.anchors, result.calibration)
+        figures["radio calibration"] = sensor_checks.calibration_figures(*made)
+    if log.scans is not None and len(log.scans.stamps):
+        figures["lidar"] = sensor_checks.lidar_figures(log)
+        figures["lidar"]["turning"], turning = sensor_checks.turning_figures(log, ratio)
+    view = RecordingView(log, repaired, result, refused, figures, turning, ratio)
     rules = (_check_notes, _check_map, _check_sensors, _check_each_sensor)
-    found = [finding for rule in rules for finding in rule(view)]
-    return Diagnosis(explained(ranked(found)), view.figures)
+    return Diagnosis(explained(ranked(finding for rule in rules for finding in rule(view))), figures)
 
 
 def screened(log: SensorLog) -> SensorLog | None:
@@ -98,31 +99,9 @@ def screened(log: SensorLog) -> SensorLog | None:
         return None
 
 
-def _view(log: SensorLog, result: MapResult | None, refused: str, repaired: SensorLog | None) -> RecordingView:
-    try:
-        repaired = repaired or screen(log)
-    except DataError as error:
-        refused = refused or str(error)
-    figures: dict[str, Any] = {"odometry": odometry_figures(log.odometry)}
-    turning = None
-    if log.ranges is not None and len(log.ranges.stamps):
-        figures["uwb"] = radio_figures(log)
-        made = ((), ()) if result is None else (result.anchors, result.calibration)
-        figures["radio calibration"] = calibration_figures(*made)
-    if log.scans is not None and len(log.scans.stamps):
-        figures["lidar"] = lidar_figures(log)
-        figures["lidar"]["turning"], turning = turning_figures(log, _turn_ratio(repaired))
-    return RecordingView(log, repaired, result, refused, figures, turning)
-
-
-def _turn_ratio(repaired: SensorLog | None) -> tuple[float, float]:
-    screening = None if repaired is None else repaired.screening
-    return (float("nan"), float("nan")) if screening is None else screening.turn_ratio
-
-
 def _check_notes(view: RecordingView) -> Iterator[Finding]:
     """Say what the reader saw: lines that are broken, oddities."""
-    notes: LogNotes = view.log.notes
+    notes = view.log.notes
     if notes.broken:
         first = "; ".join(f"line {number}: {why}" for number, why in notes.broken_lines[:3])
         text = f"{notes.broken} of {notes.lines} lines are broken and were skipped ({first})"
@@ -138,29 +117,28 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
         yield Finding("refused", DOUBT, view.refusal, "no map is made before that is fixed", "log")
     if view.result is not None:
         yield from view.result.findings
-    elif view.repaired is not None:
-        for finding in check_recording(view.repaired):
-            if finding.kind == WHEELS_AGAINST_LIDAR:
-                cure = "a map is doubted for it, unless its ranges agree with the lidar there"
-                yield replace(finding, severity=WARNING, cure=cure)
-            elif finding.severity == DOUBT:
-                yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there")
-            else:
-                yield replace(finding, cure="a map repairs it so; the files stay as they are")
+        return
+    for finding in [] if view.repaired is None else check_recording(view.repaired):
+        if finding.kind == WHEELS_AGAINST_LIDAR:
+            cure = "a map is doubted for it, unless its ranges agree with the lidar there"
+            yield replace(finding, severity=WARNING, cure=cure)
+        elif finding.severity == DOUBT:
+            yield replace(finding, cure="the map will be doubted: repair the recording, or cut it there")
+        else:
+            yield replace(finding, cure="a map repairs it so; the files stay as they are")
 
 
 def _check_sensors(view: RecordingView) -> Iterator[Finding]:
     """Say which sensors are missing."""
-    log, repaired = view.log, view.repaired
-    sensors = () if repaired is None else (s for s in (repaired.ranges, repaired.scans) if s is not None and len(s.stamps) > 1)
-    if repaired is not None and not any(True for _ in sensors):
+    repaired, notes = view.repaired, view.log.notes
+    sensors = () if repaired is None else (repaired.ranges, repaired.scans)
+    if repaired is not None and not any(sensor is not None and len(sensor.stamps) > 1 for sensor in sensors):
         text = "neither ranges nor scans are left to constrain the trajectory"
         yield Finding("odometry-alone", DOUBT, text, "odometry alone drifts", "log")
     if "uwb" not in view.figures:
         cure = "the map rests on wheels and lidar; check the tag if that is not meant"
-        if log.notes.unread:
-            unread = ", ".join(log.notes.unread)
-            cure = f"there may be some in what was not read: {unread}; `mappings` say where (see above)"
+        if notes.unread:
+            cure = f"there may be some in what was not read: {', '.join(notes.unread)}; `mappings` say where (see above)"
         yield Finding("no-ranges", NOTE, "there are no UWB ranges", cure, "radio")
     if "lidar" not in view.figures:
         cure = "there will be a trajectory and anchors, but no map"
@@ -168,24 +146,18 @@ def _check_sensors(view: RecordingView) -> Iterator[Finding]:
 
 
 def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
-    """Say what the figures of each sensor show."""
-    yield from _as_written(view, check_odometry(view.log.odometry, view.figures["odometry"]))
-    if "uwb" in view.figures:
-        yield from check_radio(view.figures["uwb"])
-    if "lidar" in view.figures:
-        yield from _as_written(view, check_lidar(view.figures["lidar"]))
-        if show_motion(view.log.scans):
-            yield from check_turning(view.turning, view.turn_ratio)
+    """Say what the figures of each sensor show.
 
-
-def _as_written(view: RecordingView, findings: Iterable[Finding]) -> Iterator[Finding]:
-    """Yield findings, those about the rhythm of a log whose odometry and scans share messages as what they are.
-
-    Such a log was corrected or thinned by a program: its rhythm is the program's, and not that of sensors, cables or computer.
+    A log whose odometry and scans share messages was corrected or thinned by a program: its rhythm is the program's, and not
+    that of sensors, cables or computer.
     """
-    for finding in findings:
-        if view.log.notes.one_clock and finding.kind in ("silences", "slow-odometry"):
+    figures = view.figures
+    found = [*sensor_checks.check_odometry(view.log.odometry, figures["odometry"])]
+    found += sensor_checks.check_radio(figures["uwb"]) if "uwb" in figures else ()
+    found += sensor_checks.check_lidar(figures["lidar"]) if "lidar" in figures else ()
+    found += sensor_checks.check_turning(view.turning, view.turn_ratio) if show_motion(view.log.scans) else ()
+    for finding in found:
+        if view.log.notes.one_clock and finding.kind in ("silences", "slow-odometry") and finding.sensor != "radio":
             cure = "a program wrote a pose with each scan that it used; where the raw log is left, map that"
-            yield replace(finding, severity=NOTE, cure=cure)
-        else:
-            yield finding
+            finding = replace(finding, severity=NOTE, cure=cure)
+        yield finding

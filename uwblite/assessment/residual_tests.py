@@ -5,15 +5,14 @@ is not specific to one fault.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
-from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
-from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..loop_closure.chain_breaks import untied_breaks
 from ..loop_closure.closures import LoopClosureConfig
@@ -22,7 +21,6 @@ from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import blocked
 from ..radio.range_noise import short_term_sigma
 from .facts import listed
-from .moments import between_keyframes, seconds
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -31,18 +29,38 @@ _FREE, _EARLY = 0.1, 0.05
 """Least share of ranges in line of sight to represent all, and share that gross errors make too short."""
 NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
-_SUDDEN = 5.0
-"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
-_JUMP, _CARRIED = 20.0, 0.5
-"""Standard deviations that a step of wheels on the floor never exceeds, and the size, m or rad, too large for slip."""
+_SUDDEN, _JUMP, _CARRIED = 5.0, 20.0, 0.5
+"""Standard deviations that a step of faultless wheels hardly ever exceeds, and one of wheels on the floor never; and the size,
+m or rad, too large for slip."""
 _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
-_MEASURED_BREAK = 0.15
+_MEASURED = 0.15
 """Steps more uncertain than that, m, are no measurements."""
-_WAYS = 0.15
-"""Relative difference of distances between scans by lidar and by wheels; single scans measure it to a few per cent."""
-_SCALE = 0.12
-"""Relative difference of lengths by two sensors beyond which one of them is wrong."""
+_SCALE = 0.15
+"""Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
+
+
+def seconds(recordings: Recordings, keyframe: int) -> float:
+    """Return the time of a keyframe since the first one of its recording, s."""
+    first = int((recordings.of_keyframe == recordings.of_keyframe[keyframe]).argmax())
+    return float(recordings.stamps[keyframe] - recordings.stamps[first])
+
+
+def between_keyframes(finding: Finding, recordings: Recordings, *spans: tuple[int, int]) -> Finding:
+    """Return a finding that concerns the stretches from one keyframe to another, with the command that leaves them out.
+
+    Parameters
+    ----------
+    spans : first and last keyframe of each stretch, in one recording; there is one at least.
+    """
+    stretches = tuple((float(recordings.stamps[first]), float(recordings.stamps[last])) for first, last in spans)
+    begin, end = seconds(recordings, spans[0][0]), seconds(recordings, spans[-1][1])
+    number = int(recordings.of_keyframe[spans[0][0]]) + 1
+    cure = (
+        f"`end={begin:.0f}` and `start={end:.0f}` give the parts before and after it; "
+        "map each, or both together where they have anchors in common"
+    )
+    return replace(finding, recording=number, stretches=stretches, cure=cure)
 
 
 def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
@@ -70,11 +88,12 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
     apart = ranges.anchor + (ranges.anchor.max() + 1) * task.recordings.of_keyframe[ranges.pose]
     short = short_term_sigma(ranges.stamps[alive], apart[alive], ranges.ranges[alive], task.config.ranges)
     most = min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES)
-    typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
+    typical = _typical_spread(residuals[alive], ranges.anchor[alive])
     if most < typical < NO_DISTANCES and grid is not None and np.mean(residuals[alive] < -most) < _EARLY:
-        free = alive & ~_through_walls(estimate.graph, ranges, grid)
+        tags, anchors = ranges.tag_positions(estimate.graph.poses), estimate.graph.anchors[ranges.anchor]
+        free = alive & ~blocked(tags, anchors, grid.occupied_points(), least=1)
         if free.sum() > _FREE * alive.sum():
-            typical = float(np.median(_spread_by_anchor(residuals[free], ranges.anchor[free])))
+            typical = _typical_spread(residuals[free], ranges.anchor[free])
     if typical <= most:
         return
     kind = "range-scatter"
@@ -89,11 +108,6 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
     yield doubt(kind, text, typical=typical, short_term=short)
 
 
-def _through_walls(graph: Graph, ranges: RangeEdges, grid: OccupancyGrid) -> Bools:
-    """Return which ranges (m,) lead through an occupied cell of the map, cells as wide as those of line_of_sight or less."""
-    return blocked(ranges.tag_positions(graph.poses), graph.anchors[ranges.anchor], grid.occupied_points(), least=1)
-
-
 def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find steps of the odometry that the map contradicts far beyond their noise, whatever that was estimated to be.
 
@@ -104,7 +118,7 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     if not len(wheels):
         return
     whitened = wheels.residuals(estimate.graph)
-    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
+    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED
     off = np.where(measured, np.abs(whitened).max(axis=1), 0.0)
     far, stretch = np.flatnonzero(off > _JUMP), _stretch(off > _SUDDEN)
     if stretch is not None:
@@ -124,13 +138,21 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         measured[far] = False
         loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
         far = np.intersect1d(far, loose)
-        yield from _loose_links(np.setdiff1d(loose, far) if estimate.placed.any() else loose, estimate, recordings)
+        at = (recordings.stamps[wheels.i[loose]] - recordings.stamps[0]).tolist()
+        if at and not estimate.placed.any():
+            # Along a bare wall scans leave a direction free, and nothing else connects the parts before and after.
+            text = (
+                f"at t = {listed(at)} s the odometry fails where the lidar cannot measure the travelled distance, as along a "
+                "bare wall, and no loop closure connects the parts before and after: they may be misplaced to each other; "
+                "drive through the first part once more"
+            )
+            yield doubt("loose-links", text, at=at)
     if estimate.placed.any() and len(far):
         yield _slips(far, whitened, wheels, recordings)
 
 
 def _error_of(wheels: OdometryEdges, at: Ints, whitened: Floats) -> tuple[Floats, Floats]:
-    """Return way, m, and turn, rad, by which steps (s,) of the odometry are off."""
+    """Return way (s,), m, and turn (s,), rad, by which steps (s,) of the odometry are off."""
     off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
     return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
 
@@ -157,47 +179,6 @@ def _stretch(off: Bools) -> tuple[int, int] | None:
     return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
 
 
-def _loose_links(loose: Ints, estimate: Estimate, recordings: Recordings) -> Iterator[Finding]:
-    """Doubt a map with steps (l,) that no odometry measured and scans leave free in a direction, as along a bare wall.
-
-    Ranges connect the parts before and after, unless those of half of the anchors contradict the map in one of them.
-    """
-    wheels, stamps = estimate.odometry, recordings.stamps
-    links = wheels.j[loose]
-    if estimate.placed.any() and estimate.ranges is not None:
-        links = _contradicted_by_ranges(links, estimate.graph, estimate.ranges)
-    at = (stamps[links - 1] - stamps[0]).tolist()
-    if at:
-        yield doubt(
-            "loose-links",
-            f"at t = {listed(at)} s the odometry fails where the lidar cannot measure the travelled distance, as along a bare "
-            "wall, and no loop closure connects the parts before and after, nor do ranges that agree: they may be misplaced "
-            "to each other; drive through the first part once more",
-            at=at,
-        )
-
-
-def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> Ints:
-    """Return those first keyframes (b,) of parts of a map at which one begins or ends that half of the anchors contradict.
-
-    An anchor contradicts a part if its ranges there, at least a few, are usually off by more than obstacles or radios explain.
-    """
-    firsts, alive = np.unique(firsts), ranges.alive
-    off = np.abs(ranges.residuals(graph)[:, 0] * ranges.sigma)
-    part = np.searchsorted(firsts, ranges.pose, "right")
-    wrong = np.zeros(len(firsts) + 1, dtype=bool)
-    for k in range(len(wrong)):
-        own = [off[alive & (part == k) & (ranges.anchor == a)] for a in np.unique(ranges.anchor)]
-        typical = np.array([np.median(some) for some in own if len(some) >= _FEW_RANGES])
-        wrong[k] = np.sum(typical > _CONTRADICTS) >= max(0.5 * len(typical), _CONTRADICTING)
-    return firsts[wrong[:-1] | wrong[1:]]
-
-
-_FEW_RANGES, _CONTRADICTS, _CONTRADICTING = 3, 1.0, 2
-"""Least number of ranges to an anchor in a part, m by which they contradict it, and the least number of such anchors: behind
-furniture ranges are too long by half a metre, and one anchor may have been moved."""
-
-
 def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Compare the lengths that odometry, lidar and radio measure."""
     calibration, lidar = estimate.graph.calibration, task.recordings.have_scans
@@ -210,7 +191,7 @@ def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
         yield doubt("scales", text, range_scale=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
-    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]
+    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _SCALE)]
     if len(off):
         outcome = f"the ranges are {scale:.2f} times" if estimate.placed.any() else "no ranges measure"
         text = (
@@ -230,7 +211,6 @@ def check_support(estimate: Estimate, task: Task) -> Iterator[Finding]:
         yield doubt("odometry-alone", text)
 
 
-def _spread_by_anchor(residuals: Floats, anchor: Ints) -> Floats:
-    """Return the robust standard deviation of the residuals (m,) of each anchor that has any, m."""
-    own = [residuals[anchor == k] for k in np.unique(anchor)]
-    return np.array([spread_about_median(r) for r in own])
+def _typical_spread(residuals: Floats, anchor: Ints) -> float:
+    """Return the robust standard deviation of the residuals (m,) of a typical anchor, m."""
+    return float(np.median([spread_about_median(residuals[anchor == k]) for k in np.unique(anchor)]))

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Ints, spread_about_median
+from ..arrays import Floats, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
@@ -37,11 +36,11 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    residuals, weights = _range_residuals(graph, ranges)
-    typical = 0.0
-    if ranges is not None and estimate.placed.any():
-        own = (residuals[ranges.anchor == k] for k in np.flatnonzero(estimate.placed))
-        typical = float(np.median([spread_about_median(r) for r in own]))
+    residuals, typical = np.zeros(0), 0.0
+    if ranges is not None:
+        residuals = -ranges.residuals(graph)[:, 0] * ranges.sigma
+        own = [residuals[ranges.anchor == k] for k in np.flatnonzero(estimate.placed)]
+        typical = float(np.median([spread_about_median(r) for r in own])) if own else 0.0
     # Relative to the scatter of a typical anchor's ranges; relative to its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
@@ -55,7 +54,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
     calibrated = tuple(
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
     )
-    table = {} if ranges is None else _range_table(ranges, graph, residuals, weights, np.abs(residuals) < limit, recordings)
+    table = {} if ranges is None else _range_table(ranges, graph, residuals, limit, recordings)
     shape = shape_error(graph.poses[covariance.chosen], covariance.among)
     plausibility.judge(plausibility.ResultView(task, estimate, anchors, calibrated, listed, table, grid, shape))
     anchors = _distrusted(anchors, stages.doubts)
@@ -88,26 +87,18 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Finding]) 
     return tuple(replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors)
 
 
-def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:
-    """Return residuals (m,), measured minus expected, m, and final weights (m,) of all ranges."""
-    if ranges is None:
-        return np.zeros(0), np.zeros(0)
-    whitened = ranges.residuals(graph)[:, 0]
-    return -whitened * ranges.sigma, ranges.own_weights * ranges.kernel.weight(whitened**2)
-
-
 def _range_table(
-    ranges: RangeEdges, graph: Graph, residuals: Floats, weights: Floats, agrees: Bools, recordings: Recordings
+    ranges: RangeEdges, graph: Graph, residuals: Floats, limit: float, recordings: Recordings
 ) -> dict[str, Floats]:
-    """Return the table of all ranges; see MapResult.range_table."""
+    """Return the table of all ranges; see MapResult.range_table. Those agree whose residuals are below a limit, m."""
     x, y = ranges.tag_positions(graph.poses).T
     return {
         "stamp": ranges.stamps,
         "anchor": ranges.anchor.astype(np.float64),
         "range": ranges.ranges,
         "residual": residuals + ranges.ranges - ranges.corrected,
-        "weight": weights,
-        "agrees": agrees.astype(np.float64),
+        "weight": ranges.own_weights * ranges.kernel.weight((residuals / ranges.sigma) ** 2),
+        "agrees": (np.abs(residuals) < limit).astype(np.float64),
         "x": x,
         "y": y,
         "theta": ranges.headings(graph.poses),
@@ -119,7 +110,11 @@ def _anchor(
     k: int, estimate: Estimate, recordings: Recordings, covariance: Covariances, residuals: Floats, limit: float
 ) -> AnchorEstimate:
     graph, found, ranges, name = estimate.graph, estimate.bootstrap, estimate.ranges, estimate.anchor_ids[k]
-    count = _count(name, recordings) if ranges is None else int(np.sum(ranges.anchor == k))
+    if ranges is not None:
+        count = int(np.sum(ranges.anchor == k))
+    else:
+        logs = [(r.log.ranges, r.anchor_ids.index(name)) for r in recordings.each if name in r.anchor_ids]
+        count = sum(int(np.sum(own.anchor == index)) for own, index in logs if own is not None)
     if found is None or ranges is None or not found.placed[k]:
         reason = f"its {count} ranges were too few or did not agree on a place"
         nowhere = np.full(2, np.nan)
@@ -140,7 +135,13 @@ def _anchor(
     # Readings that are no distances, or were left out as made on the way from place to place, are not short.
     measured = own[ranges.alive[ranges.anchor == k]]
     short = int(np.sum(measured + max(bias, 0.0) < -max(limit, _SHORT)))
-    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
+    doubtful = _reason_to_distrust(used, sigma, longest, bias, scatter)
+    if not doubtful and short > max(_FEW_SHORT, _SHARE_SHORT * len(measured)):
+        doubtful = (
+            f"{short} of its {len(measured)} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for "
+            "a time?"
+        )
+    if doubtful:
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
         name,
@@ -161,11 +162,8 @@ def _anchor(
 def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
     """Return the reason why an anchor is distrusted, '' where it is not.
 
-    Parameters
-    ----------
-    used : share of its ranges that agree with the map. sigma : standard deviation of its place, m. longest : its longest
-        range, m: it stands nearer than that, and with a larger uncertainty the place is unknown. bias : constant error, m.
-        scatter : robust standard deviation of its ranges about the map, m.
+    By the share of its ranges that agree with the map, the standard deviation of its place, m, its longest range, m (it stands
+    nearer than that), the constant error and the robust standard deviation of its ranges, m.
     """
     if used < DISAGREE:
         return f"only {used:.0%} of its ranges agree with the map"
@@ -176,13 +174,6 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
     if scatter > NO_DISTANCES:
         return f"its ranges scatter by {scatter:.1f} m about the map: they are not distances to one place"
     return ""
-
-
-def _reason_of_short_ranges(short: int, count: int) -> str:
-    """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
-    if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
-        return ""
-    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"
 
 
 def _with_times(
@@ -196,41 +187,23 @@ def _with_times(
     for k in range(len(anchors)):
         own = ranges.anchor == k
         if np.sum(bases == bases[k]) > 1 and own.any():
-            at = _shown_in(k, bases, ranges, recording)
+            # The first recording with ranges to this place and to another of the anchor; else the first with the one.
+            others = np.isin(ranges.anchor, np.flatnonzero(bases == bases[k])) & ~own
+            both = np.intersect1d(recording[own], recording[others])
+            at = (both if len(both) else recording[own]).min()
             dated[k] = replace(anchors[k], since=float(np.min(ranges.stamps[own & (recording == at)])))
     return tuple(dated)
-
-
-def _shown_in(k: int, bases: NDArray[np.str_], ranges: RangeEdges, recording: Ints) -> int:
-    """Return the first recording with ranges to an anchor's place and to another of its places; else the first with the one.
-
-    Parameters
-    ----------
-    bases : (a,) names of anchors before they were moved. recording : (m,) of each range.
-    """
-    own, others = ranges.anchor == k, np.isin(ranges.anchor, np.flatnonzero(bases == bases[k]))
-    both = np.intersect1d(recording[own], recording[others & ~own])
-    return int((both if len(both) else recording[own]).min())
-
-
-def _count(name: str, recordings: Recordings) -> int:
-    """Return how many ranges to an anchor the recordings hold."""
-    measured = [(r.log.ranges, r.anchor_ids.index(name)) for r in recordings.each if name in r.anchor_ids]
-    return sum(int(np.sum(ranges.anchor == k)) for ranges, k in measured if ranges is not None)
 
 
 def _calibration(
     k: int, unknown: Unknown, graph: Graph, covariance: Covariances, by_steps: float | None
 ) -> CalibrationEstimate:
-    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (calibration_checks)."""
-    value = float(graph.calibration.values[k])
+    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before."""
+    value, sigma, state, why = float(graph.calibration.values[k]), float(covariance.calibration[k]), "estimated", ""
     if by_steps is not None:
-        return CalibrationEstimate(unknown.key, value, by_steps, unknown.unit, unknown.meaning, "estimated")
-    if graph.fixed_calibration[k]:
-        why = "this recording has no measurement of it" if value == 0.0 else "fixed"
-        return CalibrationEstimate(unknown.key, value, unknown.sigma, unknown.unit, unknown.meaning, "prior", why)
-    sigma = float(covariance.calibration[k])
-    if sigma > _SHOWN * unknown.sigma:
-        why = "the recording does not show it better than the prior"
-        return CalibrationEstimate(unknown.key, value, sigma, unknown.unit, unknown.meaning, "prior", why)
-    return CalibrationEstimate(unknown.key, value, sigma, unknown.unit, unknown.meaning, "estimated")
+        sigma = by_steps
+    elif graph.fixed_calibration[k]:
+        sigma, state, why = unknown.sigma, "prior", "this recording has no measurement of it" if value == 0.0 else "fixed"
+    elif sigma > _SHOWN * unknown.sigma:
+        state, why = "prior", "the recording does not show it better than the prior"
+    return CalibrationEstimate(unknown.key, value, sigma, unknown.unit, unknown.meaning, state, why)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats
 from ..findings import Finding, doubt
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
@@ -20,14 +20,18 @@ from ..pipeline.recordings import Recording
 from ..sensor_log.sensors import radio_name
 
 _SILENT, _DRIVEN = 10.0, 3.0
-"""Time without any scan, s, and distance meanwhile, m, after which an odometry that failed may have any error."""
+"""Time without any scan, s, and distance meanwhile, m, after which an odometry that failed may have any error. Anchors that all
+end, and others that all appear, within this time were not passed one after the other."""
 _PART = 6
 """Least number of keyframes of a part for a doubt."""
 _ANCHORS, _MEASURED = 2, 3
-"""Least number of anchors that connect two parts, and of ranges to each of them in each part; also of constrained keyframes at
-an end of a recording."""
-_AT_ONCE = 10.0
-"""s; anchors that all end, and others that all appear, within this time were not passed one after the other."""
+"""Least number of anchors that connect two parts, or by which more agree than do not; and of ranges to each of them, also of
+constrained keyframes at an end of a recording."""
+_PER_METRE, _PER_SECOND = 0.02, 0.001
+"""rad/m, rad/s; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives
+straight on at 0.2 m/s exceeds the limit below after 7 m; one without other sensors for 10 s is off by some centimetres."""
+_ASTRAY = 0.5
+"""m; error of a place from which on the map counts as wrong there."""
 
 
 def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
@@ -61,40 +65,30 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
     Errors of the wheels there leave no residual, and sigmas assume faultless wheels. The middle of a recording
     is constrained from both sides.
     """
-    held = _held(estimate.graph, ranges)
+    ends = [] if ranges is None else [ranges.pose]
+    ends += [np.append(e.i, e.j) for e in estimate.graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
+    held = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends]))
     for recording in task.recordings.each if len(held) else ():
         frames, places = recording.frames, estimate.graph.poses[recording.rows, :2]
         own = held[recording.has(held)] - recording.rows.start
         first, last = (int(own[_MEASURED - 1]), int(own[-_MEASURED])) if len(own) >= _MEASURED else (0, 0)
-        back, on = slice(first, None, -1), slice(last, None)
-        before, after = slice(None, first), slice(last, None)
-        ends = (
-            ("until", first, places[back], frames.path[before][::-1], frames.duration[before][::-1]),
-            ("from", last, places[on], frames.path[after], frames.duration[after]),
-        )
-        for word, at, way, lengths, durations in ends:
-            off, seconds = float(dead_reckoning_error(way, lengths, durations).max()), frames.stamps[at] - frames.stamps[0]
+        for word, edge, rows in (("until", "start", np.arange(first, -1, -1)), ("from", "end", np.arange(last, len(places)))):
+            steps, (begin, end) = np.minimum(rows[1:], rows[:-1]), sorted(frames.stamps[rows[[0, -1]]].tolist())
+            way, at = float(frames.path[steps].sum()), float(frames.stamps[rows[0]])
+            off = float(dead_reckoning_error(places[rows], frames.path[steps], frames.duration[steps]).max())
             if off > _ASTRAY:
+                seconds = at - frames.stamps[0]
                 loose = doubt(
                     "untied-parts",
-                    f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
-                    f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "
-                    "why no sensor measured there",
-                    at=float(frames.stamps[at]),
-                    way=float(lengths.sum()),
+                    f"{word} t = {seconds:.0f} s, over {way:.0f} m, neither scans nor ranges constrain the trajectory: "
+                    f"usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out why no sensor "
+                    "measured there",
+                    at=at,
+                    way=way,
                     error=off,
                 )
-                ends_at = sorted((float(frames.stamps[at]), float(frames.stamps[0 if word == "until" else -1])))
-                edge = "start" if word == "until" else "end"
                 cure = f"`{edge}={seconds:.0f}` leaves that part out"
-                yield replace(loose, recording=recording.number + 1, stretches=((ends_at[0], ends_at[1]),), cure=cure)
-
-
-def _held(graph: Graph, ranges: RangeEdges | None) -> Ints:
-    """Return the keyframes that scans, closures and ranges constrain, in order."""
-    ends = [] if ranges is None else [ranges.pose]
-    ends += [np.append(e.i, e.j) for e in graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends]))
+                yield replace(loose, recording=recording.number + 1, stretches=((begin, end),), cure=cure)
 
 
 def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
@@ -113,13 +107,6 @@ def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> 
         arms = np.cumsum(turns)[:, None] * places[1:] - np.cumsum(turns[:, None] * middles, axis=0)
         row[1:] = np.hypot(arms[:, 0], arms[:, 1])
     return np.asarray(np.hypot(*moved))
-
-
-_PER_METRE, _PER_SECOND = 0.02, 0.001
-"""rad/m, rad/s; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives
-straight on at 0.2 m/s exceeds the limit below after 7 m; one without other sensors for 10 s is off by some centimetres."""
-_ASTRAY = 0.5
-"""m; error of a place from which on the map counts as wrong there."""
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
@@ -147,14 +134,16 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     np.add.at(spans, appears, 1)
     np.add.at(spans, silent, -1)
     at = np.flatnonzero(np.cumsum(spans)[: len(anchor)] == 0)[:-1]
-    return [(float(stamps[k]), float(stamps[k + 1])) for k in at.tolist() if _suddenly(stamps, anchor, k)]
-
-
-def _suddenly(stamps: Floats, anchor: Ints, k: int) -> bool:
-    """Return whether several anchors are measured shortly before a range and several shortly after the next."""
-    before = (stamps > stamps[k] - _AT_ONCE) & (stamps <= stamps[k])
-    after = (stamps > stamps[k]) & (stamps < stamps[k + 1] + _AT_ONCE)
-    return min(len(np.unique(anchor[side])) for side in (before, after)) >= _ANCHORS
+    # Several are measured shortly before such a range, and several shortly after the next.
+    sides = [
+        ((stamps > stamps[k] - _SILENT) & (stamps <= stamps[k]), (stamps > stamps[k]) & (stamps < stamps[k + 1] + _SILENT))
+        for k in at
+    ]
+    return [
+        (float(stamps[k]), float(stamps[k + 1]))
+        for k, pair in zip(at, sides, strict=True)
+        if min(len(np.unique(anchor[side])) for side in pair) >= _ANCHORS
+    ]
 
 
 def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> bool:
@@ -183,7 +172,7 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]
     alive = ranges.rows(np.flatnonzero(ranges.alive))
     counts = np.zeros((len(recordings.each), len(names)), dtype=np.intp)
     np.add.at(counts, (recordings.of_keyframe[alive.pose], alive.anchor), 1)
-    heard = (counts >= _HEARD) & estimate.placed
+    heard = (counts >= _MEASURED) & estimate.placed
     radio = np.array([radio_name(name) for name in names])
     ends = recordings.of_keyframe[np.stack([estimate.closures.edges.i, estimate.closures.edges.j])]
     # Of two that contradict each other, the second is named.
@@ -192,7 +181,7 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]
         same = heard[n] & others
         moved = np.setdiff1d(np.intersect1d(radio[heard[n]], radio[others]), radio[same])
         tied = np.any((ends == n).any(axis=0) & (ends[0] != ends[1]))
-        if len(moved) and int(same.sum()) - len(moved) < _MAJORITY and not tied:
+        if len(moved) and int(same.sum()) - len(moved) < _ANCHORS and not tied:
             yield doubt(
                 "untied-parts",
                 f"{recording.name} has {int(same.sum())} anchors where the others have them and {len(moved)} elsewhere "
@@ -201,9 +190,3 @@ def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]
                 recording=n + 1,
                 moved=moved.tolist(),
             )
-
-
-_HEARD = 3
-"""Ranges of a recording to an anchor from which on it says where that is."""
-_MAJORITY = 2
-"""More anchors that agree than do not, for those that agree to be the ones that were not moved."""

@@ -33,17 +33,7 @@ class ScanRays:
 
 
 def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
-    """Choose scans such that between neighbours the laser moved or turned far enough; the first is always in.
-
-    Parameters
-    ----------
-    poses : (k, 3) T_map_laser of each scan.
-    distance : m; 0 chooses every scan.
-
-    Returns
-    -------
-    (s,) indices.
-    """
+    """Choose scans (s,) such that between neighbours the laser, at poses (k, 3), moved or turned far enough; 0 m: all."""
     if distance <= 0.0 or len(poses) == 0:
         return np.arange(len(poses))
     chosen = [0]
@@ -54,45 +44,6 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
             chosen.append(index)
             x0, y0, theta0 = x, y, theta
     return np.array(chosen, dtype=np.intp)
-
-
-def seen_reach(scans: LaserScans, chosen: Ints, max_range: float = math.inf) -> NDArray[np.float32]:
-    """Return the length (s, b) of the rays of chosen scans (s,) that ended at something up to max_range, m; 0 = none."""
-    readings = scans.ranges[chosen]
-    return np.where(scans.hits(readings, max_range), readings, np.float32(0.0))
-
-
-def empty_reach(scans: LaserScans, chosen: Ints, distance: float, run: int) -> NDArray[np.float32]:
-    """Return `distance` (s, b), m, for beams of chosen scans that saw nothing, in runs of at least `run`; 0 = others."""
-    reach = np.float32(min(distance, scans.range_max))
-    return np.where(in_runs(np.isposinf(scans.ranges[chosen]), run), reach, np.float32(0.0))
-
-
-def scan_rays(
-    scans: LaserScans, reach: NDArray[np.float32], first: Floats, last: Floats | None = None, *, flipped: bool = False
-) -> ScanRays:
-    """Return the rays of some scans.
-
-    Parameters
-    ----------
-    reach : (s, b) length of the rays of each scan, m; where it is 0 there is no ray.
-    first : (s, 3) T_map_laser at the first ray of each scan.
-    last : (s, 3) T_map_laser at the last ray; in between the laser moves evenly. None = it stood still.
-    flipped : the laser is mounted upside down; its rays run clockwise.
-    """
-    rows = np.flatnonzero(reach > 0)
-    beams = reach.shape[1]
-    moved = np.zeros_like(first) if last is None else last - first
-    moved[:, 2] = se2.wrap_angle(moved[:, 2])
-    fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
-    bearing = (first[:, 2:] + (-scans.angles if flipped else scans.angles)) + moved[:, 2:] * fraction
-    # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
-    bearing, length = bearing.astype(np.float32).take(rows), reach.take(rows)
-    origins, ends = np.empty((2, 2, len(rows)))
-    for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
-        origins[axis] = (first[:, axis, None] + moved[:, axis, None] * fraction).take(rows)
-        ends[axis] = origins[axis] + length * direction
-    return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(reach > 0, axis=1)))
 
 
 def in_runs(flags: Bools, least: int) -> Bools:
@@ -127,9 +78,19 @@ class Sweeps:
             raise DataError(f"{count} scans need as many poses, not {first.shape}")
 
     def rays(self, chosen: Ints, reach: NDArray[np.float32]) -> ScanRays:
-        """Return the rays of chosen scans (s,), whose lengths (s, b) are given, m; see scan_rays."""
-        last = None if self.last is None else self.last[chosen]
-        return scan_rays(self.scans, reach, self.first[chosen], last, flipped=self.flipped)
+        """Return the rays of chosen scans (s,), whose lengths (s, b) are given, m; where one is 0 there is no ray."""
+        rows, first, beams = np.flatnonzero(reach > 0), self.first[chosen], reach.shape[1]
+        moved = np.zeros_like(first) if self.last is None else self.last[chosen] - first
+        moved[:, 2] = se2.wrap_angle(moved[:, 2])
+        fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
+        bearing = (first[:, 2:] + (-self.scans.angles if self.flipped else self.scans.angles)) + moved[:, 2:] * fraction
+        # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
+        bearing, length = bearing.astype(np.float32).take(rows), reach.take(rows)
+        origins, ends = np.empty((2, 2, len(rows)))
+        for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
+            origins[axis] = (first[:, axis, None] + moved[:, axis, None] * fraction).take(rows)
+            ends[axis] = origins[axis] + length * direction
+        return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(reach > 0, axis=1)))
 
 
 def from_sweeps(
@@ -257,10 +218,11 @@ class _Task:
 
     def reach(self, some: Ints, empty: bool) -> NDArray[np.float32]:
         """Return the length of the beams of some scans, m, with a reading or without; 0 = others."""
-        scans, config = self.sweeps.scans, self.config
+        scans, config, readings = self.sweeps.scans, self.config, self.sweeps.scans.ranges[some]
         if empty:
-            return empty_reach(scans, some, config.max_clear_distance, config.clear_run)
-        return seen_reach(scans, some, config.max_range or math.inf)
+            reach = np.float32(min(config.max_clear_distance, scans.range_max))
+            return np.where(in_runs(np.isposinf(readings), config.clear_run), reach, np.float32(0.0))
+        return np.where(scans.hits(readings, config.max_range or math.inf), readings, np.float32(0.0))
 
     def within(self, low: Floats, high: Floats) -> "_Task":
         """Return the task with the scans whose laser stood in a box."""

@@ -34,7 +34,6 @@ class UnclosedBag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.connections: list[Any] = []
-        self._numbers: dict[int, int] = {}
         counts, times = Counter[int](), [0]
         for number, time, _ in self._messages():
             counts[number] += 1
@@ -50,8 +49,7 @@ class UnclosedBag:
     def _add(self, number: int, topic: str, kind: str, definition: Any) -> None:
         from rosbags.interfaces import Connection
 
-        if number not in self._numbers:
-            self._numbers[number] = len(self.connections)
+        if all(connection.id != number for connection in self.connections):
             self.connections.append(Connection(number, topic, kind, definition, "", 0, None, self))  # type: ignore[arg-type]
 
     def _messages(self) -> Iterator[Message]:
@@ -190,12 +188,7 @@ class OpenBag:
         return tuple(topics[name] for name in sorted(topics))
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yield topic, time of recording, ns, and message of every message of some topics, in the order of recording.
-
-        Raises
-        ------
-        FormatError : the definition of such a message cannot be read.
-        """
+        """Yield topic, time of recording, ns, and message of every message of some topics, in the order of recording."""
         parts = []
         for reader in self.readers:
             wanted = [c for c in reader.connections if c.topic in topics]
@@ -267,11 +260,7 @@ def _words(error: Exception, most: int) -> str:
 
 @contextmanager
 def open_bag(path: str | os.PathLike[str]) -> Iterator[OpenBag]:
-    """Open a bag.
-
-    Parameters
-    ----------
-    path : a file of any name, told by its content, or the folder of a ROS 2 bag, with or without its metadata.yaml.
+    """Open a bag: a file of any name, told by its content, or the folder of a ROS 2 bag, with or without its metadata.yaml.
 
     Raises
     ------

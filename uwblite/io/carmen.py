@@ -1,9 +1,7 @@
 """CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds; docs/formats.md lists the messages.
 
 ``NAME contents ipc_timestamp ipc_hostname logger_timestamp``. UWB and GYRO are uwblite's own; other CARMEN readers skip them.
-ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp: both are
-accepted, and then the logger's time counts. A reading at or above the maximum range saw nothing (+inf); one below range_min is
-an error code (nan).
+ROBOTLASER1 exists with and without num_remissions and turn_axis, and some published logs leave out ipc_timestamp.
 """
 
 import hashlib
@@ -60,7 +58,7 @@ def read_log(
 
     Raises
     ------
-    FormatError : the file cannot be read, is no CARMEN log, has no odometry, or too many of its lines are broken.
+    FormatError : it is no CARMEN log, has no odometry, or too many of its lines are broken.
     ConfigError : there are no scans of the message that was asked for.
     """
     if every_nth_scan < 1:

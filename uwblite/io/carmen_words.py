@@ -75,10 +75,6 @@ def kinds_of(message: str) -> dict[bytes, bytes]:
     Parameters
     ----------
     message : name of the only message to read, such as ROBOTLASER2 of the second lidar; empty = the first lidar's.
-
-    Raises
-    ------
-    ConfigError : scans are not read from such a message.
     """
     if not message:
         return {name: name for name in RANK}
@@ -144,12 +140,7 @@ _TRUE = {b"1": True, b"on": True, b"true": True, b"yes": True, b"0": False, b"of
 
 
 class Params:
-    """The PARAM lines seen so far; a later line wins.
-
-    Parameters
-    ----------
-    laser : which of the robot's lidars is read, counted from 1.
-    """
+    """The PARAM lines seen so far, for one of the robot's lidars, counted from 1; a later line wins."""
 
     def __init__(self, laser: int = 1) -> None:
         self._names = {} if laser == 1 else dict.fromkeys(_OF_LASER, "")
@@ -208,9 +199,7 @@ class Params:
     def guess_scanner(self, beams: int) -> tuple[float, float]:
         """Return angle_min and angle_increment, rad, of an FLASER message, which gives only its number of readings.
 
-        The usual conventions: SICK LMS with 180/181 readings of 1 degree, 360/361 of half a degree, 401 of a quarter
-        (100 degrees); 0.5 and 0.25 degrees over 270 (541, 1081); 682/683 steps of 1/1024 turn (URG-04LX); otherwise
-        180 degrees over all readings. PARAM laser_front_laser_resolution (degrees) wins.
+        PARAM laser_front_laser_resolution (degrees) wins; a number that no usual scanner has spans 180 degrees.
         """
         resolution = self.get("laser_front_laser_resolution")
         if resolution is not None and 0.0 < abs(resolution) <= 180.0:
@@ -230,3 +219,4 @@ _USUAL_DEGREES = {
     **dict.fromkeys((400, 401, 720, 721, 1081), 0.25),
     **dict.fromkeys((682, 683), 360.0 / 1024),
 }
+"""Angle between the readings of SICK LMS and URG-04LX scanners, by their number."""

@@ -34,15 +34,7 @@ def read_constraints(path: str | None, anchors_from: str | None) -> Constraints:
 
 
 def parse_constraints(text: str, path: str = "") -> Constraints:
-    """Return the constraints of a TOML text; path is its name for error messages.
-
-    Tables: ``[[anchor]]``, ``[[pose]]``, ``[[anchor_distance]]``, ``[[landmark]]``, ``[[landmark_distance]]``,
-    ``[[closure]]``, ``[[forbidden_closure]]``, each with the fields of its class in constraints.py.
-
-    Raises
-    ------
-    ConfigError : a table or field is unknown, missing or of the wrong kind.
-    """
+    """Return the constraints of a TOML text, tables with the fields of their classes; path is its name for error messages."""
     data = parse_toml(text, path)
     entries: dict[str, tuple[Any, ...]] = {}
     for name, tables in data.items():
@@ -76,10 +68,6 @@ def read_anchors(path: str | os.PathLike[str]) -> Constraints:
 
     Where the map has an anchor at several places (``5C0B``, later ``5C0B@2``), the last one counts. Sigmas are taken as
     the larger of x and y, and at least 2 cm: an earlier map's own frame is not more certain than that.
-
-    Raises
-    ------
-    FormatError : it is not such a file, or no anchor in it has a place.
     """
     table = read_csv(path)
     names = table.texts("id")

@@ -67,12 +67,7 @@ class Sensors:
 
 
 def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: bool = False) -> None:
-    """Write a recording as CSV files into a folder, made where it is missing; all files are replaced together.
-
-    Raises
-    ------
-    ConfigError : the folder holds such files already and force is not given, or uwblite has not written them.
-    """
+    """Write a recording as CSV files into a folder, all together; raise ConfigError where others stand there."""
     path = Path(folder)
     present = [path / name for name in _FILES if (path / name).is_file()]
     if present and not force:
@@ -118,12 +113,7 @@ def _sensors(log: SensorLog) -> Sensors:
 
 
 def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
-    """Read a recording from a folder of CSV files.
-
-    Raises
-    ------
-    FormatError : odometry.csv is missing, or a file is not what it should be.
-    """
+    """Read a recording from a folder of CSV files."""
     path, read, sensors = Path(folder), _Reading(), Sensors()
     if (path / "sensors.toml").exists():
         stated = parse_toml("".join(read.lines(path / "sensors.toml")), str(path / "sensors.toml"))

@@ -76,8 +76,8 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
 
 _LARGEST = 1 << 26
 """Bytes of a table that is read."""
-_FARTHEST = 1e9
-"""m; a number beyond it is no place on Earth."""
+_FARTHEST = 1e10
+"""m or s; a number beyond it is neither a place on Earth nor a time since 1970."""
 
 
 def csv_rows(lines: Iterable[str], path: str) -> Iterator[tuple[int, list[str]]]:

@@ -40,11 +40,8 @@ _LINES = 20
 
 
 def format_of_content(path: str) -> str:
-    """Return the format of a file: 'bag', 'log', 'g2o', 'pyfg', 'isam', 'librsf', 'tum', 'numbers' (a table without names), or
-    'rawlog', 'player', 'gfs', 'aria', 'rhino', which are not read.
-
-    '' of what is none of them, or cannot be read. TORO files are 'g2o', whose reader takes them.
-    """
+    """Return the format of a file: 'bag', 'log', 'g2o' (TORO too), 'pyfg', 'isam', 'librsf', 'tum', 'numbers' (a table without
+    names), 'rawlog', 'player', 'gfs', 'aria', 'rhino', which are not read, or '' of what is none of them, or cannot be read."""
     start = _beginning(path)
     if start.startswith(_BAGS):
         return "bag"
@@ -208,12 +205,7 @@ def graph_format(path: str) -> str:
 
 
 def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
-    """Read a pose graph of any known format, told by its content; standard input is g2o.
-
-    Raises
-    ------
-    FormatError : it is none.
-    """
+    """Read a pose graph of any known format, told by its content; standard input is g2o."""
     from .g2o import read_g2o
     from .pyfg import read_pyfg
 

@@ -30,12 +30,7 @@ _WITH_SIDEWAYS = 9
 
 
 def read_librsf(path: str | os.PathLike[str]) -> SensorLog:
-    """Read a recording, plain or gzip.
-
-    Raises
-    ------
-    FormatError : a line is wrong, or there is no odometry.
-    """
+    """Read a recording, plain or gzip; raise FormatError where a line is wrong, or there is no odometry."""
     speeds, ranges, names, skipped = array("d"), array("d"), dict[str, int](), Counter[str]()
     with open_source(path) as source:
         number = 0

@@ -103,7 +103,7 @@ def _unfiltered(rows: Image, channels: int, path: str) -> Image:
     above = np.zeros((width, channels), dtype=np.uint8)
     for start in range(0, height, _BAND):
         band = slice(start, start + _BAND)
-        image[band] = _by_diagonals(kinds[band], lines[band], above)
+        image[band] = _by_diagonals(kinds[band], lines[band], above) if kinds[band].any() else lines[band]
         above = image[band][-1]
     return image
 

@@ -65,12 +65,9 @@ _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
     """Read a planar PyFG graph, plain or gzip; ``-`` = standard input.
 
-    Chains of several robots may be tied by nothing but ranges, between their poses or to landmarks.
-
     Parameters
     ----------
-    from_odometry : forget where the vertices are and start from the edges between successive poses; landmarks that only
-        ranges measure then have no position (nan).
+    from_odometry : forget where the vertices are and start from the edges between successive poses.
 
     Raises
     ------

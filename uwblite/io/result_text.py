@@ -62,8 +62,7 @@ def covariance_csv(stamps: Floats, covariances: Floats, recordings: Ints | None 
 
     Parameters
     ----------
-    stamps : (n,) s. covariances : (n, 3, 3). recordings : (n,) of each pose, from 0; None = there is one.
-    trusted : (n,) poses that no doubt concerns; None = all.
+    recordings : (n,) of each pose, from 0; None = there is one. trusted : (n,) poses that no doubt concerns; None = all.
     """
     lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording,trusted"]
     upper = np.triu_indices(3)

@@ -34,16 +34,11 @@ def plan_bag(
 
 
 def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()) -> SensorLog:
-    """Read a bag; of one whose recording was not closed, what is complete.
+    """Read a bag (see open_bag); of one whose recording was not closed, what is complete.
 
     Parameters
     ----------
-    path : a file of any name, or the folder of a ROS 2 bag, with or without its metadata.yaml.
     mappings : how ranges stand in messages; the known ones are tried after these.
-
-    Returns
-    -------
-    SensorLog in time order; stamps are seconds since the epoch, as in the headers.
 
     Raises
     ------

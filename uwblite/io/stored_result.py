@@ -17,7 +17,6 @@ from ..sensor_log import MOST_ANCHORS
 from .csv_table import read_csv
 from .map_server import read_map
 from .results import repair_result
-from .source import finite
 from .tum import read_tum
 
 
@@ -102,13 +101,7 @@ class StoredResult:
         return se2.interpolate_trajectory(*self.trajectories[recording - 1], stamps)
 
     def trail(self, stamps: Floats, wheels: Floats, most: int) -> Floats:
-        """Return the poses (k, 3) since the last trajectory ends, by the odometry, in the map's frame.
-
-        Parameters
-        ----------
-        stamps, wheels : (n,) s and (n, 3) of the odometry; without readings of that time the last pose stands alone.
-        most : k is about this at most.
-        """
+        """Return about `most` poses (k, 3) since the last trajectory ends, by stamps (n,) and poses (n, 3) of the odometry."""
         known, poses = self.trajectories[-1]
         later = np.flatnonzero(stamps > known[-1])
         if not len(later) or stamps[0] > known[-1]:
@@ -119,12 +112,7 @@ class StoredResult:
 
 
 def read_result(folder: str | os.PathLike[str]) -> StoredResult:
-    """Read a result.
-
-    Raises
-    ------
-    FormatError : the folder holds none, or a file in it is not what it should be.
-    """
+    """Read a result; raise FormatError where a folder holds none, or a file in it is not what it should be."""
     path = Path(folder)
     repair_result(path)
     if not (path / "trajectory.tum").is_file():
@@ -140,13 +128,7 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
 
 
 def read_space(path: str, warnings: list[str]) -> tuple[OccupancyGrid, tuple[StoredAnchor, ...]]:
-    """Return the grid of a result, or of the map.yaml of any map, and the anchors where they are known.
-
-    Raises
-    ------
-    ConfigError : the result has no grid.
-    FormatError : as for `read_result` and `read_map`.
-    """
+    """Return the grid of a result, or of the map.yaml of any map, and the anchors where they are known."""
     if not os.path.isdir(path):
         return read_map(path, warnings), ()
     result = read_result(path)
@@ -180,10 +162,7 @@ def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
     if not path.exists():
         return np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3))
     table = read_csv(path)
-    # Stamps are times since 1970 in many recordings: too large for the lengths that a table is checked for.
-    texts = zip(table.texts("stamp"), table.lines, strict=True)
-    stamps = np.array([finite(text, f"stamp is {text[:40]!r}, not a time", table.path, line) for text, line in texts])
-    upper = table.numbers("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
+    stamps, upper = table.numbers("stamp")[:, 0], table.numbers("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
     covariances = np.empty((len(upper), 3, 3))
     row, col = np.triu_indices(3)
     covariances[:, row, col] = covariances[:, col, row] = upper

@@ -54,9 +54,9 @@ class BootstrapConfig:
     """Assumed standard deviation of ranges until it is learnt, m."""
     drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
-    heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
+    heading_scales: ClassVar[tuple[float, ...]] = tuple(2.0**k - 1.0 for k in (0, -1, 1, -0.5, 0.5, -0.25, 0.25))
     """Relative heading errors of the odometry, tried until the ranges agree: a wrong track width in the base's settings is the
-    most frequent gross fault, and a factor of two its most frequent value."""
+    most frequent gross fault, and a factor of two its most frequent value; then its roots."""
     enough: ClassVar[float] = 50.0
     """Travelled distance over which a heading error is tried before the whole path is, m."""
     agreement: ClassVar[float] = 2.0

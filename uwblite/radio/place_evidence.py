@@ -30,12 +30,10 @@ class MovePolicy:
     """That an anchor is moved while a recording is made."""
     moved_between: ClassVar[float] = 0.05
     """That it is moved between two recordings."""
-    blocked: ClassVar[float] = 0.3
-    """That its line of sight changes lastingly while a recording is made."""
-    high: ClassVar[float] = 0.3
-    """That an anchor whose height nobody gave is high above the tag."""
-    heights: ClassVar[tuple[float, ...]] = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    """m; heights that are tried."""
+    usual: ClassVar[float] = 0.3
+    """That its line of sight changes lastingly while a recording is made; that one whose height nobody gave is high."""
+    heights: ClassVar[tuple[float, ...]] = tuple(np.arange(1.0, 7.0).tolist())
+    """m; heights above the tag that are tried."""
     most_ranges: ClassVar[int] = 1000
     """Ranges of one radio that are compared, spread evenly; a place needs no more."""
     splits: ClassVar[int] = 3
@@ -205,7 +203,7 @@ class PlaceModel:
         between = self.track.recording[before] != self.track.recording[after]
         times = np.log(self.count[before]) * np.where(after - before > 1, 2.0, 1.0)
         moved = float(np.sum(np.where(between, np.log(policy.moved_between), np.log(policy.moved) - times)))
-        return moved + (float(np.log(policy.high / len(policy.heights))) if height != self.track.heights[0] else 0.0)
+        return moved + (float(np.log(policy.usual / len(policy.heights))) if height != self.track.heights[0] else 0.0)
 
 
 _TINY = 1e-9

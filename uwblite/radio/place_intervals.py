@@ -146,7 +146,7 @@ class _Search:
                     apart[part] = True
                     found = [*best.found[:here], start, *best.found[here + 1 :]]
                     tried.append(self.model.explanation(best.place, found, best.height, shares, apart).evidence)
-        return max(tried, default=-np.inf) + float(np.log(MovePolicy.blocked / self.model.count[own[0]]))
+        return max(tried, default=-np.inf) + float(np.log(MovePolicy.usual / self.model.count[own[0]]))
 
 
 def _evidence(each: Explanation) -> float:
