@@ -196,7 +196,7 @@ def _draw_axes(canvas: Canvas, low: Floats, scale: float) -> None:
             canvas.lines(np.array([[*edge, *(edge + _TICK * inward)]]), _THIN, INK)
             if 2 * _PAD < along < size[axis] - 2 * _PAD:
                 half = np.array([(WIDTH + 1) * len(f"{value + 0.0:g}"), HEIGHT]) / 2
-                canvas.text(edge + (_GAP + half) * inward - half, f"{value + 0.0:g}", INK, 1, PAPER)
+                canvas.text(edge + (_TICK + _GAP + half) * inward - half, f"{value + 0.0:g}", INK, 1, PAPER)
     origin = np.array([-low[0] * scale, size[1] + low[1] * scale])
     if ((origin >= 0) & (origin < size)).all():
         for name, ahead in zip("xy", _AXIS * np.array([[1.0, 0.0], [0.0, -1.0]]), strict=True):
