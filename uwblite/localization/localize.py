@@ -185,7 +185,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
     scanner = None if s is None else Scanner.of(s, sign)
     localizer = Localizer(replace(known, laser_delay=sign * known.laser_delay), log.mounting, scanner)
     poses = np.full(log.odometry.poses.shape, np.nan)
-    covariances = np.full((*poses.shape, poses.shape[1]), np.nan)
+    covariances = np.full((*poses.shape, *poses.shape[1:]), np.nan)
     times, kinds, numbers = _events(log, known, sign)
     wanted, reason = set(rows.tolist()), ""
     for done, (at, kind, k) in enumerate(zip(times.tolist(), kinds.tolist(), numbers.tolist(), strict=True)):
