@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from .. import se2
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import ACCEPTED, ANCHOR, DOUBTED, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, Colour, rgb
@@ -219,8 +218,9 @@ def _draw_anchor(canvas: Canvas, anchor: DrawnAnchor, side: str, pixel: Callable
     """Draw an anchor's ellipse of two standard deviations, its place and its name."""
     colour = PROPOSED if anchor.kind == "proposed" else ANCHOR
     if (axes := ellipse(anchor.covariance)) is not None:
-        around = np.stack([axes[0] * np.cos(_TURN), axes[1] * np.sin(_TURN)], axis=1)
-        outline = pixel(anchor.position + se2.rotate(axes[2], around))
+        major, minor, turn = axes
+        ahead, aside = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        outline = pixel(anchor.position + np.outer(major * np.cos(_TURN), ahead) + np.outer(minor * np.sin(_TURN), aside))
         canvas.polygon(outline[:-1], colour, _FAINT)
         canvas.polyline(outline, _THIN, colour, _STRONG)
     place = pixel(anchor.position)
