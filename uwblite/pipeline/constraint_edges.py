@@ -27,6 +27,7 @@ from ..graph.robust import Kernel
 from ..graph.solver import optimize
 from ..grid.columns import find_column, fit_circle
 from ..lidar.clouds import Clouds
+from ..loop_closure.candidates import CandidatePolicy
 from ..problem.solution import rough
 from ..se2 import align
 from . import map_frame
@@ -38,7 +39,7 @@ from .lidar_stages import refine_jointly, solve_by_own_errors
 class GivenPolicy:
     """When places agree with what is given, and which clouds see a landmark."""
 
-    gate: ClassVar[float] = 3.0
+    gate: ClassVar[float] = CandidatePolicy.sigmas
     """Standard deviations within which a place or a distance agrees."""
     unsure: ClassVar[float] = 0.6
     """m, more of a first estimate, whose biases are not yet known well."""

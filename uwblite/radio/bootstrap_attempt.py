@@ -34,7 +34,7 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, tri
 class BootstrapConfig:
     """Bootstrap of the first estimate."""
 
-    seed_distances: ClassVar[tuple[float, ...]] = tuple(25.0 * 2.5**k for k in (0, -1, -2, 1, 2))
+    seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
     starts: ClassVar[int] = 5
     """Travelled distances of the first stretch, m, tried at so many places in this order until the anchors in it are clear;
     then all of the path."""
@@ -47,7 +47,8 @@ class BootstrapConfig:
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
     scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, 3.0)
-    """Scales of the ranges' kernel, one after the other, standard deviations; the first one for pieces alone."""
+    first_scales: ClassVar[tuple[float, ...]] = (10.0, 3.0)
+    """Scales of the ranges' kernel, one after the other, standard deviations; and those of the first stretch."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
@@ -142,15 +143,15 @@ class Attempt:
             self.first = self.low, self.high
             self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
             if self.placed.any():
-                self._solve()
+                self._solve(self.config.first_scales)
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
             held, failed = self.config.growth
             self.piece = held * self.piece if self._extend(self.piece) else max(failed * self.piece, self.smallest)
             if self.high - self.low >= self.config.resolve_factor * self.solved or self.complete:
-                self._solve()
+                self._solve(self.config.scales[1:])
                 self.solved = self.high - self.low
                 if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
-                    self._solve()
+                    self._solve(self.config.scales[1:])
                 if not torn and self._is_torn():
                     break
         if np.isinf(enough):
@@ -345,11 +346,11 @@ class Attempt:
         part = replace(self._part(low, high), fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)
         self.poses[low:high] = self._tightened(part, scales).poses
 
-    def _solve(self) -> None:
+    def _solve(self, scales: tuple[float, ...]) -> None:
         """Optimise everything known so far and learn each anchor's spread."""
         part = replace(self._part(self.low, self.high), fixed_anchors=~self.placed)
         part = replace(part, fixed_calibration=self.graph.fixed_calibration).with_edges(*self.graph.edges)
-        solved = self._tightened(part, self.config.scales[1:])
+        solved = self._tightened(part, scales)
         self.poses[self.low : self.high] = solved.poses
         self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
         for edges in solved.edges:
