@@ -28,7 +28,7 @@ from uwblite.arrays import (
 )
 from uwblite.errors import DataError, SolverError
 from uwblite.graph import graph, point_edges, pose_edges, range_edges
-from uwblite.graph.graph import Calibration, EdgeTable, Graph, PriorEdges, UnknownKey
+from uwblite.graph.graph import Calibration, Edges, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import AnchorDistanceEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
@@ -114,7 +114,7 @@ def test_dataclasses_of_arrays_are_concatenated_field_by_field():
 KINDS = [
     cls for module in (graph, pose_edges, range_edges, point_edges)
     for _, cls in inspect.getmembers(sys.modules[module.__name__], inspect.isclass)
-    if issubclass(cls, EdgeTable) and cls is not EdgeTable and cls.__module__ == module.__name__
+    if issubclass(cls, Edges) and cls is not Edges and cls.__module__ == module.__name__
 ]  # fmt: skip
 
 

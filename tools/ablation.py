@@ -91,11 +91,11 @@ INGREDIENTS: dict[str, LeftOut] = {
         ("pipeline.surface_adjustment.fitted_columns", lambda rays, poses, columns: columns),
     )),
     "walls that poses bend": LeftOut(patches=(
-        ("lidar.walls._halved", lambda number, *places: np.unique(number, return_inverse=True)[1]),
+        ("lidar.walls._curved", lambda lines, places: np.ones(len(lines.centre), dtype=bool)),
     )),
     "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
     "noise of wheels by rays": LeftOut(patches=(("pipeline.surface_adjustment.noise_at", lambda graph, wheels, sure: wheels),)),
-    "points between beams": LeftOut(patches=(("lidar.beam_gaps.filled", lambda rays: rays),)),
+    "points between beams": LeftOut(patches=(("lidar.clouds.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),

@@ -122,8 +122,7 @@ def bench_marginals(repeats: int) -> None:
     """Compute every pose's covariance, and the joint one of 100 poses with the relative covariance of 300 pairs of them."""
     import numpy as np
 
-    from uwblite.graph.joint_covariance import JointCovariance
-    from uwblite.graph.marginals import marginals
+    from uwblite.graph.marginals import JointCovariance, marginals
     from uwblite.graph.solver import optimize
 
     head("Marginal covariances, ms", "graph", "poses", "all blocks", "300 relative ones of 100 poses")
@@ -180,19 +179,18 @@ def bench_icp(repeats: int) -> None:
     from uwblite import se2
     from uwblite.lidar.cloud_rasters import rasterize
     from uwblite.lidar.clouds import joined, make_cloud
-    from uwblite.lidar.pair_alignment import align_pairs
-    from uwblite.lidar.scan_matching import pair_points
+    from uwblite.lidar.scan_matching import align_pairs, pairs_of
 
     first, second = np.array([0]), np.array([1])
 
     def prepare(target, source, truth):
         """Return what align_pairs asks for; both views look from the middle of the hall."""
         clouds = [make_cloud(target, np.zeros(2), 0.15), make_cloud(source, se2.inverse(truth)[:2], 0.15)]
-        return joined(clouds), rasterize(joined(clouds[:1]), 0.1, 0.5), pair_points(joined(clouds), second, len(source))
+        both = joined(clouds)
+        return rasterize(both, 0.1, 0.5), pairs_of(both, first, second, len(source))
 
     def align(prepared, guess):
-        clouds, raster, points = prepared
-        return align_pairs(clouds, raster, first, guess[None], points, 0.5, 0.15).pose[0]
+        return align_pairs(*prepared, guess[None], 0.5, 0.15).pose[0]
 
     columns = ("uwblite", "small_gicp ICP", "Open3D point to line")
     head("Registration, ms (error, mm), 24 pairs", "points", *columns, "ratio to small_gicp", "prepared")

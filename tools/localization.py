@@ -354,7 +354,8 @@ def posterior(on: Bench, begin: float) -> tuple[float, float, int]:
     estimator, walls = localizer._estimator, on.known.walls
     assert walls is not None
     odom, odometer = estimator._odometer.pose, estimator._way
-    ranges, (rays, ago) = estimator._window.ranges_since(odom, odometer), estimator._window.seen(odom, odometer, LOOK_BACK)
+    ranges = estimator._window.ranges_since(localizer.known.anchors, odom, odometer)
+    rays, ago = estimator._window.seen(odom, odometer, LOOK_BACK)
     axes = [np.arange(low, high, STEPS[0]) for low, high in zip(walls.geometry.origin, walls.geometry.corner, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     places = places[walls.state_at(*places.T) == FREE]

@@ -14,9 +14,9 @@ from trials import table
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.object_likelihood import ObjectLikelihood, ObjectPolicy, pairs_of
-from uwblite.lidar.pair_alignment import align_pairs
+from uwblite.lidar.object_likelihood import ObjectLikelihood
 from uwblite.lidar.registration import Prior, register
+from uwblite.lidar.scan_matching import PairPolicy, align_pairs, pairs_of
 
 Floats = NDArray[np.float64]
 
@@ -67,8 +67,8 @@ def placements(clouds: Clouds, truth: Floats, apart: int, rng: np.random.Generat
     mean = step + rng.standard_normal(step.shape) * (SOUND + slips[:, None] * SLIPPED)
     sound = np.broadcast_to(np.diag(SOUND**2), (len(i), 3, 3)).copy()
     pairs = pairs_of(clouds, i, i + apart)
-    objects = ObjectLikelihood.of(clouds, rasterize(clouds, 0.1, 0.5), 0.02, pairs, step)
-    ended = align_pairs(clouds, objects.raster, i, mean, pairs.points, 0.5, ObjectPolicy.gate).pose
+    objects = ObjectLikelihood.of(rasterize(clouds, 0.1, 0.5), 0.02, pairs, step)
+    ended = align_pairs(objects.raster, pairs, mean, PairPolicy.reach, PairPolicy.gate).pose
     objects = objects.learnt(pairs, ended)
     wide = np.broadcast_to(SLIPPED, mean.shape)
     prior = Prior.about(mean, sound, wide, wide)

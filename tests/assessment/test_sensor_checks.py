@@ -204,7 +204,7 @@ def test_an_anchor_of_fewer_than_ten_ranges_cannot_be_placed(count, few):
 @pytest.mark.parametrize(("width", "straight"), [(0.9, True), (1.1, False)])
 def test_a_straight_path_leaves_two_places(width, straight):
     angle = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
-    where = np.column_stack([np.cos(angle), width * CheckPolicy.straight * np.sin(angle)])
+    where = np.column_stack([np.cos(angle), width * CheckPolicy.some * np.sin(angle)])
     _, found = anchor_figures(np.full(100, 3.0), where=where)
     assert ["either side" in f.text for f in found] == ([True] if straight else [])
 
@@ -279,7 +279,7 @@ def test_many_error_codes_are_noted(errors, said):
 def turned(ratio=(1.0, 0.01), **values):
     """Return sensor and text of the findings of a comparison of turns that came out so."""
     plain = Turning(
-        pairs=40, typical=0.3, as_given=0.01, other=0.5, misfit=0.01, delay=0.0, delay_clear=True, ratio=1.0, ratio_sigma=0.01
+        pairs=40, typical=0.3, as_given=0.01, other=0.5, misfit=0.01, delay=0.0, delay_clear=True, ratio=1.0
     )
     return [(f.sensor, f.text) for f in check_turning(replace(plain, **values), ratio)]
 

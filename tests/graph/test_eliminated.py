@@ -71,7 +71,7 @@ def test_covariances_are_those_of_the_whole_system():
 def test_the_factor_is_in_an_order_with_contiguous_subtrees():
     """Else the selected inverse hands on the rows of unrelated columns, which takes far more memory and time."""
     _, normal, blocks, whole, _ = planted(60)
-    found = WithBlocks(normal.matrix, blocks)
+    found = WithBlocks(normal, blocks, np.zeros(normal.unknowns.size))
     lower, n = found.L.toarray(), len(whole)
     np.testing.assert_array_equal(found.perm_r, found.perm_c)
     order = np.argsort(found.perm_c)

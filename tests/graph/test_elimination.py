@@ -5,9 +5,9 @@ import pytest
 from scipy import sparse
 
 from uwblite.graph.elimination import (
-    _ALONE,
+    EliminationPolicy,
+    _pairs_of,
     adjacency,
-    alike_columns,
     column_sizes,
     contiguous,
     elimination_tree,
@@ -15,8 +15,6 @@ from uwblite.graph.elimination import (
     minimum_degree,
     narrow_order,
     order_of_columns,
-    pairs_of,
-    postorder,
     work,
     work_of,
 )
@@ -52,16 +50,9 @@ def test_tree_and_sizes_are_those_of_the_filled_pattern(seed):
     np.testing.assert_array_equal(column_sizes(pairs, order, width, parent), sizes)
     above = np.append(sizes, 0)[parent]
     continued = [top == size - width[k] for k, top, size in zip(order, above, sizes, strict=True)]
-    each = [width[k] * size**2 * (1 if more else _ALONE) for k, size, more in zip(order, sizes, continued, strict=True)]
+    alone = EliminationPolicy.alone
+    each = [width[k] * size**2 * (1 if more else alone) for k, size, more in zip(order, sizes, continued, strict=True)]
     assert work(pairs, order, width, parent) == sum(each)
-
-
-def test_a_tree_is_walked_in_postorder():
-    """Children before parents, and every subtree in one piece: 0 and 3 are below 4, 1 below 2."""
-    walk = postorder(np.array([4, 2, 5, 4, 5])).tolist()
-    assert sorted(walk) == [0, 1, 2, 3, 4]
-    assert walk.index(1) + 1 == walk.index(2)
-    assert sorted(walk[walk.index(4) - 2 : walk.index(4)]) == [0, 3]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -113,44 +104,26 @@ def test_a_matrix_is_counted_by_its_pattern():
     arrow = np.eye(5)
     arrow[-1] = arrow[:, -1] = 1.0
     matrix = sparse.csc_matrix(arrow)
-    assert sorted(map(tuple, pairs_of(matrix).tolist())) == [(0, 4), (1, 4), (2, 4), (3, 4)]
-    assert work_of(matrix) == 4 * 2**2 + 1
+    assert sorted(map(tuple, _pairs_of(matrix).tolist())) == [(0, 4), (1, 4), (2, 4), (3, 4)]
+    assert work_of(matrix) == EliminationPolicy.per_complex * (4 * 2**2 + 1)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_columns_of_one_pattern_are_eliminated_together(seed):
+def test_subtrees_of_columns_are_contiguous(seed):
     """Three columns for each node of a graph, and one more that half of the first columns touch."""
     rng = np.random.default_rng(seed)
     n = 40
     pairs = np.vstack([np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), rng.integers(0, n, (10 * seed, 2))])
-    nodes = adjacency(pairs, n)
     more = np.zeros((1, 3 * n))
     more[0, : 3 * (n // 2) : 3] = 1.0
-    three = sparse.kron(nodes, np.ones((3, 3)))
+    three = sparse.kron(adjacency(pairs, n), np.ones((3, 3)))
     matrix = sparse.csc_matrix(sparse.bmat([[three + sparse.eye(3 * n), more.T], [more, np.array([[1e6]])]]))
-    matrix.sort_indices()
-    group, found = alike_columns(matrix)
-    # The first columns of the first half stand alone, the others are one group of each node, and the last column is one.
-    assert len(np.unique(group)) == 2 * (n // 2) + (n - n // 2) + 1
-    first = np.unique(group, return_index=True)[1]
-    linked = np.tril(matrix[first][:, first].toarray(), -1) != 0.0
-    assert set(map(tuple, found.tolist())) == set(zip(*np.nonzero(linked.T), strict=True))
     order = order_of_columns(matrix)
     assert sorted(order) == list(range(3 * n + 1))
-    place = np.argsort(order)
-    assert np.all(np.diff(place)[np.diff(group) == 0] == 1)
-    parent = elimination_tree(pairs_of(matrix), order)
+    parent = elimination_tree(_pairs_of(matrix), order)
     size = np.ones(len(parent), dtype=int)
     for column, above in enumerate(parent):
         if above < len(parent):
             size[above] += size[column]
     # In one piece: the last of a subtree before its root is a child of it.
     assert all(size[c] == 1 or parent[c - 1] == c for c in range(len(parent)))
-    assert column_sizes(pairs_of(matrix), order, np.ones(3 * n + 1, dtype=int), parent).sum() <= 1.2 * filled_by_columns(matrix)
-
-
-def filled_by_columns(matrix):
-    """Return the entries of a factor by minimum degree of single columns."""
-    pairs, n = pairs_of(matrix), matrix.shape[0]
-    order, parent = contiguous(pairs, minimum_degree(adjacency(pairs, n)))
-    return column_sizes(pairs, order, np.ones(n, dtype=int), parent).sum()

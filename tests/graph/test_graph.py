@@ -268,8 +268,8 @@ def test_chi2_sums_robust_weighted_costs():
         kinds["relative pose"].j,
         kinds["relative pose"].T_i_j,
         kinds["relative pose"].sqrt_information,
-        kernel,
-        weights,
+        kernel=kernel,
+        weights=weights,
     )
     residuals = edges.residuals(graph)
     expected = sum(w * kernel.rho(np.array(r @ r)) for w, r in zip(weights, residuals, strict=True))

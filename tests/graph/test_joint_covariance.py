@@ -9,9 +9,9 @@ from helpers.planted_graphs import calibrated_loop, dense_covariance, dense_syst
 
 from uwblite import se2
 from uwblite.errors import SolverError
-from uwblite.graph import joint_covariance
+from uwblite.graph import marginals
 from uwblite.graph.graph import Graph
-from uwblite.graph.joint_covariance import JointCovariance, calibration_covariance
+from uwblite.graph.marginals import JointCovariance, calibration_covariance
 
 
 @pytest.mark.parametrize("chosen", [np.arange(0, 60, 7), np.array([40, 3, 17]), np.array([5]), np.array([0]), np.arange(60)])
@@ -45,13 +45,11 @@ def test_joint_covariances_where_something_is_not_measured():
 
 
 def test_pieces_of_the_work_change_no_bit(monkeypatch):
-    """Pairs, and columns of the factor, some at a time."""
     graph, _ = calibrated_loop()
     chosen = np.arange(0, 60, 3)
     i, j = (ends.ravel() for ends in np.meshgrid(chosen, chosen))
     whole = JointCovariance(graph, chosen).relative(i, j)
-    monkeypatch.setattr(joint_covariance, "_PAIRS_AT_ONCE", 7)
-    monkeypatch.setattr(joint_covariance, "_COLUMNS_AT_ONCE", 7)
+    monkeypatch.setattr(marginals.MarginalsPolicy, "pairs_at_once", 7)
     assert JointCovariance(graph, chosen).relative(i, j).tobytes() == whole.tobytes()
     assert JointCovariance(graph, chosen).relative(i[:0], j[:0]).shape == (0, 3, 3)
 
@@ -68,9 +66,9 @@ def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
 
 def test_a_calibration_with_a_direction_that_nothing_measures_has_no_covariance(monkeypatch):
     graph, _ = calibrated_loop()
-    normal = joint_covariance.filled(graph)
+    normal = marginals.filled(graph)
     normal.values = -normal.values
-    monkeypatch.setattr(joint_covariance, "filled", lambda graph: normal)
+    monkeypatch.setattr(marginals, "filled", lambda graph: normal)
     with pytest.raises(SolverError, match="singular"):
         calibration_covariance(graph)
 

@@ -9,8 +9,7 @@ from scipy import sparse
 
 from uwblite import se2
 from uwblite.graph.graph import Graph, edge_weights
-from uwblite.graph.joint_covariance import JointCovariance
-from uwblite.graph.marginals import _VARIANCES, about_best_fit, added_unknown, marginals, shape_error
+from uwblite.graph.marginals import JointCovariance, MarginalsPolicy, about_best_fit, added_unknown, marginals, shape_error
 from uwblite.graph.solver import optimize
 
 
@@ -130,7 +129,7 @@ def test_common_errors_are_unknowns_of_the_size_that_the_residuals_show(table, c
     whole[parts[table]] = shifts.reshape(-1, count)
     both, size = np.hstack([jacobian, whole]), jacobian.shape[1]
     worth, values = [], []
-    for variance in _VARIANCES.ravel():
+    for variance in MarginalsPolicy.variances.ravel():
         information, slope = both.T @ both, both.T @ residuals
         information[np.arange(size, size + count), np.arange(size, size + count)] += 1.0 / variance
         step = -np.linalg.solve(information, slope)

@@ -10,8 +10,10 @@ from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph.graph import Graph, linearize
 from uwblite.graph.normal_equations import NormalEquations
-from uwblite.graph.schwarz_cg import _ENOUGH, _MOST_COARSE, _PIECE, TwoLevelFactor, chains, cut, iterated
+from uwblite.graph.schwarz_cg import SchwarzPolicy, TwoLevelFactor, cut, iterated
 from uwblite.graph.solver import optimize
+
+_PIECE, _MOST_COARSE = SchwarzPolicy.piece, SchwarzPolicy.most_coarse
 
 
 def tied(n, each=5, seed=0, is_fixed=()):
@@ -47,7 +49,7 @@ def test_solutions_are_those_of_the_dense_matrix(is_fixed):
     exact = np.linalg.solve(H, -g)
     found = factor.solve(-np.asarray(normal.gradient))
     error = found - exact
-    assert error @ H @ error < (3.0 * _ENOUGH) ** 2 * (exact @ H @ exact)
+    assert error @ H @ error < (3.0 * SchwarzPolicy.enough) ** 2 * (exact @ H @ exact)
     both = factor.solve(np.stack([-np.asarray(normal.gradient), np.ones(len(g))], axis=1))
     np.testing.assert_array_equal(both[:, 0], found)
 
@@ -78,7 +80,7 @@ def test_pieces_end_with_their_chains():
 def test_the_minimum_is_that_of_the_factorisation(monkeypatch):
     graph, truth = tied(700, 20)
     found, summary = optimize(graph)
-    monkeypatch.setattr("uwblite.graph.elimination._MANY", 10_000)
+    monkeypatch.setattr("uwblite.graph.elimination.EliminationPolicy.many", 10_000)
     expected, direct = optimize(graph)
     assert summary.converged
     assert summary.chi2 == pytest.approx(direct.chi2, rel=1e-6)
@@ -122,31 +124,11 @@ def test_the_coarse_level_moves_pieces_as_rigid_bodies_and_all_else_on_its_own()
     assert not basis[number.ravel()][:, 6:].any()
 
 
-def test_poses_with_any_numbers_are_put_in_chains():
-    """A chain whose poses are numbered at random, and one more apart: nearly all share an edge with the next one."""
-    rng = np.random.default_rng(0)
-    names, count = rng.permutation(400), 400
-    pairs = np.stack([names[:-1], names[1:]], axis=1)
-    pairs = np.vstack([np.delete(pairs, 299, axis=0), names[rng.integers(0, 300, (10, 2))]])
-    order, linked = chains(pairs, count, np.zeros(count - 1, dtype=bool))
-    assert sorted(order) == list(range(count))
-    ties = {tuple(sorted(pair)) for pair in pairs.tolist()}
-    walked = np.sort(np.stack([order[:-1], order[1:]], axis=1), axis=1).tolist()
-    np.testing.assert_array_equal(linked, [tuple(pair) in ties for pair in walked])
-    assert np.count_nonzero(~linked) < count / _PIECE
-    as_numbered = np.arange(count - 1) != 299
-    kept, same = chains(pairs, count, as_numbered)
-    np.testing.assert_array_equal(kept, np.arange(count))
-    np.testing.assert_array_equal(same, as_numbered)
-
-
 def test_a_star_is_cut_all_the_same():
     """Its poses share no edge with one another; pieces of one pose each would make the coarse level as large as the matrix."""
     count = 2000
-    pairs = np.stack([np.zeros(count - 1, dtype=int), np.arange(1, count)], axis=1)
-    order, linked = chains(pairs, count, np.zeros(count - 1, dtype=bool))
-    assert sorted(order) == list(range(count))
-    assert linked.all()
+    pieces = cut(np.arange(3 * count).reshape(-1, 3), np.zeros((count, 3)), 3 * count, np.zeros(count - 1, dtype=bool))
+    assert len(pieces.number) == -(-count // _PIECE)
 
 
 @pytest.mark.parametrize("others", [_MOST_COARSE, _MOST_COARSE + 1])

@@ -389,7 +389,7 @@ def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
         np.full(n - 1, 0.5),
         np.tile(np.diag([100.0, 200.0, 100.0]), (n - 1, 1, 1)),
         np.tile([-1, -1, 0, -1, -1, -1, -1, -1], (n - 1, 1)),
-        Kernel("cauchy", 5.0),
+        kernel=Kernel("cauchy", 5.0),
     )
     seen = i[i % 97 != 0]
     matched = step[seen] + rng.normal(scale=0.002, size=(len(seen), 3))

@@ -1,8 +1,11 @@
-"""Rays that end on a wall and on a column."""
+"""Rays that end on a wall and on a column, and their equations one by one."""
+
+from types import SimpleNamespace
 
 import numpy as np
 
 from uwblite import se2
+from uwblite.lidar import ray_equations
 from uwblite.lidar.surface_rays import SurfaceRays, Surfaces
 
 POSES = np.array([[0.3, -0.2, 0.4], [1.1, 0.3, -2.0]])
@@ -29,3 +32,15 @@ def rays_that_end(extra=0.0):
     reach = np.where(surface == 0, flat, curved) + SURFACES.offset[surface] + extra
     local = se2.rotate(-POSES[keyframe, 2], way)
     return SurfaceRays(keyframe, surface, reach[:, None] * local, local, np.full(40, 0.01), np.arange(40))
+
+
+def linearized(rays, surfaces, sensors, poses):
+    """Return whitened residuals of single rays and their derivatives by pose and surface."""
+    rows = np.empty((len(rays.keyframe), 8))
+    for kind in (False, True):
+        own = np.flatnonzero(surfaces.round[rays.surface] == kind)
+        if len(own):
+            lines = ray_equations.linearized(rays.rows(own), np.arange(len(own)), surfaces, sensors, poses)
+            combined = np.broadcast_to(lines.combined, (len(own), *lines.combined.shape[-2:]))
+            rows[own] = np.einsum("maf,fm->ma", combined, lines.figures) * np.sqrt(lines.information)[:, None]
+    return SimpleNamespace(by_pose=rows[:, :3], by_surface=rows[:, 3:7], residual=rows[:, 7])

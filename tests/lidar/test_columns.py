@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.columns import fitted_circles, join_circles, refined_columns, surroundings
+from uwblite.lidar.columns import fitted_circles, fitted_columns, join_circles, surroundings
+from uwblite.lidar.surface_rays import as_rays
 from uwblite.odometry.attached import ScanPoints
 
 POSES = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a), a + 2.0] for a in np.arange(0.0, 6.2, 0.5)])
@@ -39,19 +40,12 @@ def square(origin, way):
     return np.where((near < far) & (near > 0.0), near, np.inf)
 
 
-def rays_in_map(rays):
-    at = se2.transform(POSES[rays.keyframe], rays.points)
-    way = at - POSES[rays.keyframe, :2]
-    reach = np.hypot(*way.T)
-    return at, way / reach[:, None], np.maximum(0.01, 0.01 * reach)
-
-
 def test_circles_of_many_scans_are_a_column_where_it_stands():
     rays = seen(POSES, round_column)
     columns = join_circles(fitted_circles(rays), POSES)
     assert len(columns) == 1
     np.testing.assert_allclose(columns[0], [0.0, 0.0, RADIUS], atol=0.05)
-    np.testing.assert_allclose(refined_columns(columns, *rays_in_map(rays))[0], [0.0, 0.0, RADIUS], atol=0.003)
+    np.testing.assert_allclose(fitted_columns(as_rays(rays), POSES, columns)[0], [0.0, 0.0, RADIUS], atol=0.003)
 
 
 def test_a_column_seen_from_too_few_keyframes_is_none():
@@ -64,7 +58,7 @@ def test_a_column_seen_from_too_few_keyframes_is_none():
 def test_a_box_is_no_column(seed):
     rays = seen(POSES, square, seed=seed)
     columns = join_circles(fitted_circles(rays), POSES)
-    assert len(refined_columns(columns, *rays_in_map(rays))) == 0
+    assert len(fitted_columns(as_rays(rays), POSES, columns)) == 0
 
 
 def test_rays_that_do_not_bend_are_no_circle():

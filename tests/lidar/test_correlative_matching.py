@@ -8,8 +8,7 @@ from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize, surface_field
 from uwblite.lidar.clouds import joined, make_cloud
 from uwblite.lidar.correlative_matching import CorrelativeConfig, _peaks, score_grid, search
-from uwblite.lidar.pair_alignment import align_pairs
-from uwblite.lidar.scan_matching import pair_points
+from uwblite.lidar.scan_matching import align_pairs, pairs_of
 
 CENTRE = (3.0, 1.5)
 
@@ -22,7 +21,7 @@ def rivalry(found):
 def _field(target, config):
     """Return the field (rows, columns) that scores look up, and its lower left corner."""
     raster = rasterize(target, config.resolution, 4 * config.resolution)
-    return surface_field(target, raster, config.spread).reshape(raster.shape[0]).T, raster.origin[0]
+    return surface_field(raster, config.spread).T, raster.origin[0]
 
 
 def _world(rng):
@@ -106,8 +105,8 @@ def test_planted_poses_are_found_from_metres_and_tens_of_degrees(seed):
     assert rivalry(found) < 0.9
     assert (np.diff(found.scores) <= 0.0).all()
     clouds, i, j = joined([target, source]), np.array([0]), np.array([1])
-    points = pair_points(clouds, j, len(source.points))
-    aligned = align_pairs(clouds, rasterize(clouds, 0.1, 0.5), i, found.poses[:1], points, 0.5, 0.15)
+    pairs = pairs_of(clouds, i, j, len(source.points))
+    aligned = align_pairs(rasterize(clouds, 0.1, 0.5), pairs, found.poses[:1], 0.5, 0.15)
     assert np.hypot(*se2.between(aligned.pose[0], truth)[:2]) < 0.015
 
 

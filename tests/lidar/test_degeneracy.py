@@ -7,16 +7,15 @@ from helpers.registration_worlds import CORRIDOR, ROOM, pair
 
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.degeneracy import MEASURED, measured_part, relative_eigen
-from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
+from uwblite.lidar.scan_matching import PairPolicy, _relative_eigen, match, measured_part, nondegenerate_step, pairs_of
 
 CENTRE = (3.0, 1.5)
 
 
 def matched(target, source, pose):
     clouds, i, j = joined([target, source]), np.array([0]), np.array([1])
-    points = pair_points(clouds, j, len(source.points))
-    return match(clouds, rasterize(clouds, 0.05, 0.3), i, np.asarray(pose)[None], points, 0.3, 0.15)
+    pairs = pairs_of(clouds, i, j, len(source.points))
+    return match(rasterize(clouds, 0.05, 0.3), pairs, np.asarray(pose)[None], 0.3, 0.15)
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.015, 0.03])
@@ -44,22 +43,22 @@ def test_eigenvalues_do_not_depend_on_units_or_frame():
     rng = np.random.default_rng(7)
     half, other, change = rng.normal(size=(3, 3, 3))
     information, spurious = half @ half.T * [10.0], 0.3 * other @ other.T + np.eye(3)
-    basis, inverse, values, vectors = relative_eigen(information, spurious)
+    basis, inverse, values = _relative_eigen(information, spurious)
     # The floor under N, 1e-9 of H, takes that share of l from an eigenvalue l of some tens.
     np.testing.assert_allclose(values, scipy.linalg.eigh(information, spurious, eigvals_only=True), rtol=1e-6)
-    np.testing.assert_allclose(basis @ vectors @ np.diag(values) @ vectors.T @ basis.T, information, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(basis @ np.diag(values) @ basis.T, information, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(basis @ inverse, np.eye(3), atol=1e-12)
-    moved = relative_eigen(change @ information @ change.T, change @ spurious @ change.T)[2]
+    moved = _relative_eigen(change @ information @ change.T, change @ spurious @ change.T)[-1]
     np.testing.assert_allclose(moved, values, rtol=1e-5)
 
 
 def test_lines_without_scatter_are_fully_measured():
-    values = relative_eigen(np.diag([4.0, 2.0, 1.0]), np.zeros((3, 3)))[2]
+    values = _relative_eigen(np.diag([4.0, 2.0, 1.0]), np.zeros((3, 3)))[-1]
     assert values.min() > 1e8
 
 
 def test_nothing_matched_has_no_measured_direction():
-    assert (relative_eigen(np.zeros((3, 3)), np.zeros((3, 3)))[2] == 0.0).all()
+    assert (_relative_eigen(np.zeros((3, 3)), np.zeros((3, 3)))[-1] == 0.0).all()
 
 
 def test_the_measured_part_is_that_of_the_nondegenerate_step():
@@ -70,5 +69,5 @@ def test_the_measured_part_is_that_of_the_nondegenerate_step():
         step, root = nondegenerate_step(factors)
         np.testing.assert_allclose(information, np.swapaxes(root, 1, 2) @ root, atol=1e-6 * information.max())
         np.testing.assert_allclose(information @ step[:, :, None], -gradient[:, :, None], atol=1e-6 * np.abs(gradient).max())
-    nothing = measured_part(MEASURED * factors.spurious, factors.spurious, factors.gradient)[0]
+    nothing = measured_part(PairPolicy.measured * factors.spurious, factors.spurious, factors.gradient)[0]
     np.testing.assert_allclose(nothing, 0.0, atol=1e-6 * factors.spurious.max())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.free_space import contradiction, free_space, seen_beyond
+from uwblite.lidar.visibility import contradiction, free_space, seen_beyond
 
 INCREMENT = np.deg2rad(1.0)
 BEARINGS = np.deg2rad(np.arange(-179.5, 180.0))

@@ -107,8 +107,8 @@ def test_poses_that_creep_along_a_wall_move_no_surface():
     factors = PairFactors(hessian, 0 * hessian, np.zeros((1, 3)), *(np.array([40]) for _ in range(4)))
     yes = np.ones(1, dtype=bool)
     for change, moved in (([0.003, 0.0, 0.0], 0.0), ([0.0, 0.003, 2 * np.pi], 0.003), ([0.0, 0.0, 0.004], 0.002)):
-        assert _surfaces_moved(factors, yes, np.array([change])) == pytest.approx(moved, abs=1e-12)
-    assert _surfaces_moved(factors, ~yes, np.ones((1, 3))) == 0.0
+        assert _surfaces_moved(factors, np.array([change])) == pytest.approx(moved, abs=1e-12)
+    assert _surfaces_moved(factors.rows(~yes), np.ones((0, 3))) == 0.0
 
 
 def test_pairs_are_ordered_unique_and_overlap():
@@ -182,15 +182,15 @@ def test_neighbours_are_of_one_recording():
 def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
-    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
-    monkeypatch.setattr(overlap.OverlapPolicy, "points_at_once", 37)
+    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
+    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
     monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
     parts = overlap.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
     assert parts.shape == whole.shape
     assert (parts != whole).nnz == 0
     assert parts.nnz == whole.nnz == whole.sum()
-    np.testing.assert_array_equal(scan_matching.pair_points(clouds, j, 7).row, listed)
+    np.testing.assert_array_equal(scan_matching.pairs_of(clouds, j, j, 7).points, listed)
 
 
 def test_surface_cells_distinguish_the_sides_of_a_wall():
@@ -262,7 +262,7 @@ def test_pairs_measured_again_say_the_same_and_less_where_points_weigh_less():
 @pytest.mark.parametrize(("convergence", "better", "rounds"), [(1e9, -np.inf, 2), (0.0, 0.9, 3), (0.0, -np.inf, 8)])
 def test_rounds_end_at_the_last_gate_where_nothing_moves_or_fits_better(monkeypatch, convergence, better, rounds):
     """From the truth the first round moves no cloud by 0.04 m, so the second has the last gate; else as often as allowed."""
-    monkeypatch.setattr(joint_refinement, "_BETTER", better)
+    monkeypatch.setattr(RefinementConfig, "creep", better)
     truth, path, clouds = room(7, 0.01, 6.0)
     config = replace(CONFIG, rounds=8, convergence=convergence)
     result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path, config, selections=1)
@@ -277,13 +277,13 @@ def test_the_gate_shrinks_at_its_own_pace_where_a_step_failed(monkeypatch, bette
     truth, path, clouds = room(7, 0.0, 4.0)
     asked = []
 
-    def recorded(clouds, raster, i, T_i_j, points, gate, *more):
+    def recorded(raster, pairs, T_i_j, gate, *more):
         asked.append(gate)
-        return match(clouds, raster, i, T_i_j, points, gate, *more)
+        return match(raster, pairs, T_i_j, gate, *more)
 
     summary = SimpleNamespace(chi2_initial=1.0, chi2_history=[] if better is None else [0.5 if better else 1.0])
     monkeypatch.setattr(joint_refinement, "match", recorded)
-    monkeypatch.setattr(joint_refinement, "_BETTER", -np.inf)
+    monkeypatch.setattr(RefinementConfig, "creep", -np.inf)
     monkeypatch.setattr(joint_refinement.Optimizer, "optimize", lambda self, problem, config: (problem, summary))
     graph, config = Graph(truth).with_edges(chained(truth, NOISE)), replace(CONFIG, rounds=4, convergence=0.0)
     assert refined(graph, clouds, path, config, selections=1).rounds == 4

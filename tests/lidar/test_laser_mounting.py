@@ -7,7 +7,7 @@ import pytest
 from helpers.planted import box, drive, odometry, recording, scans, wander
 
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _ratio, _turning_pairs, compare
+from uwblite.lidar.laser_mounting import LAGS, TurningPolicy, _ratio, _turning_pairs, compare
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting
 
@@ -86,7 +86,7 @@ def test_a_robot_that_turns_only_while_driving_still_reports_it():
     stamps, truth = drive([(0.6, 0.0, 0.35)] * 3, [10.0] * 3)
     seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=DOWN)
     found = compare(recording(odometry(stamps, truth), None, seen))
-    assert found.pairs >= LEAST_PAIRS
+    assert found.pairs >= TurningPolicy.least_pairs
     assert found.turned_over
 
 
@@ -119,13 +119,13 @@ def test_a_delay_is_clear_by_its_gain_and_by_the_gain_s_own_scatter(monkeypatch,
     """Below 0.7 of the difference without it, and by more than two standard deviations of the mean gain of all pairs."""
     log, _ = turner()
     pairs = 16
-    errors = np.full((len(_LAGS), pairs), 0.29)
-    errors[len(_LAGS) // 2] = centre
+    errors = np.full((len(LAGS), pairs), 0.29)
+    errors[len(LAGS) // 2] = centre
     errors[30] = best + scatter * np.where(np.arange(pairs) % 2 == 0, 1.0, -1.0)
     differences(monkeypatch, errors, np.full_like(errors, 0.3))
-    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
+    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: 1.0)
     seen = compare(log)
-    assert seen.delay == _LAGS[30]
+    assert seen.delay == LAGS[30]
     assert (seen.as_given, seen.other, seen.misfit) == pytest.approx((best, 0.3, best))
     assert seen.delay_clear is clear
 
@@ -134,29 +134,29 @@ def test_a_delay_is_clear_by_its_gain_and_by_the_gain_s_own_scatter(monkeypatch,
 def test_the_other_way_up_must_agree_twice_as_well_at_its_best_delay_as_the_given_one_at_its_own(
     monkeypatch, upside_down, over
 ):
-    errors = np.full((len(_LAGS), 16), 0.29)
+    errors = np.full((len(LAGS), 16), 0.29)
     errors[30] = 0.2
     other = np.full_like(errors, 0.29)
     other[10] = upside_down
     differences(monkeypatch, errors, other)
-    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
+    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: 1.0)
     seen = compare(turner()[0])
-    assert (seen.turned_over, seen.delay) == (over, _LAGS[10 if over else 30])
+    assert (seen.turned_over, seen.delay) == (over, LAGS[10 if over else 30])
     assert seen.misfit == pytest.approx(upside_down if over else 0.2)
 
 
 def test_the_ratio_of_turns_is_a_median_of_clear_ones():
-    """Turns of more than 0.1 rad; the standard deviation of a median of Gaussian ratios is 1.2533 times that of a mean."""
+    """Turns of more than 0.1 rad."""
     rng = np.random.default_rng(3)
     wheels = rng.uniform(0.11, 0.5, 4000) * rng.choice([-1.0, 1.0], 4000)
     small = np.full(500, 0.1)
     laser = wheels * (1.2 + 0.1 * rng.standard_normal(4000))
-    ratio, sigma = _ratio(np.append(laser, 9.0 * small), np.append(wheels, small))
-    assert ratio == pytest.approx(1.2, abs=4 * sigma)
-    assert sigma == pytest.approx(1.2533 * 0.1 / np.sqrt(4000), rel=0.1)
-    few = wheels[: LEAST_PAIRS - 1]
-    assert np.isnan(_ratio(few, few)).all()
-    assert _ratio(wheels[:LEAST_PAIRS], wheels[:LEAST_PAIRS]) == (1.0, 0.0)
+    # The standard deviation of a median of Gaussian ratios is 1.2533 times that of their mean.
+    sigma = 1.2533 * 0.1 / np.sqrt(4000)
+    assert _ratio(np.append(laser, 9.0 * small), np.append(wheels, small)) == pytest.approx(1.2, abs=4 * sigma)
+    few = wheels[: TurningPolicy.least_pairs - 1]
+    assert np.isnan(_ratio(few, few))
+    assert _ratio(wheels[:TurningPolicy.least_pairs], wheels[:TurningPolicy.least_pairs]) == 1.0
 
 
 @pytest.mark.parametrize(("speed", "compared"), [(0.09, False), (0.11, True), (0.58, True), (0.62, False)])
@@ -200,7 +200,7 @@ def test_pairs_of_turns_on_the_spot_come_first_and_where_there_are_few_those_tha
         if spot:
             assert lidar.stamps[second].max() < 5.3
         else:
-            assert len(first) <= 2 * LEAST_PAIRS
+            assert len(first) <= 2 * TurningPolicy.least_pairs
 
 
 @pytest.mark.parametrize(("period", "pairs"), [(1.9, True), (2.0, False)])

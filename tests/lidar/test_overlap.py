@@ -6,9 +6,8 @@ from helpers.laser_walks import CORRIDOR, HALL, scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.free_space import free_space, seen_beyond
 from uwblite.lidar.overlap import OverlapPolicy, directional_overlap, net_overlap
-from uwblite.lidar.visibility import VisibilityPolicy, nearest_by_bearing
+from uwblite.lidar.visibility import free_around, seen_beyond
 
 GATE, SPACING = 0.15, 0.02
 FIRST, SECOND = np.array([0]), np.array([1])
@@ -18,14 +17,14 @@ NICHES = np.concatenate([CORRIDOR, NICHES, [[x, y, x, np.sign(y)] for x0, y, x1,
 """A corridor along x with pillars at irregular places."""
 
 
-def spaces(clouds):
-    nearest = nearest_by_bearing(clouds)
-    return [free_space(np.zeros((1, 3)), nearest[k : k + 1]) for k in range(len(clouds))]
+@pytest.fixture(autouse=True)
+def all_points(monkeypatch):
+    monkeypatch.setattr(OverlapPolicy, "points", 10_000)
 
 
-def net(clouds, pose, free, limit=10_000):
-    raster, pair = rasterize(clouds, 0.05, 0.5), (np.array([0]), np.array([1]))
-    return float(net_overlap(clouds, raster, free, *pair, np.array([pose]), limit, GATE, SPACING)[0])
+def net(clouds, pose, free):
+    """Return the net overlap, m, of the first two clouds."""
+    return SPACING * float(net_overlap(rasterize(clouds, 0.05, 0.5), free, FIRST, SECOND, np.array([pose]), GATE)[0])
 
 
 def by_loops(clouds, pose, free):
@@ -42,7 +41,7 @@ def by_loops(clouds, pose, free):
             distance = np.hypot(*(other - point).T)
             k = np.argmin(distance)
             good = distance[k] <= GATE and normal @ facing[k] > np.sqrt(0.5)
-            seen = seen_beyond(space, se2.transform(frame, point[None]), VisibilityPolicy.margin)[1][0] > 0
+            seen = seen_beyond(space, se2.transform(frame, point[None]))[1][0] > 0
             total += np.outer(normal, normal) * (1.0 if good else -OverlapPolicy.against * seen)
     angle = np.linspace(0.0, np.pi, 3600)
     u = np.stack([np.cos(angle), np.sin(angle)])
@@ -53,21 +52,22 @@ def by_loops(clouds, pose, free):
 def test_it_is_the_least_over_all_directions(off):
     """A raster's cell is 5 cm, so points within that of the gate may count otherwise: one metre of 30 here."""
     clouds = scanned(POSES, HALL, 0.01, 1, beams=360, reach=9.0)
-    pose, free = se2.between(*POSES) + off, spaces(clouds)
+    pose, free = se2.between(*POSES) + off, free_around(clouds)
     assert abs(net(clouds, pose, free) - by_loops(clouds, pose, free)) < 1.0
 
 
-def test_points_left_out_count_by_those_looked_up():
+def test_points_left_out_count_by_those_looked_up(monkeypatch):
     clouds = scanned(POSES, HALL, 0.01, 1, beams=720, reach=9.0)
-    true, free = se2.between(*POSES), spaces(clouds)
+    true, free = se2.between(*POSES), free_around(clouds)
     whole = net(clouds, true, free)
-    assert abs(net(clouds, true, free, limit=len(clouds.points) // 4) - whole) < 0.15 * whole
+    monkeypatch.setattr(OverlapPolicy, "points", len(clouds.points) // 4)
+    assert abs(net(clouds, true, free) - whole) < 0.15 * whole
 
 
 def test_clouds_that_meet_in_part_speak_for_the_true_place_alone():
     """Two scans in a corridor share some faces of pillars; slid along it, walls match as before and pillars contradict."""
     clouds = scanned(np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]]), NICHES, 0.01, 2, beams=720, reach=6.0)
-    free = spaces(clouds)
+    free = free_around(clouds)
     right = net(clouds, [1.5, 0.0, 0.0], free)
     assert right > 1.0  # both ways; each sees 0.3 m of the ends of three pillars that the other sees, and of some a part
     for slid in (-2.0, 0.0, 0.6, 2.4, 4.4, 6.0):
@@ -77,12 +77,12 @@ def test_clouds_that_meet_in_part_speak_for_the_true_place_alone():
 def test_where_free_space_is_not_asked_all_points_count_as_in_view():
     clouds = scanned(np.array([[-1.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), NICHES, 0.01, 2, beams=720, reach=6.0)
     true = [5.0, 0.0, 0.0]
-    assert net(clouds, true, None) < net(clouds, true, spaces(clouds))
+    assert net(clouds, true, None) < net(clouds, true, free_around(clouds))
 
 
 def test_clouds_out_of_each_others_view_say_nothing():
     clouds = scanned(POSES, HALL, 0.01, 1, beams=360, reach=9.0)
-    assert net(clouds, [90.0, 0.0, 0.0], spaces(clouds)) == 0.0
+    assert net(clouds, [90.0, 0.0, 0.0], free_around(clouds)) == 0.0
     assert net(clouds, [90.0, 0.0, 0.0], None) < 0.0
 
 
@@ -95,16 +95,16 @@ def test_what_other_clouds_there_are_does_not_matter():
     pair = scanned(POSES, HALL, 0.0, beams=360, reach=9.0)
     more = scanned(np.array([[3.0, 1.0, 0.0], *POSES, [-3.0, 0.0, 1.0]]), HALL, 0.0, beams=360, reach=9.0)
     for free in (False, True):
-        alone = net(pair, se2.between(*POSES), spaces(pair) if free else None)
+        alone = net(pair, se2.between(*POSES), free_around(pair) if free else None)
         among = net_overlap(
-            more, rasterize(more, 0.05, 0.5), spaces(more) if free else None, np.array([1, 0, 3]), np.array([2, 3, 0]),
-            np.tile(se2.between(*POSES), (3, 1)), 10_000, GATE, SPACING,
+            rasterize(more, 0.05, 0.5), free_around(more) if free else None, np.array([1, 0, 3]), np.array([2, 3, 0]),
+            np.tile(se2.between(*POSES), (3, 1)), GATE,
         )  # fmt: skip
-        assert among[0] == pytest.approx(alone, rel=1e-9)
+        assert SPACING * among[0] == pytest.approx(alone, rel=1e-9)
 
 
-def share(clouds, pose, limit=10_000):
-    return float(directional_overlap(clouds, rasterize(clouds, 0.05, 0.5), FIRST, SECOND, np.array([pose]), limit, GATE)[0])
+def share(clouds, pose):
+    return float(directional_overlap(rasterize(clouds, 0.05, 0.5), FIRST, SECOND, np.array([pose]), GATE)[0])
 
 
 def share_by_loops(clouds, pose):

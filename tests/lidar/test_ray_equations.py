@@ -4,18 +4,15 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from helpers.planted_rays import POSES, SURFACES, rays_that_end
+from helpers.planted_rays import POSES, SURFACES, linearized, rays_that_end
 
 from uwblite import se2
-from uwblite.lidar.ray_equations import linearized, noise_of, weighted_sums
-from uwblite.lidar.ray_noise import RayNoise
-from uwblite.lidar.surface_rays import MeasuredSurfaces, SurfaceRays, Surfaces
+from uwblite.lidar.ray_equations import noise_of, weighted_sums
+from uwblite.lidar.surface_rays import MeasuredSurfaces, RayNoise, SurfaceRays, Surfaces
 
 
 def residuals(rays, surfaces, poses):
-    """In metres: what weighs them by incidence is divided out, which derivatives leave alone."""
-    at = linearized(rays, surfaces, poses, poses)
-    return at.residual
+    return linearized(rays, surfaces, poses, poses).residual
 
 
 def test_derivatives_are_those_of_the_residuals():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from uwblite.lidar.ray_noise import ALIKE, UNLEARNT, learnt_noise
+from uwblite.lidar.ray_equations import learnt_noise
+from uwblite.lidar.surface_rays import UNLEARNT, ShapePolicy
 
 SURFACES, PLACES, EACH = 40, 12, 30
 """Each surface has so many places, and each place so many rays."""
@@ -44,7 +45,7 @@ def test_what_rays_of_a_place_have_in_common_counts_against_them(shared):
 def test_surfaces_of_few_places_show_nothing():
     residual, place, surface = planted(1.0, 0.5)
     noise = learnt_noise(residual, place % 4, surface, np.zeros(SURFACES, dtype=bool))
-    np.testing.assert_array_equal(noise.alike, [ALIKE, ALIKE])
+    np.testing.assert_array_equal(noise.alike, ShapePolicy.alike)
 
 
 def test_outliers_change_little():

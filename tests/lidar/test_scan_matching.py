@@ -1,5 +1,7 @@
 """Matching of pairs: the condensed cost against numbers, known motions, blind directions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, ROOM, scanned
@@ -11,7 +13,12 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.scan_matching import PairFactors, PairPoints, match, measured, nondegenerate_step, pair_points
+from uwblite.lidar.scan_matching import PairFactors, match, measured, nondegenerate_step, pairs_of
+
+
+def listed(pairs, pair):
+    """Return the rows of the points of one pair."""
+    return pairs.points[pair][pairs.points[pair] >= 0]
 
 
 @settings(max_examples=20)
@@ -20,9 +27,9 @@ def test_pair_points_are_spread_over_the_points_with_normals(seed, limit):
     rng = np.random.default_rng(seed)
     clouds = scattered(rng, [30, 0, 3, 100])
     j = np.array([3, 1, 0, 2, 3])
-    points = pair_points(clouds, j, limit)
+    pairs = pairs_of(clouds, j, j, limit)
     for pair, cloud in enumerate(j):
-        rows = points.of(pair)
+        rows = listed(pairs, pair)
         own = np.flatnonzero((clouds.owner == cloud) & np.any(clouds.normals != 0.0, axis=1))
         assert len(rows) == min(limit, len(own))
         assert np.isin(rows, own).all()
@@ -58,10 +65,10 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
     raster, gate, scale = rasterize(clouds, 0.05, 0.4), 0.3, 0.08
     i, j = np.array([0, 0, 2]), np.array([1, 2, 1])
     pose = se2.between(truth[i], truth[j]) + rng.normal(0, 0.03, (3, 3))
-    points = pair_points(clouds, j, 120)
-    factors = match(clouds, raster, i, pose, points, gate, scale)
+    pairs = pairs_of(clouds, i, j, 120)
+    factors = match(raster, pairs, pose, gate, scale)
     for e in range(3):
-        rows = points.of(e)
+        rows = listed(pairs, e)
         source, target, normal, scatter = by_hand(clouds, raster, i[e], pose[e], rows, gate, scale)
         assert factors.asked[e] == len(rows)
         assert factors.matched[e] == len(source)
@@ -95,11 +102,11 @@ def test_a_point_of_weight_two_counts_as_two_and_one_of_none_not_at_all():
     truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9]])
     clouds = scanned(truth, ROOM, 0.01, 3)
     raster, i, j = rasterize(clouds, 0.05, 0.4), np.array([0]), np.array([1])
-    pose, points = se2.between(truth[i], truth[j]) + 0.01, pair_points(clouds, j, 120)
-    rows, weight = points.of(0), np.ones(len(clouds.points))
+    pose, pairs = se2.between(truth[i], truth[j]) + 0.01, pairs_of(clouds, i, j, 120)
+    rows, weight = listed(pairs, 0), np.ones(len(clouds.points))
     weight[rows[::2]], weight[rows[1::2]] = 2.0, 0.0
-    whole = match(clouds, raster, i, pose, points, 0.3, 0.08, weight)
-    half = match(clouds, raster, i, pose, PairPoints(rows[None, ::2].astype(np.int32)), 0.3, 0.08)
+    whole = match(raster, pairs, pose, 0.3, 0.08, weight)
+    half = match(raster, replace(pairs, points=rows[None, ::2]), pose, 0.3, 0.08)
     for name in ("hessian", "gradient", "spurious", "squared", "weight"):
         np.testing.assert_allclose(getattr(whole, name), 2.0 * getattr(half, name), rtol=1e-9, atol=1e-9)
     assert whole.asked[0] == len(rows)
@@ -111,21 +118,21 @@ def test_each_pair_may_have_its_own_gate_and_kernel():
     truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
     clouds = scanned(truth, ROOM, 0.01, 3)
     raster, i, j = rasterize(clouds, 0.05, 0.4), rng.integers(0, 3, 200), rng.integers(0, 3, 200)
-    pose, points = se2.between(truth[i], truth[j]) + 0.02, pair_points(clouds, j, 120)
+    pose, pairs = se2.between(truth[i], truth[j]) + 0.02, pairs_of(clouds, i, j, 120)
     gate, scale = rng.choice([0.05, 0.1, 0.3], 200), rng.choice([0.02, 0.1], 200)
-    together = match(clouds, raster, i, pose, points, gate, scale)
+    together = match(raster, pairs, pose, gate, scale)
     for one, width in ((0.05, 0.02), (0.1, 0.1), (0.3, 0.02)):
         own = np.flatnonzero((gate == one) & (scale == width))
-        alone = match(clouds, raster, i[own], pose[own], PairPoints(points.row[own]), one, width)
+        alone = match(raster, pairs.rows(own), pose[own], one, width)
         for name in ("hessian", "spurious", "gradient", "matched", "squared", "weight"):
             np.testing.assert_allclose(getattr(together, name)[own], getattr(alone, name), rtol=1e-12, atol=1e-12)
 
 
 def converged(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):
     """Return the poses after rounds of matching and stepping, and the last factors and measurement."""
-    points, pose = pair_points(clouds, j, 200), guess.copy()
+    pairs, pose = pairs_of(clouds, i, j, 200), guess.copy()
     for gate in gates:
-        factors = match(clouds, raster, i, pose, points, gate, gate / 2)
+        factors = match(raster, pairs, pose, gate, gate / 2)
         before = pose
         pose, root = measured(factors, pose, np.ones(len(i)))
     return before, factors, pose, root
@@ -224,10 +231,10 @@ def test_nothing_to_match_is_no_information():
     clouds = scattered(np.random.default_rng(0), [5, 0, 5])
     raster = rasterize(clouds, 0.1, 0.3)
     none = np.zeros(0, dtype=np.intp)
-    empty = match(clouds, raster, none, np.zeros((0, 3)), pair_points(clouds, none, 10), 0.3, 0.1)
+    empty = match(raster, pairs_of(clouds, none, none, 10), np.zeros((0, 3)), 0.3, 0.1)
     assert measured(empty, np.zeros((0, 3)), np.zeros(0))[1].shape == (0, 3, 3)
     i, j, far = np.array([0, 1, 0]), np.array([1, 0, 2]), np.full((3, 3), 50.0)
-    factors = match(clouds, raster, i, far, pair_points(clouds, j, 10), 0.3, 0.1)
+    factors = match(raster, pairs_of(clouds, i, j, 10), far, 0.3, 0.1)
     assert factors.matched.tolist() == [0, 0, 0]
     z, root = measured(factors, far, np.ones(3))
     assert np.all(root == 0.0)
@@ -241,7 +248,7 @@ def test_opposite_sides_of_a_thin_wall_do_not_match():
     truth = np.array([[0.0, -1.5, 0.0], [0.0, 1.5, 0.0], [0.5, -1.5, 0.0]])
     clouds = scanned(truth, walls)
     i, j = np.array([0, 0]), np.array([1, 2])
-    points = pair_points(clouds, j, 100)
-    factors = match(clouds, rasterize(clouds, 0.04, 0.3), i, se2.between(truth[i], truth[j]), points, 0.2, 0.1)
+    pairs = pairs_of(clouds, i, j, 100)
+    factors = match(rasterize(clouds, 0.04, 0.3), pairs, se2.between(truth[i], truth[j]), 0.2, 0.1)
     assert factors.matched[0] == 0
     assert factors.matched[1] > 50

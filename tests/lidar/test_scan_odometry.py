@@ -1,5 +1,7 @@
 """Motions between pairs of scans: measured where walls are seen, the guess where none are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.planted import box, drive, scans
@@ -33,7 +35,7 @@ def test_motions_are_found_whatever_the_mounting(mounting):
     right, wrong = (misfits(lidar, mounting, FIRST, SECOND, exact + off) for off in (np.zeros(3), np.array([0.1, 0.1, 0.0])))
     assert np.all(right < 0.2 * wrong)
     away = misfits(lidar, mounting, FIRST, SECOND, exact + np.array([90.0, 0.0, 0.0]))
-    np.testing.assert_allclose(away, ScanStepPolicy.first_gate**2)
+    np.testing.assert_allclose(away, ScanStepPolicy.reach**2)
 
 
 def test_along_a_bare_corridor_a_scan_matches_the_next_one_no_better_if_the_robot_stood():
@@ -81,6 +83,6 @@ def test_rays_are_points_in_the_frame_of_the_base_that_come_from_the_laser(mount
 def test_a_scan_that_sees_nothing_is_searched_in_vain():
     lidar, _ = seen()
     lidar.ranges[0] = np.inf
-    built, raster, *_ = _pairs(lidar, NOMINAL, FIRST[:1], SECOND[:1])
-    assert _searched(built, raster, 0, 1, np.zeros(3)) is None
-    assert _searched(built, raster, 1, 1, np.zeros(3))[1] > 0.9
+    raster, pairs = _pairs(lidar, NOMINAL, FIRST[:1], SECOND[:1])
+    assert _searched(raster, pairs, np.zeros(3))[1] == 0.0
+    assert _searched(raster, replace(pairs, i=pairs.j), np.zeros(3))[1] > 0.9

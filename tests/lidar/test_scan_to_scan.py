@@ -11,7 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds, joined
-from uwblite.lidar.scan_to_scan import follow, match_plainly, reattached
+from uwblite.lidar.scan_to_scan import follow, match_plainly
 from uwblite.odometry.slips import EVERY, LASTS
 
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -32,8 +32,8 @@ def tracked(truth, clouds, stated, by_ranges=None, duration=None):
     for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    steps = match_plainly(clouds, raster, wheels.i, stated, GATE)
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), steps)
+    steps = match_plainly(raster, wheels.i, stated, GATE)
+    return follow(raster, wheels, Graph(np.array(poses)), steps)
 
 
 @pytest.fixture(scope="module")
@@ -189,47 +189,3 @@ def test_a_corridor_is_not_measured_along():
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     assert len(steps) > 20
     assert np.median(information[:, 0, 0]) < 0.02 * np.median(information[:, 1, 1])
-
-
-def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
-    truth, clouds, _ = walk
-    rng = np.random.default_rng(4)
-    lines = np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
-    astray = int(np.argmax(np.convolve(lines, np.ones(5), mode="valid"))) + 2
-    poses, tied = truth + rng.standard_normal(truth.shape) * 0.003, np.ones(len(truth), dtype=bool)
-    poses[astray] = se2.compose(poses[astray], np.array([0.2, -0.1, 0.8]))
-    tied[astray] = False
-    raster = rasterize(clouds, 0.1, GATE)
-    found, laid = reattached(clouds, raster, poses, np.arange(len(truth)) * 1.0, tied, GATE)
-    assert laid.tolist() == [astray]
-    error = se2.between(se2.between(truth[astray - 1], truth[astray]), se2.between(found[astray - 1], found[astray]))
-    assert np.hypot(*error[:2]) < 0.02
-    assert abs(error[2]) < 0.01
-    np.testing.assert_array_equal(np.delete(found, astray, axis=0), np.delete(poses, astray, axis=0))
-
-
-def test_as_many_as_three_keyframes_in_a_row_are_laid_where_their_stamps_say(walk):
-    """The odometry says nothing of them; the clock of the recording may have begun long ago."""
-    truth, clouds, _ = walk
-    lines = np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
-    first = int(np.argmax(np.convolve(lines, np.ones(7), mode="valid"))) + 2
-    run, tied = np.arange(first, first + 3), np.ones(len(truth), dtype=bool)
-    tied[run] = False
-    poses = truth.copy()
-    poses[run] += [30.0, 0.0, 1.0]
-    stamps = 1e6 + np.arange(len(truth))
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE)
-    assert laid.tolist() == run.tolist()
-    error = se2.between(truth[run], found[run])
-    assert np.abs(error[:, :2]).max() < 0.03
-    assert np.abs(error[:, 2]).max() < 0.02
-
-
-def test_keyframes_without_neighbours_on_both_sides_stay(walk):
-    truth, clouds, _ = walk
-    tied = np.ones(len(truth), dtype=bool)
-    tied[[0, -1]] = False
-    tied[4:9] = False
-    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE)
-    assert len(laid) == 0
-    np.testing.assert_array_equal(found, truth)

@@ -6,7 +6,7 @@ from helpers.wall_rays import seen
 
 from uwblite import se2
 from uwblite.lidar import walls as walls_module
-from uwblite.lidar.walls import WallConfig, find_walls, straight_pieces
+from uwblite.lidar.walls import WallPolicy, find_walls, straight_pieces
 
 ALONG = np.column_stack([np.arange(0.0, 6.0, 0.4), np.zeros(15), np.zeros(15)])
 
@@ -90,7 +90,7 @@ def test_a_bent_wall_is_none():
     assert len(found.centre) == 0
 
 
-def test_stems_that_look_flat_from_every_side_are_hardly_walls():
+def test_stems_that_look_flat_from_every_side_are_hardly_walls(monkeypatch):
     """Stems of 9 cm radius along an aisle: few rays on each show no curvature, and what is seen of it turns with the view."""
     angle = np.linspace(0.0, 2.0 * np.pi, 25)
     rings = [0.09 * np.column_stack([np.cos(angle), np.sin(angle)]) + [x, y] for x in (1.5, 3.0, 4.5) for y in (-1.5, 1.5)]
@@ -100,7 +100,8 @@ def test_stems_that_look_flat_from_every_side_are_hardly_walls():
     every = np.ones(len(pieces.length), dtype=bool)
     # One of the six hardly turns, within its noise.
     assert len(find_walls(pieces, poses, every).centre) <= 1
-    assert len(find_walls(pieces, poses, every, WallConfig(turned=np.inf)).centre) >= 5
+    monkeypatch.setattr(WallPolicy, "turned", np.inf)
+    assert len(find_walls(pieces, poses, every).centre) >= 5
 
 
 def test_a_wall_that_poses_bend_is_found_in_straight_parts():

@@ -5,8 +5,8 @@ import numpy as np
 from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.comparison import PlaceSearch, _no_repetition
-from uwblite.localization.known_map import KnownAnchors, KnownMap
-from uwblite.localization.range_model import RangeFacts, range_errors
+from uwblite.localization.known_map import KnownMap
+from uwblite.localization.range_model import KnownAnchors, range_errors
 from uwblite.localization.search import UNIT
 from uwblite.localization.verdict import CERTAIN
 from uwblite.localization.window import Window, WindowRange
@@ -28,10 +28,10 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
     window = Window()
     for k, pose in enumerate(path):
         for a, place in enumerate(anchors):
-            fact = RangeFacts(a, place, float(np.hypot(*(pose[:2] - place))), 0.0, 0.05, 0.0)
-            window.ranges.append(WindowRange(fact, pose, np.zeros(2), 0.2 * k, 0.1 * k))
+            metres = float(np.hypot(*(pose[:2] - place)))
+            window.ranges.append(WindowRange(a, metres, pose, np.zeros(2), 0.2 * k, 0.1 * k))
     places, driven = PlaceSearch(known), np.array([1.0, 0.3, 0.4])
-    nobody = hypotheses.started(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(4))
+    nobody = hypotheses.none(4)
     places.begin(window, path[-1], 4.0)
     now = se2.compose(path[-1], driven)
     found = None

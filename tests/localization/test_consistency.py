@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers.hypotheses import anchors_at
 from helpers.localization_room import ANCHORS
 from scipy.stats import chi2
 
 from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH, SLOW_SIGMA, WHEEL_SIGMA
-from uwblite.localization.range_model import RangeFacts
 from uwblite.radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
 
 PLACES = np.array(list(ANCHORS.values()))
@@ -36,6 +36,7 @@ def planted(seed, steps=150):
     pattern, slow = PATTERN_SIGMA * rng.normal(size=2 * HARMONICS), SLOW_SIGMA * rng.normal(size=len(PLACES))
     bias = BIASES * rng.normal(size=len(PLACES))
     bank = hypotheses.started((truth + np.linalg.cholesky(START) @ rng.normal(size=3))[None], START[None], BIASES)
+    known = anchors_at(PLACES, WHITE)
     fade, found = np.exp(-STEP / SLOW_LENGTH), []
     for k in range(steps):
         # A circle of 1.5 m about the room's middle.
@@ -49,7 +50,7 @@ def planted(seed, steps=150):
             bearing = np.arctan2(*(place - truth[:2])[::-1]) - truth[2]
             error = pattern_waves(np.array([bearing]))[0] @ pattern + slow[anchor] + bias[anchor]
             value = np.hypot(*(truth[:2] - place)) + error + WHITE * rng.normal()
-            bank = hypotheses.ranged(bank, RangeFacts(anchor, place, value, 0.0, WHITE, 0.0), np.zeros(2))[0]
+            bank = hypotheses.ranged(bank, known, anchor, value, np.zeros(2))[0]
         if k % 50 == 49:
             off = bank.poses[0] - truth
             off[2] = se2.wrap_angle(off[2])

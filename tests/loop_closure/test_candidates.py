@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from uwblite.loop_closure.candidates import (
     Candidates,
     _among,
-    _best_per_submap,
     _near,
     any_uncertain,
+    best_per_submap,
     missed,
     overlap_probability,
 )
@@ -31,7 +31,7 @@ def test_every_submap_keeps_its_best_partners(seed, limit):
         for submap in range(6):
             own = np.flatnonzero(one == submap)
             kept |= set(own[np.argsort(-worth[own])][:limit].tolist())
-    assert _best_per_submap(a, b, worth, limit).tolist() == sorted(k for k in kept if worth[k] > 0.0)
+    assert best_per_submap(a, b, worth, limit).tolist() == sorted(k for k in kept if worth[k] > 0.0)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([2, 3]))

@@ -7,7 +7,7 @@ import pytest
 from helpers.laser_walks import returned
 
 from uwblite import se2
-from uwblite.graph.joint_covariance import JointCovariance
+from uwblite.graph.marginals import JointCovariance
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, of_pieces
 from uwblite.loop_closure.candidates import (

@@ -44,9 +44,9 @@ def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypat
     ends, guess = np.array([0, 0]), np.tile(se2.between(truth[0], truth[1]), (2, 1))
     stretches = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), np.ones(2), False, long=True)
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
-    monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[3]), 13.7))
+    monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[2]), 13.7))
     for candidates, net in ((stretches, 13.7), (replace(stretches, long=False), np.inf)):
-        found, _ = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
+        found, _ = matching._fit(matching._Batch(candidates, clouds, 1.0, None, config, CorrelativeConfig()))
         assert found.net.tolist() == [net, net]
         np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
         assert found.found.all()
@@ -70,7 +70,7 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
         return SimpleNamespace(poses=np.tile(guess, (30, 1)))
 
     monkeypatch.setattr(matching, "search", search)
-    monkeypatch.setattr(matching, "_prepare", lambda clouds, k, prepared: k)
+    monkeypatch.setattr(matching, "_prepare", lambda clouds, k: k)
     monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
     spread, sigma = np.array([config.direct, 1.0, 2.0, 9.0]), np.array([1.0, 0.01, 0.1, 9.0])
     candidates = SimpleNamespace(

@@ -9,7 +9,7 @@ from helpers.laser_walks import drifted, scanned, walked
 from scipy.spatial import cKDTree
 
 from uwblite import se2
-from uwblite.graph.joint_covariance import JointCovariance
+from uwblite.graph.marginals import JointCovariance
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.lidar.correlative_matching import CorrelativeConfig

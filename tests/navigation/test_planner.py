@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OCCUPIED, OccupancyGrid
-from uwblite.navigation import regions, steps
+from uwblite.navigation import steps
 from uwblite.navigation.planner import NoPathError, make_planner
 from uwblite.navigation.steps import STEPS
 
@@ -96,9 +96,8 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     grid = random_grid(seed, rows=100, cols=140, boxes=95)
     grid.log_odds[20:30, 20:26] = 0.0
     whole = make_planner(grid, RADIUS, unknown="price")
-    monkeypatch.setattr(steps, "_AT_ONCE", 2500)
-    for module in (steps, regions):
-        monkeypatch.setattr(module, "BLOCK", block)
+    monkeypatch.setattr(steps, "AT_ONCE", 2500)
+    monkeypatch.setattr(steps, "BLOCK", block)
     parts = make_planner(grid, RADIUS, unknown="price")
     assert parts.steps.regions is not None
     nodes = whole.steps.nodes()
@@ -131,7 +130,7 @@ def test_a_long_corridor_is_hardly_searched_and_its_path_is_as_cheap(monkeypatch
     grid = OccupancyGrid(GridGeometry(0.05, np.zeros(2), *log_odds.shape), log_odds)
     start, goal = np.array([0.7, 0.8]), np.array([49.2, 5.2])
     whole = make_planner(grid, 0.2, unknown=unknown).plan(start, [goal])
-    monkeypatch.setattr(steps, "_AT_ONCE", 15_000)
+    monkeypatch.setattr(steps, "AT_ONCE", 15_000)
     parts = make_planner(grid, 0.2, unknown=unknown)
     searched = []
     search = steps.StepSearch._search
@@ -254,7 +253,7 @@ def test_a_robot_too_near_to_a_wall_may_leave_and_one_inside_of_it_not():
 
 @pytest.mark.parametrize("at_once", [300_000, 200])
 def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known(monkeypatch, at_once):
-    monkeypatch.setattr(steps, "_AT_ONCE", at_once)
+    monkeypatch.setattr(steps, "AT_ONCE", at_once)
     text = "\n".join(["." * 40] * 16 + ["?" * 10 + "#" * 20 + "?" * 10] + ["?" * 40] * 16)
     grid = grid_of(text)
     planner, priced = make_planner(grid, 0.2), make_planner(grid, 0.2, unknown="price")

@@ -28,7 +28,7 @@ def test_batches_change_nothing(monkeypatch):
     rng = np.random.default_rng(1)
     begin, end = (rng.uniform(clearance.geometry.origin, clearance.geometry.corner, (60, 2)) for _ in range(2))
     whole = along_lines(clearance, begin, end)
-    monkeypatch.setattr(smoothing, "_SAMPLES_AT_A_TIME", 100)
+    monkeypatch.setattr(smoothing, "AT_ONCE", 100)
     for one, other in zip(whole, along_lines(clearance, begin, end), strict=True):
         assert np.array_equal(one, other)
 

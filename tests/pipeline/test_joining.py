@@ -14,8 +14,7 @@ from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.graph.calibration import CalibrationConfig, block, of_recording, prior_edges, unknowns
 from uwblite.graph.graph import Graph
-from uwblite.graph.joint_covariance import anchor_covariance
-from uwblite.graph.marginals import marginals
+from uwblite.graph.marginals import anchor_covariance, marginals
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges

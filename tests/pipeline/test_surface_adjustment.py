@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import aligned_error
+from helpers.planted_rays import linearized
 from simulation.real_rooms import RealRooms
 from simulation.recording import Settings
 from trials import made
@@ -14,7 +15,6 @@ from uwblite.graph.calibration import LASER, with_free
 from uwblite.graph.marginals import marginals
 from uwblite.graph.normal_equations import filled
 from uwblite.graph.solver import optimize
-from uwblite.lidar.ray_equations import linearized
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances

@@ -8,7 +8,7 @@ from helpers.planted import ranges, wander
 
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph, PriorEdges
-from uwblite.graph.joint_covariance import calibration_covariance
+from uwblite.graph.marginals import calibration_covariance
 from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select

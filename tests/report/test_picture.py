@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
-from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATH, PATHS, PROPOSED, START, WIDTH, Canvas, rgb, text_mask
+from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, rgb, text_mask
 from uwblite.report.drawn_map import DrawnAnchor, DrawnClosure, DrawnMap
 from uwblite.report.picture import FLOOR, INK, PAPER, WALL, Key, _paste, draw_errors, draw_map, rows_of
 from uwblite.report.svg_map import round_length
@@ -37,7 +37,7 @@ def test_everything_is_on_it():
     assert image.dtype == np.uint8
     for colour in (WALL, PAPER, (255, 255, 255), ANCHOR):
         assert share(image, colour) > 1e-4
-    for colour in (PATH, ACCEPTED):
+    for colour in (PATHS[0], ACCEPTED):
         assert share(image, colour, 60) > 1e-4
     np.testing.assert_array_equal(decode_png(encode_png(image)), image)
     np.testing.assert_array_equal(draw_map(drawn, caption="a room"), image)
@@ -51,8 +51,8 @@ def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
     rows = np.flatnonzero(dark.mean(axis=1) > 0.5)
     below = image[rows.max() + 5 : -100]
     assert rows.mean() < image.shape[0] / 2
-    assert share(below, PATH, 60) > 0
-    assert share(image[: rows.max()], PATH, 60) == 0
+    assert share(below, PATHS[0], 60) > 0
+    assert share(image[: rows.max()], PATHS[0], 60) == 0
 
 
 @pytest.mark.parametrize(("size", "resolution"), [(240, 0.01), (240, 0.3), (300, 0.05), (2000, 0.05)])
@@ -163,7 +163,7 @@ def test_many_cells_in_one_pixel_equal_a_loop_over_blocks():
 
 
 def test_the_legend_is_of_what_is_drawn_and_never_cut():
-    keys = [Key(text, PATH, "line", 32) for text in ("path", "recording 2", "anchor, 2 sigma", "loop closure")]
+    keys = [Key(text, PATHS[0], "line", 32) for text in ("path", "recording 2", "anchor, 2 sigma", "loop closure")]
     for width in (240, 500, 2000):
         rows = rows_of(width, keys)
         assert [key for row in rows for key in row] == keys

@@ -9,7 +9,6 @@ from helpers.told import told
 from uwblite.screening import range_motion
 from uwblite.screening.odometry_chain import usual_speed
 from uwblite.screening.range_motion import (
-    _agreed,
     _by_anchor,
     _jumps,
     _noise,
@@ -43,23 +42,6 @@ def test_jumps_are_differences_of_medians_beyond_the_way_driven(window):
         driven = np.mean(way[after]) - np.mean(way[before])
         expected[k] = abs(np.median(ranges[after]) - np.median(ranges[before])) - 1.5 * driven
     np.testing.assert_allclose(_jumps(ranges, way, window), expected)
-
-
-@pytest.mark.parametrize(
-    ("over", "agreed"),
-    [
-        ([0.7], 0.7),
-        ([-0.2], -0.2),
-        ([3.0, 1.0], 1.0),
-        ([1.0, 3.0, 2.0], 2.0),
-        ([6, 5, 4, 3, 2, 1], 4.0),
-        ([9, 8, 7, 6], 8.0),
-    ],
-)
-def test_half_of_the_anchors_must_agree_and_at_least_two_where_there_are_two(over, agreed):
-    assert _agreed(np.array(over, dtype=float)) == agreed
-    both = np.array([over, over[::-1]], dtype=float).T
-    assert _agreed(both).tolist() == [agreed, agreed]
 
 
 def test_noise_is_that_of_second_differences():

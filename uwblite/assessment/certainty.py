@@ -42,9 +42,7 @@ _STEP = 1e-4
 def check_certainty(estimate: Estimate, sigma: float, task: Task) -> Iterator[Finding]:
     """Doubt a map whose own uncertainties are so large that its shape is not known well.
 
-    Parameters
-    ----------
-    sigma : m, rms of the places' expected errors after alignment, the unit of length apart.
+    Sigma is the rms of the places' expected errors after alignment, m, the unit of length apart.
     """
     extent = float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
     # Ranges hold every place to the same error; without, that of a chain of steps grows with the root of its length.

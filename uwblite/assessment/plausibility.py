@@ -35,6 +35,10 @@ _UNRELATED = 0.2
 _WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
 """Relative error of the odometry's turns beyond which their sign is no longer sure: where they are too small, and where too
 large. Wheels that slip count too much, never too little: skid steering as if its track were wider, by two thirds at most."""
+_ONE_TIME = 30.0
+"""Moves within so much of each other count as simultaneous, s."""
+SAME_PLACE = 1.5
+"""m; an anchor nearer than this to the former place of another one took its place, or only its name."""
 _POOR_FIT = 4.0
 """chi2 per degree of freedom beyond which errors are twice the assumed noise: the model is not valid."""
 
@@ -108,10 +112,10 @@ def _left_without(view: ResultView, cause: Finding) -> set[tuple[str, str]]:
     return {(finding.kind, finding.anchor) for finding in found}
 
 
-def check_repairs(task: Task) -> list[Finding]:
+def check_repairs(task: Task) -> Iterator[Finding]:
     """Say what the screening of the recordings found, but for what only a finished map can judge."""
     found = check_recordings([recording.log for recording in task.recordings.each])
-    return [finding for finding in found if finding.kind != WHEELS_AGAINST_LIDAR]
+    yield from (finding for finding in found if finding.kind != WHEELS_AGAINST_LIDAR)
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate]) -> Iterator[Finding]:
@@ -148,37 +152,19 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
         both = set(base[early].tolist()) & set(base[late].tolist())
         changed = {names[k][0] for k in these}
         enough = len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both)))
-        if enough and not _exchanged(these, anchors, names):
+        others = [(names[k][0], a.position) for k, a in enumerate(anchors) if names[k][1] == 1]
+        near = [[np.hypot(*(anchors[k].position - p)) < SAME_PLACE for n, p in others if n != names[k][0]] for k in these]
+        if enough and not all(any(each) for each in near):
             when = float(start - task.recordings.stamps[0])
-            yield doubt(
-                "anchors-moved-together",
-                f"{len(changed)} of {len(both | changed)} anchors seem to have moved at about t = {when:.0f} s: "
-                + (
-                    "an error of lidar, radio or clocks is likelier"
-                    if lidar
-                    else "a change of wheels, tag or radio is likelier, and only the odometry connects the two parts of the map"
-                )
-                + "; map both parts separately and compare",
-                at=when,
-                moved=len(changed),
-                measured=len(both),
+            likelier = "an error of lidar, radio or clocks is likelier"
+            if not lidar:
+                likelier = "a change of wheels, tag or radio is likelier, and only the odometry connects both parts of the map"
+            text = (
+                f"{len(changed)} of {len(both | changed)} anchors seem to have moved at about t = {when:.0f} s: {likelier}; "
+                "map both parts separately and compare"
             )
+            yield doubt("anchors-moved-together", text, at=when, moved=len(changed), measured=len(both))
             return
-
-
-_ONE_TIME = 30.0
-"""Moves within so much of each other count as simultaneous, s."""
-SAME_PLACE = 1.5
-"""m; an anchor nearer than this to the former place of another one took its place, or only its name."""
-
-
-def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: Sequence[tuple[str, int]]) -> bool:
-    """Return whether each of these anchors was moved to where another one was before."""
-    earlier = {names[k][0]: anchors[k].position for k in range(len(anchors)) if names[k][1] == 1}
-    return all(
-        any(name != names[k][0] and np.hypot(*(anchors[k].position - place)) < SAME_PLACE for name, place in earlier.items())
-        for k in these
-    )
 
 
 def check_sensors(grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
@@ -233,18 +219,14 @@ def check_calibration(
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
         unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
-        add = doubt if short or unclear else warning
-        yield add(
-            "unusual-calibration",
+        text = (
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
-            + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
-            + unit_of
-            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else ""),
-            name=value.name,
-            value=value.value,
-            sigma=value.sigma,
-            usual=sigma,
+            f"{_RADIO_OR_WHEELS if scale else 'check that sensor and its settings'}{unit_of}"
         )
+        if short:
+            text += "; the wheels missed some of the travelled distance: the map may be too short"
+        add, figures = doubt if short or unclear else warning, {"value": value.value, "sigma": value.sigma, "usual": sigma}
+        yield add("unusual-calibration", text, name=value.name, **figures)
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:

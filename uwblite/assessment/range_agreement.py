@@ -1,4 +1,7 @@
-"""Test whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not."""
+"""Whether the ranges to one anchor agree with the map throughout, and which results depend on them where they do not.
+
+The table of these rules is MapResult.range_table, empty without ranges; its numbers are those of the anchors.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -42,10 +45,6 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
 
     A line of sight was blocked, or an anchor was moved. Without a lidar, ranges alone determine the path: half of the anchors
     that disagree, or are distrusted or left out, are a doubt as well. An anchor that was moved counts once.
-
-    Parameters
-    ----------
-    anchors : in the order of the table's numbers. table : MapResult.range_table; empty without ranges.
     """
     placed = [a for a in anchors if a.status != "unplaced"]
     of_place = {a.id: name_and_number(a.id)[0] for a in placed}
@@ -96,10 +95,6 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
     question, would not agree with a path that the lidar has bent: then only the wheels are wrong. Anchors that seem to have
     been moved are not used: a bent path could have displaced them.
-
-    Parameters
-    ----------
-    table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
     recorded = check_recordings([recording.log for recording in task.recordings.each])
     against = [finding for finding in recorded if finding.kind == WHEELS_AGAINST_LIDAR]

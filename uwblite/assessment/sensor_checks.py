@@ -9,6 +9,7 @@ from ..arrays import Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..lidar.laser_mounting import Turning, compare
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..screening.repeats import RepeatPolicy
 from ..screening.units import CLEARLY, heading_agreement, heading_reading
 from ..screening.wheel_motion import show_motion
 from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, Odometry, SensorLog, UwbRanges, plausible
@@ -20,7 +21,8 @@ class CheckPolicy:
     """From where on something is worth a finding."""
 
     some: ClassVar[float] = 0.02
-    """Share of readings, or of the time, with a fault from which on it costs accuracy."""
+    """Share of readings, or of the time, with a fault from which on it costs accuracy; and width of a path by its length below
+    which its two sides cannot be distinguished."""
     many: ClassVar[float] = 0.1
     """Share from which on it is a warning."""
     few: ClassVar[int] = 10
@@ -31,8 +33,6 @@ class CheckPolicy:
     """Usual periods of a sensor, and seconds, that are a long silence."""
     slowest: ClassVar[float] = 5.0
     """Hz; ranges and rays between odometry readings that are farther apart are placed badly at usual speeds."""
-    straight: ClassVar[float] = 0.02
-    """Width of a path by its length below which its two sides cannot be distinguished."""
     window: ClassVar[float] = 2.0
     """s; anchors within it are in reach at one time."""
     late: ClassVar[float] = 0.06
@@ -41,8 +41,6 @@ class CheckPolicy:
     """Relative difference of turns by laser and wheels that slip does not explain."""
     sigmas: ClassVar[float] = 5.0
     """Standard deviations beyond which nothing is noise."""
-    noise: ClassVar[float] = 0.03
-    """Least noise of a radio, m."""
 
 
 def rhythm(stamps: Floats, *, expected_gap: float, repeated: float | None = None) -> Figures:
@@ -179,7 +177,7 @@ def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
     windows = np.lib.stride_tricks.sliding_window_view(values, 5)
     noise = white_noise(values)
     around = np.median(np.delete(windows, 2, axis=1), axis=1)
-    limit = travelled[4:] - travelled[:-4] + CheckPolicy.sigmas * max(noise, CheckPolicy.noise)
+    limit = travelled[4:] - travelled[:-4] + CheckPolicy.sigmas * max(noise, RepeatPolicy.usual_noise)
     return int(np.sum(np.abs(windows[:, 2] - around) > limit)), noise
 
 
@@ -231,7 +229,7 @@ def _check_anchor(name: str, figures: Figures) -> Iterator[Finding]:
         text = f"anchor {name}: {share:.0%} of the ranges jump farther than the robot drove (line of sight blocked?)"
         cure = "they are down-weighted; a higher or more open place helps the anchor"
         yield Finding("spikes", WARNING if share > CheckPolicy.many else NOTE, text, cure, "radio", anchor=name)
-    if figures["width of the path by its length"] < CheckPolicy.straight:
+    if figures["width of the path by its length"] < CheckPolicy.some:
         text = f"anchor {name} was in reach on a straight path only: it may stand on either side of it"
         cure = "drive a curve within its reach; until then its mirror image is as likely"
         yield Finding("straight-path", WARNING, text, cure, "radio", anchor=name)

@@ -6,26 +6,19 @@ from typing import Any
 import numpy as np
 
 from ..io.files import write_text
-from ..io.folders import refuse_foreign_picture
-from ..io.formats import refuse_existing
 from ..io.png import write_png
-from ..io.stored_result import read_space
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.drawn_map import DrawnAnchor, DrawnMap
 from ..report.picture import draw_map
 from . import console
+from .inputs import space_to_plan
 
 _HEAD = "x,y,theta,distance,clearance"
 """Of the table."""
 
 
 def run(args: argparse.Namespace) -> int:
-    table, picture = f"{args.out}.csv", f"{args.out}.png"
-    refuse_existing(args.force, table, picture)
-    refuse_foreign_picture(table, picture, _HEAD)
-    warnings = list[str]()
-    grid, anchors = read_space(args.map, warnings)
-    console.note_of(args.map, warnings)
+    grid, anchors, table, picture = space_to_plan(args, _HEAD)
     try:
         places = [np.array(p) for p in (args.start, *args.via, args.goal)]
         path = make_planner(grid, args.radius, unknown=args.unknown).plan(places[0], places[1:], step=args.step)

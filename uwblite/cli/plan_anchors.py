@@ -6,27 +6,20 @@ from typing import Any
 import numpy as np
 
 from ..io.files import write_text
-from ..io.folders import refuse_foreign_picture
-from ..io.formats import refuse_existing
 from ..io.png import write_png
-from ..io.stored_result import read_space
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
 from ..report.drawn_map import DrawnAnchor
 from ..report.picture import draw_errors, side_by_side
 from ..report.printable import signed
 from . import console
+from .inputs import space_to_plan
 
 _HEAD = "id,x,y,mean_error,error_95"
 """Of the table."""
 
 
 def run(args: argparse.Namespace) -> int:
-    table, picture = f"{args.out}.csv", f"{args.out}.png"
-    refuse_existing(args.force, table, picture)
-    refuse_foreign_picture(table, picture, _HEAD)
-    warnings = list[str]()
-    grid, anchors = read_space(args.map, warnings)
-    console.note_of(args.map, warnings)
+    grid, anchors, table, picture = space_to_plan(args, _HEAD)
     placed = [DrawnAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
     plan = plan_anchors(grid, np.array([a.position for a in placed]).reshape(-1, 2), args.count, reach=args.reach)
     figures = _figures(args, plan, len(placed))

@@ -111,7 +111,7 @@ class DeviceClock:
         spread: float = 0.0,
         proven: bool = True,
     ) -> None:
-        self.latency, self.tied, self.period = latency, spread, period
+        self.tick, self.latency, self.tied, self.period = tick, latency, spread, period
         """s; `tied` is by how much the delay may be wrong."""
         self.proven, self._expected = proven, proven
         self.rate: float | None = None

@@ -152,9 +152,8 @@ def _gyro_line(options: Values, _setup: Setup) -> Driver:
 
 
 def _board(parse: Parse, title: str, options: Values) -> Driver:
-    unit = options.get("time_unit", 1.0)
-    clock = DeviceClock(unit, proven=False)
-    return UwbDriver(LineProtocol(within_reach(parse)), title, options["baud"], clock, unit, options["tag"])
+    clock = DeviceClock(options.get("time_unit", 1.0), proven=False)
+    return UwbDriver(LineProtocol(within_reach(parse)), title, options["baud"], clock, options["tag"])
 
 
 def _uwb_line(options: Values, _setup: Setup) -> Driver:
@@ -164,7 +163,7 @@ def _uwb_line(options: Values, _setup: Setup) -> Driver:
 
 def _tag_frames(name: str, title: str, protocol: type[LinkTrackProtocol | Bu03Protocol], usual: int) -> DeviceKind:
     def make(options: Values, _setup: Setup) -> Driver:
-        return UwbDriver(protocol(), title.partition(" (")[0], options["baud"], DeviceClock(1e-3, 1 << 32), 1e-3)
+        return UwbDriver(protocol(), title.partition(" (")[0], options["baud"], DeviceClock(1e-3, 1 << 32))
 
     return DeviceKind(name, "uwb", title, make, talks=True, probe=name == "linktrack", options={"baud": _baud(usual)})
 

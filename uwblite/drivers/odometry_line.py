@@ -75,18 +75,23 @@ def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str
     return parse
 
 
-class OdometryLineDriver(LineDriver):
-    """A base that prints text lines; where these hold ticks, its pose at the first one is `start`."""
+class _ColumnDriver(LineDriver):
+    """A device that prints numbers by columns, perhaps its own time among them."""
 
-    def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        unit = line_format.time_unit
-        clock = DeviceClock(unit, proven=False)
-        super().__init__(LineProtocol(values_by(line_format)), "base that prints lines", baud, clock, unit)
+    def __init__(self, line_format: LineFormat, baud: int, title: str) -> None:
+        super().__init__(LineProtocol(values_by(line_format)), title, baud, DeviceClock(line_format.time_unit, proven=False))
         self._format = line_format
-        self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
 
     def time_of(self, content: dict[str, float]) -> float | None:
         return content.get("t")
+
+
+class OdometryLineDriver(_ColumnDriver):
+    """A base that prints text lines; where these hold ticks, its pose at the first one is `start`."""
+
+    def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
+        super().__init__(line_format, baud, "base that prints lines")
+        self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
 
     def follows(self, before: Line, after: Line) -> bool:
         """Return whether a base can have moved so, and its clock have gone on so."""
@@ -145,7 +150,7 @@ def gyro_format(columns: str, time_unit: float = 1.0, angle_unit: float = 1.0, p
     return LineFormat(names, time_unit, 1.0, angle_unit, prefix=prefix)
 
 
-class GyroLineDriver(LineDriver):
+class GyroLineDriver(_ColumnDriver):
     """A gyro that prints lines. Nothing is ever sent.
 
     A heading that the gyro sends is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
@@ -153,9 +158,7 @@ class GyroLineDriver(LineDriver):
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:
-        unit = line_format.time_unit
-        clock = DeviceClock(unit, proven=False)
-        super().__init__(LineProtocol(values_by(line_format)), "gyro that prints lines", baud, clock, unit)
+        super().__init__(line_format, baud, "gyro that prints lines")
         self._angle_unit, self._heading = line_format.angle_unit, 0.0
         self._last: tuple[float, float] | None = None
 
@@ -163,9 +166,6 @@ class GyroLineDriver(LineDriver):
         """Discard half a line, and the motion of the gyro meanwhile."""
         super().begin()
         self._last = None
-
-    def time_of(self, content: dict[str, float]) -> float | None:
-        return content.get("t")
 
     def follows(self, before: Line, after: Line) -> bool:
         step = {name: (after.content[name] - before.content[name]) * self._angle_unit for name in after.content}

@@ -110,15 +110,14 @@ class LineProtocol:
 
 
 class LineDriver(Driver, ABC):
-    """A device that is only listened to, perhaps with its own time, in units of so many s. Nothing is ever sent."""
+    """A device that is only listened to, perhaps with its own time in what it sends. Nothing is ever sent."""
 
     first_is_whole = False
     """The first line cannot be the end of one that began before the port was opened."""
 
-    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float) -> None:
+    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock) -> None:
         super().__init__(protocol, title)
         self.baud, self.clock, self.health = baud, clock, LinkHealth()
-        self._unit = unit
         self._series = Continuity(self.follows, "line that")
 
     def spacing(self, event: Line | Corrupt) -> float | None:
@@ -155,7 +154,7 @@ class LineDriver(Driver, ABC):
             return True
         usual = self.clock.lateness(t0, before.stamp) or 0.0
         most = max(LATE, usual + EARLY) if self.health.is_damaged(after.stamp) else math.inf
-        return (t1 - t0) * self._unit >= -1e-9 and min(usual, 0.0) - EARLY <= late <= most
+        return (t1 - t0) * self.clock.tick >= -1e-9 and min(usual, 0.0) - EARLY <= late <= most
 
     def timed(self, line: Line) -> tuple[float, float | None, list[Action]]:
         """Return the stamp of a line, s, the time since the one before by the device, s, and what is missing in between."""

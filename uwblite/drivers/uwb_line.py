@@ -224,8 +224,8 @@ class UwbDriver(LineDriver):
     Of several tags in its lines `tag` counts; "" = the first that is seen twice.
     """
 
-    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float, tag: str = "") -> None:
-        super().__init__(protocol, title, baud, clock, unit)
+    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, tag: str = "") -> None:
+        super().__init__(protocol, title, baud, clock)
         self.first_is_whole = clock.proven
         self._tag, self._leap, self._empty = tag, 0, 0
         self._tags: Counter[str] = Counter()

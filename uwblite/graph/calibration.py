@@ -11,10 +11,13 @@ ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rat
 """Kinds of unknowns of the odometry."""
 TURNING, OMNI = "sideways_per_turn", ("sideways_scale", "sideways_per_metre", "ahead_per_sideways")
 """Kinds of unknowns of an odometry that slips sideways: in turns, and of wheels that drive sideways."""
+WHEELS = (*ODOMETRY, TURNING, *OMNI)
 LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
 """Kinds of unknowns of the lidar."""
 BIAS, HEIGHT, RANGE_SCALE = "bias", "height2", "range_scale"
-RADIO = (HEIGHT, "tag_x", "tag_y", "range_delay")
+RANGING = (RANGE_SCALE, BIAS, HEIGHT, "tag_x", "tag_y", "range_delay")
+"""Kinds of unknowns of a range."""
+RADIO = RANGING[2:]
 """Kinds of unknowns of the radio that the bootstrap does not use."""
 SHARED = (*LASER, RANGE_SCALE)
 """Kinds that all recordings have in common."""
@@ -170,12 +173,12 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
         return scale, bias, calibration.index(HEIGHT, name) if height < 0 else height, x, y, delay
 
     table = [[row(name, number) for name in anchor_ids] for number in range(int(np.max(tags, initial=0)) + 1)]
-    return np.array(table, dtype=np.intp).reshape(len(table), len(anchor_ids), 6)[tags, anchor]
+    return np.array(table, dtype=np.intp).reshape(len(table), len(anchor_ids), len(RANGING))[tags, anchor]
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:
     """Return the (e, 8) calibration indices of OdometryEdges."""
-    return np.broadcast_to(indices(calibration, *ODOMETRY, TURNING, *OMNI), (edges, 8))
+    return np.broadcast_to(indices(calibration, *WHEELS), (edges, len(WHEELS)))
 
 
 def scan_indices(calibration: Calibration) -> Ints:

@@ -35,10 +35,10 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .elimination import PER_COMPLEX, work_of
+from .elimination import work_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
-from .point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges
+from .point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges, distances
 from .pose_edges import RelativePoseEdges
 from .problem_checks import floating_components
 from .range_edges import RangeEdges
@@ -97,16 +97,13 @@ class TangentForm:
             arm = edges.tag_positions(graph.poses) - graph.poses[edges.pose, :2]
             parts: _Parts = ((edges.pose, 1.0), self._carried(edges.pose, arm), (self._anchor + edges.anchor, -1.0))
             self._add_distance(weights / edges.sigma**2, edges.ranges, edges.distances(graph), parts)
-        elif isinstance(edges, PointDistanceEdges):
-            (i, p), (j, q) = (
-                (self.places + k, _complex(point)) for k, point in ((edges.i, edges.point_i), (edges.j, edges.point_j))
-            )
-            parts = ((edges.i, 1.0), (i, p), (edges.j, -1.0), (j, -q))
-            self._add_distance(weights / edges.sigma**2, edges.distance, edges.lengths(graph), parts)
-        elif isinstance(edges, AnchorDistanceEdges):
-            expected = edges.residuals(graph)[:, 0] * edges.sigma + edges.distance
-            parts = ((self._anchor + edges.i, 1.0), (self._anchor + edges.j, -1.0))
-            self._add_distance(weights / edges.sigma**2, edges.distance, expected, parts)
+        elif isinstance(edges, PointDistanceEdges | AnchorDistanceEdges):
+            if isinstance(edges, AnchorDistanceEdges):
+                parts = ((self._anchor + edges.i, 1.0), (self._anchor + edges.j, -1.0))
+            else:
+                one, other = (self.places + edges.i, _complex(edges.point_i)), (self.places + edges.j, -_complex(edges.point_j))
+                parts = ((edges.i, 1.0), one, (edges.j, -1.0), other)
+            self._add_distance(weights / edges.sigma**2, edges.distance, distances(edges, graph), parts)
         elif isinstance(edges, RelativePoseEdges):
             L, r = _weighted(graph, edges, weights)
             i, j = self.places + edges.i, self.places + edges.j
@@ -236,7 +233,7 @@ def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
     try:
         minimum, summary = optimize(graph, _POLISHED, None, allowed)
         S, D = certificate_matrix(minimum)
-        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * PER_COMPLEX * work_of(S) > allowed:
+        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * work_of(S) > allowed:
             return Certificate(False, 0.0, "its edges tie so many poses to so many others that the matrix would fill up")
         bound = max(summary.chi2 - _gap(S, D, 0.5 * negligible, summary.chi2), 0.0)
     except SolverError as problem:

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .elimination import MOST_WORK, PER_COMPLEX, work_of
+from .elimination import EliminationPolicy, work_of
 from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
@@ -60,7 +60,7 @@ def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Float
     inner = A[:, free].conj().T
     solved = values.copy()
     normal = (inner @ inner.conj().T).tocsc()
-    if PER_COMPLEX * work_of(normal) > MOST_WORK:
+    if work_of(normal) > EliminationPolicy.most_work:
         raise SolverError("the matrix would fill up")
     solved[free] = superlu(normal, "MMD_AT_PLUS_A").solve(inner @ right)
     return solved

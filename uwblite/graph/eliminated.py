@@ -49,37 +49,18 @@ def rows_of(linearized: Linearization, unknowns: Unknowns) -> sparse.csr_matrix:
     """Return the Jacobian (e d, n) of measurements (e) by the unknowns of a graph."""
     columns = np.concatenate([unknowns.number[name][index] for name, index, _ in linearized.blocks], axis=1)
     values = np.concatenate([jacobian for *_, jacobian in linearized.blocks], axis=2)
-    return sparse_rows(np.repeat(columns, values.shape[1], axis=0), values.reshape(-1, values.shape[2]), unknowns.size)
+    rows = np.arange(linearized.residuals.size).reshape(linearized.residuals.shape)
+    return entries(rows, columns, values, (rows.size, unknowns.size))
 
 
-def sparse_rows(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
-    """Return the matrix (m, size) with values (m, k) in these columns (m, k); a column below 0 is fixed."""
-    free = columns >= 0
-    ends = np.concatenate([[0], np.cumsum(free.sum(axis=1))])
-    return sparse.csr_matrix((values[free], columns[free], ends), shape=(len(columns), size))
-
-
-_TRACE = 1e-12
+TRACE = 1e-12
 """Damping, as a share of the diagonal: unmeasured directions keep their values."""
 
 
 def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> "WithBlocks":
-    """Return the factor of the normal equations of a graph and of blocks.
-
-    Parameters
-    ----------
-    normal : of the graph, in the sparse layout (NormalEquations with subtrees).
-    order : of an earlier factor of measurements with the same pattern.
-
-    Raises
-    ------
-    SolverError : the matrix is singular, in spite of the damping.
-    """
+    """Return the factor of the normal equations of a graph and of blocks, with a trace of damping; see WithBlocks."""
     diagonal = normal.diagonal + blocks.among.diagonal()
-    damping = sparse.diags(np.where(diagonal > 0.0, _TRACE * diagonal, 1.0))
-    found = WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
-    counted(found, normal.spent)
-    return found
+    return WithBlocks(normal, blocks, np.where(diagonal > 0.0, TRACE * diagonal, 1.0), order)
 
 
 class WithBlocks:
@@ -89,13 +70,13 @@ class WithBlocks:
     unrelated poses, and each passes on the rows of all others.
     """
 
-    def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks, order: Ints | None = None) -> None:
+    def __init__(self, normal: NormalEquations, blocks: Blocks, damping: Floats, order: Ints | None = None) -> None:
         """Factorise.
 
         Parameters
         ----------
-        matrix : (n, n) H.
-        order : of elimination, of a matrix with the same pattern.
+        normal : of the graph, in the sparse layout (NormalEquations with subtrees). damping : (n,) of its unknowns.
+        order : of elimination, of an earlier factor of measurements with the same pattern.
 
         Raises
         ------
@@ -104,13 +85,16 @@ class WithBlocks:
         count = len(blocks.own)
         own = sparse.csr_matrix(sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1))))
         own.eliminate_zeros()
-        whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
-        self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
+        matrix = normal.matrix + sparse.diags(damping) + blocks.among
+        whole = sparse.bmat([[matrix, blocks.across.T], [blocks.across, own]], format="csc")
+        self._size, self._more = normal.unknowns.size, own.shape[0]
         whole.sort_indices()
         self.order = order_of_columns(whole) if order is None else order
         self._place = np.argsort(self.order)
         self._lu = superlu(sparse.csc_matrix(whole[self.order][:, self.order]), "NATURAL")
         self.perm_r, self.perm_c = self._lu.perm_r[self._place], self._lu.perm_c[self._place]
+        self.nnz = int(self._lu.nnz)
+        counted(self, normal.spent)
 
     @property
     def L(self) -> sparse.csc_matrix:
@@ -122,20 +106,15 @@ class WithBlocks:
         """Upper triangle."""
         return self._lu.U
 
-    @property
-    def nnz(self) -> int:
-        """Entries of the factor."""
-        return int(self._lu.nnz)
-
     def step(self, normal: NormalEquations, blocks: Blocks) -> tuple[Floats, Floats]:
         """Return the step of the graph's unknowns (n,) and of the blocks (b, k) by these slopes."""
-        found = -self.solve_all(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
+        found = -self._solve(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
         return found[: self._size], found[self._size :].reshape(blocks.own_slope.shape)
 
     def solve(self, right: Floats) -> Floats:
         """Solve for the graph's unknowns by right-hand sides (n,) or (n, m)."""
-        return self.solve_all(np.concatenate([right, np.zeros((self._more, *right.shape[1:]))]))[: self._size]
+        return self._solve(np.concatenate([right, np.zeros((self._more, *right.shape[1:]))]))[: self._size]
 
-    def solve_all(self, right: Floats) -> Floats:
-        """Solve for all unknowns by right-hand sides (n + b k,) or (n + b k, m)."""
+    def _solve(self, right: Floats) -> Floats:
+        """Solve for all unknowns (n + b k, ...)."""
         return np.asarray(self._lu.solve(right[self.order])[self._place])

@@ -11,6 +11,7 @@ to compute row and column counts for sparse Cholesky factorization, SIAM J. Matr
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +20,34 @@ from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree, rever
 from scipy.sparse.linalg import spilu
 
 from ..arrays import WIDE, Ints
+from .graph import WIDTHS
 from .schwarz_cg import expected_work
 
-_WIDEST_BAND = 16
-"""Distance in the band, poses, up to which the banded factorisation wins (docs/lab/performance.md)."""
-_WIDEST_BORDER = 48
-"""Most scalars in a border; more of them stay in the sparse matrix."""
-_LONGEST_LINK = 16
-"""Longest reach of an edge in a chain, poses."""
-_MANY, _TIED = 500, 4
-"""From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all poses
-are connected, in the rooms of a site or the streets of a town only those nearby."""
-MOST_WORK = 4e9
-"""Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9. Edges between
-any poses and any others, however few, fill the whole matrix."""
-_LITTLE_WORK = 4e8
-"""Multiplications in the envelope of a band up to which those of a sparser order are not counted: that takes half as long as a
-factorisation."""
-PER_COMPLEX = 4
-"""Multiplications in one of complex numbers."""
+
+@dataclass(frozen=True, slots=True)
+class EliminationPolicy:
+    """Which factorisation suits which pattern (docs/lab/performance.md)."""
+
+    widest_band: ClassVar[int] = 16
+    """Distance in the band, poses, up to which the banded factorisation wins."""
+    widest_border: ClassVar[int] = 48
+    """Scalars in a border; more of them stay in the sparse matrix."""
+    many: ClassVar[int] = 500
+    tied: ClassVar[int] = 4
+    """From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all
+    poses are connected, in the rooms of a site or the streets of a town only those nearby."""
+    most_work: ClassVar[float] = 4e9
+    """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9."""
+    little_work: ClassVar[float] = 4e8
+    """Multiplications in the envelope of a band up to which those of a sparser order are not counted."""
+    per_complex: ClassVar[int] = 4
+    """Multiplications in one of complex numbers."""
+    alone: ClassVar[float] = 6.0
+    """Time of a multiplication in a single column relative to one in many columns together: measured with SuperLU."""
+    small: ClassVar[int] = 3000
+    wide: ClassVar[float] = 0.1
+    """Rows up to which any pattern is counted, and the mean share of the rows that each reaches back in the band of a matrix
+    that fills up in any order; for the streets of a town it is a fiftieth."""
 
 
 def adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
@@ -66,25 +76,12 @@ def _compressed(minor: Ints, major: Ints, nodes: int) -> tuple[NDArray[np.int32]
     return (keys % max(nodes, 1)).astype(np.int32), np.append(np.zeros(1, dtype=np.int32), ends)
 
 
-def pairs_of(matrix: sparse.csc_matrix) -> Ints:
-    """Return the pairs (b, 2) of columns with an entry in a symmetric matrix."""
-    column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
-    below = matrix.indices > column
-    return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.intp)
-
-
-def alike_columns(matrix: sparse.csc_matrix) -> tuple[Ints, Ints]:
-    """Return the number (n,) of the group of each column of a symmetric matrix, and the pairs (b, 2) of groups with an entry.
-
-    Neighbouring columns with the same pattern, as those of one pose, are one group.
-    """
-    n, count, row = matrix.shape[0], np.diff(matrix.indptr), matrix.indices
-    column = np.repeat(np.arange(n), count)
-    in_next = np.minimum(np.arange(len(row)) + np.repeat(count, count), len(row) - 1)
-    first = np.ones(n, dtype=bool)
-    first[1:] = (np.diff(count) != 0) | (np.bincount(column, row != row[in_next], n)[:-1] > 0)
-    group, kept = np.cumsum(first) - 1, first[column] & first[row] & (row > column)
-    return group, np.stack([group[column[kept]], group[row[kept]]], axis=1)
+def _lower_triangle(pairs: Ints, order: Ints) -> sparse.csr_matrix:
+    """Return the pattern below the diagonal of the matrix with its nodes in this order; columns ascend in every row."""
+    place = np.argsort(order)
+    one, other = map(place.take, _apart(pairs))
+    columns, indptr = _compressed(np.minimum(one, other), np.maximum(one, other), len(order))
+    return sparse.csr_matrix((np.ones(len(columns)), columns, indptr), shape=(len(order), len(order)))
 
 
 def narrow_order(pattern: sparse.csc_matrix) -> tuple[Ints, Ints]:
@@ -106,18 +103,13 @@ def is_full(reach: Ints) -> bool:
     Such a matrix connects arbitrary unknowns. Counting by minimum degree takes many seconds for it, and less time than the
     factorisation for all others.
     """
-    return len(reach) > _SMALL and float(np.mean(reach)) > _WIDE * len(reach)
-
-
-_SMALL, _WIDE = 3000, 0.1
-"""Number of rows, and their share in the band of such a matrix. For the streets of a town it is a fiftieth."""
+    return len(reach) > EliminationPolicy.small and float(np.mean(reach)) > EliminationPolicy.wide * len(reach)
 
 
 def minimum_degree(pattern: sparse.csc_matrix) -> Ints:
     """Return the order (n,) of elimination by multiple minimum degree.
 
-    SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, then takes almost no time; a
-    complete one would compute the fill that is only to be counted.
+    SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, then takes almost no time.
 
     Parameters
     ----------
@@ -148,32 +140,29 @@ def elimination_tree(pairs: Ints, order: Ints) -> Ints:
     return np.array(parent, dtype=np.intp)
 
 
-def postorder(parent: Ints) -> Ints:
-    """Return the order (n,) in which every subtree of an elimination tree is contiguous and ends at its root.
-
-    A depth-first walk from the roots, read backwards, is such an order; it adds no fill and makes neighbours in the order
-    neighbours in the factor. The memory accesses of a factorisation are then local: in its own order, minimum degree halves all
-    chains at the same time, and the factorisation takes twice as long.
-    """
-    n = len(parent)
-    tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
-    walk: Ints = depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.intp)
-    return walk
-
-
 def contiguous(pairs: Ints, order: Ints) -> tuple[Ints, Ints]:
-    """Return an order (n,) that fills the same and has every subtree contiguous, and its elimination tree (n,)."""
-    parent = elimination_tree(pairs, order)
-    walk = postorder(parent)
-    return order[walk], np.append(np.argsort(walk), len(order))[parent[walk]]
+    """Return an order (n,) that fills the same and has every subtree contiguous, ending at its root, and its elimination tree.
+
+    A depth-first walk from the roots, read backwards, is such an order. It makes neighbours in the order neighbours in the
+    factor: minimum degree halves all chains at the same time, and in its own order a factorisation takes twice as long.
+    """
+    n, parent = len(order), elimination_tree(pairs, order)
+    tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
+    walk = depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.intp)
+    return order[walk], np.append(np.argsort(walk), n)[parent[walk]]
+
+
+def _pairs_of(matrix: sparse.csc_matrix) -> Ints:
+    """Return the pairs (b, 2) of columns with an entry in a symmetric matrix."""
+    column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+    below = matrix.indices > column
+    return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.intp)
 
 
 def order_of_columns(matrix: sparse.csc_matrix) -> Ints:
-    """Return the order (n,) of elimination of the columns of a symmetric matrix, whose rows ascend in each of them: by minimum
-    degree of groups that are alike, with every subtree contiguous."""
-    group, pairs = alike_columns(matrix)
-    place = np.argsort(contiguous(pairs, minimum_degree(adjacency(pairs, int(group.max(initial=-1)) + 1)))[0])
-    return np.argsort(place[group], kind="stable")
+    """Return the order (n,) of elimination of a symmetric matrix by minimum degree, with every subtree contiguous."""
+    pairs = _pairs_of(matrix)
+    return contiguous(pairs, minimum_degree(adjacency(pairs, matrix.shape[0])))[0]
 
 
 def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
@@ -197,51 +186,10 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     change[:-1] += np.where(tied, 0, scalars)
     change -= np.bincount(parent, scalars, n + 1)
     total = np.append(0.0, np.cumsum(change[:-1]))
-    return np.rint(total[1:] - total[_first_below(parent)]).astype(np.intp)
-
-
-def work(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> float:
-    """Return the multiplications of a factorisation with the nodes in this order, in units of one of a dense matrix.
-
-    Columns with the pattern of the next one are multiplied together; others are slower because of memory access.
-
-    Parameters
-    ----------
-    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
-    """
-    sizes, scalars = column_sizes(pairs, order, width, parent), width[order]
-    continued = np.append(sizes, 0)[parent] == sizes - scalars
-    return float(scalars @ (np.square(sizes, dtype=np.float64) * np.where(continued, 1.0, _ALONE)))
-
-
-_ALONE = 6.0
-"""Time of a multiplication in a single column relative to one in many columns together: measured with SuperLU."""
-
-
-def work_of(matrix: sparse.csc_matrix) -> float:
-    """Return the multiplications of a factorisation of a symmetric matrix by minimum degree; infinite where it fills up."""
-    pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
-    pattern = adjacency(pairs, len(width))
-    if is_full(narrow_order(pattern)[1]):
-        return np.inf
-    order, parent = contiguous(pairs, minimum_degree(pattern))
-    return work(pairs, order, width, parent)
-
-
-def _lower_triangle(pairs: Ints, order: Ints) -> sparse.csr_matrix:
-    """Return the pattern below the diagonal of the matrix with its nodes in this order; columns ascend in every row."""
-    place = np.argsort(order)
-    one, other = map(place.take, _apart(pairs))
-    columns, indptr = _compressed(np.minimum(one, other), np.maximum(one, other), len(order))
-    return sparse.csr_matrix((np.ones(len(columns)), columns, indptr), shape=(len(order), len(order)))
-
-
-def _first_below(parent: Ints) -> Ints:
-    """Return the first node (n,) of the subtree of each node of a tree in postorder."""
-    first = list(range(len(parent) + 1))
+    first = list(range(n + 1))
     for node, above in enumerate(parent.tolist()):
         first[above] = min(first[above], first[node])
-    return np.array(first[:-1], dtype=np.intp)
+    return np.rint(total[1:] - total[first[:-1]]).astype(np.intp)
 
 
 def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
@@ -255,8 +203,33 @@ def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
         half = 1 << len(highest) - 1
         highest.append(np.maximum(highest[-1], np.append(highest[-1][half:], np.zeros(half, dtype=np.intp))))
     step = np.log2(np.maximum(other - one, 1)).astype(np.intp)
-    table = np.stack(highest) if len(parent) else np.zeros((1, 0), dtype=np.intp)
+    table = np.stack(highest)
     return np.asarray(np.maximum(table[step, one], table[step, other - (1 << step)]))
+
+
+def work(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> float:
+    """Return the multiplications of a factorisation with the nodes in this order, in units of one of a dense matrix.
+
+    Columns with the pattern of the next one are multiplied together; others are slower because of memory access.
+
+    Parameters
+    ----------
+    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
+    """
+    sizes, scalars = column_sizes(pairs, order, width, parent), width[order]
+    continued = np.append(sizes, 0)[parent] == sizes - scalars
+    return float(scalars @ (np.square(sizes, dtype=np.float64) * np.where(continued, 1.0, EliminationPolicy.alone)))
+
+
+def work_of(matrix: sparse.csc_matrix) -> float:
+    """Return the multiplications of a factorisation of a symmetric, complex matrix by minimum degree; infinite where it fills
+    up."""
+    pairs, width = _pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
+    pattern = adjacency(pairs, len(width))
+    if is_full(narrow_order(pattern)[1]):
+        return np.inf
+    order, parent = contiguous(pairs, minimum_degree(pattern))
+    return EliminationPolicy.per_complex * work(pairs, order, width, parent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,9 +238,9 @@ class Ordering:
 
     order: Ints
     """(m,) poses, first eliminated first."""
-    bordered: bool
+    bordered: bool = False
     """Everything else is a border."""
-    banded: bool
+    banded: bool = False
     """The poses are a narrow band."""
     iterative: bool = False
     """A factor would fill up: see schwarz_cg.py."""
@@ -275,7 +248,7 @@ class Ordering:
     """Multiplications of a factorisation, where they are many enough to be counted; more than there are, where they are few."""
 
 
-def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
@@ -283,27 +256,28 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
     width : (n,) scalars of each node.
     subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
-    last : poses that come after the others, in the sparse form.
     """
+    policy, each = EliminationPolicy, np.arange(poses)
     if poses < 2:
-        return Ordering(np.arange(poses), False, False)
+        return Ordering(each)
     among = pairs.take(np.flatnonzero(np.maximum(pairs[:, 0], pairs[:, 1]) < poses), axis=0)
-    if last is not None:
-        return Ordering(_before(among, poses, last), False, False)
     pattern = adjacency(among, poses)
     if subtrees:
-        return Ordering(contiguous(among, minimum_degree(pattern))[0], False, False)
-    bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
-    tied = poses >= _MANY and len(among) - poses > _TIED * poses
+        return Ordering(contiguous(among, minimum_degree(pattern))[0])
+    others = int(width[poses:].sum())
+    bordered = others <= policy.widest_border
+    tied = poses >= policy.many and len(among) - poses > policy.tied * poses
     if bordered or tied:
         order, reach = narrow_order(pattern)
-        if bordered and reach.max() <= _WIDEST_BAND:
-            return Ordering(order, True, True)
+        if bordered and reach.max() <= policy.widest_band:
+            return Ordering(order, bordered=True, banded=True)
         if tied and is_full(reach):
-            return Ordering(np.arange(poses), False, False, iterative=True)
+            return Ordering(each, iterative=True)
     order = minimum_degree(pattern)
-    if bordered and not tied and (most := 27.0 * float(np.sum((reach + 1.0) ** 2))) <= _LITTLE_WORK:
-        return Ordering(order, True, False, work=most)
+    if bordered and not tied:
+        most = WIDTHS["poses"] * float(np.sum((WIDTHS["poses"] * (reach + 1.0)) ** 2))
+        if most <= policy.little_work:
+            return Ordering(order, bordered=True, work=most)
     order, parent = contiguous(among, order)
     if bordered:
         multiplications = work(among, order, width, parent)
@@ -311,25 +285,6 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
         every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
         multiplications = work(pairs, every, width, parent)
     entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
-    if multiplications > (expected_work(poses, int(width[poses:].sum()), entries) if tied else MOST_WORK):
-        return Ordering(np.arange(poses), False, False, iterative=True)
-    return Ordering(order, bordered, False, work=multiplications)
-
-
-def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
-    """Return the order in which some poses come last and the others fill little.
-
-    The remainder of a chain is a chain: it is halved repeatedly by blocks as long as its edges reach, so that each
-    elimination connects few of the last poses. (Minimum degree runs along the chain and connects all of them.)
-    """
-    late = np.zeros(poses, dtype=bool)
-    late[last[last >= 0]] = True
-    reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
-    if reach > _LONGEST_LINK:
-        order = minimum_degree(adjacency(pairs, poses))
-    else:
-        block = np.arange(poses) // reach + 1
-        order = np.lexsort((np.arange(poses), block & -block))
-    order = np.concatenate([order[~late[order]], order[late[order]]])
-    walk = contiguous(pairs, order)[0]
-    return np.concatenate([walk[~late[walk]], order[late[order]]])
+    if multiplications > (expected_work(poses, others, entries) if tied else policy.most_work):
+        return Ordering(each, iterative=True)
+    return Ordering(order, bordered, work=multiplications)

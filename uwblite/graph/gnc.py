@@ -8,27 +8,43 @@ for Robust Spatial Perception, RA-L 2020, equation 14)::
     w = 1                             r^2 <= mu / (mu + 1) c^2
     w = c / r sqrt(mu (mu + 1)) - mu  between
 
-Two differences from the source: the search starts from the residuals of the given estimate instead of an optimum with all
-edges as inliers, and one or two Gauss-Newton steps per mu are enough, since mu changes little.
+The search starts from the residuals of the given estimate instead of an optimum with all edges as inliers, and takes a step
+for each mu, which changes little.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+from scipy.special import chdtri
 
 from ..arrays import Bools, Floats
-from .graph import Edges, Graph, Linearization, PriorEdges, linearize
+from .graph import POSE, Edges, Graph, Linearization, PriorEdges, linearize
 from .normal_equations import NormalEquations
 from .pose_edges import RelativePoseEdges
 from .problem_checks import check
 from .robust import SQUARED, Kernel
 from .solver import Optimizer, Progress, SolverConfig, SolverSummary, minimise
 
-_MU_FACTOR = 2.0
-"""Factor on mu from step to step; one linear system is solved for each."""
-_REACH = 100.0
-"""Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
+
+@dataclass(frozen=True, slots=True)
+class OutlierPolicy:
+    """What an outlier is, and the way to it."""
+
+    probability: ClassVar[float] = 1e-3
+    """Of a sound edge to be taken for an outlier."""
+    factor: ClassVar[float] = 2.0
+    """On mu from step to step; one linear system is solved for each."""
+    reach: ClassVar[float] = 100.0
+    """Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
+    strict: ClassVar[float] = 100.0
+    """mu at which the surrogate is the truncated square to within a per cent of the threshold."""
+
+
+def _threshold(dimensions: int) -> float:
+    """Return the whitened norm beyond which an edge of so many dimensions is an outlier."""
+    return float(np.sqrt(chdtri(dimensions, OutlierPolicy.probability)))
 
 
 def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
@@ -45,7 +61,7 @@ def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], so
         if scale != scales[-1] and _worst(graph, dict.fromkeys(chosen, scale)) <= 1.0:
             continue
         kernel = Kernel("geman-mcclure", scale)
-        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))
         graph = optimizer.optimize(replace(graph, edges=edges), solver)[0]
     return graph
 
@@ -69,24 +85,23 @@ def optimize_gnc(
     ----------
     graph : estimates to start from and edges; a kind's own weights stay as factors, its kernel is not used.
     thresholds : by position in ``graph.edges``, the whitened norm, in standard deviations, above which an edge is an
-        outlier: the root of a chi-square quantile, 3 for ranges, 4 for poses.
+        outlier.
     solver : of the last optimisation, with the weights decided.
     progress : called with (done, most) after every step, `most` being an estimate.
     allowed : work, multiplications; half of it for the steps that find the weights, the rest for the last optimisation.
 
     Returns
     -------
-    The graph, its chosen edges carrying the weights found; the summary of the last optimisation; and by position the
-    weights (e,) themselves, 0 = outlier, 1 = inlier.
+    The graph with the weights found; how the last optimisation went; by position the weights (e,), 0 = outlier, 1 = inlier.
     """
     check(graph)
-    edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+    edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))
     plain = replace(graph, edges=edges)
     linearized = linearize(plain)
     normal = NormalEquations(plain, linearized)
-    mu = 1.0 / max(2.0 * min(_worst(plain, thresholds), _REACH**2) - 1.0, 1e-3)
+    mu = 1.0 / max(2.0 * min(_worst(plain, thresholds), OutlierPolicy.reach**2) - 1.0, 1e-3)
     few = replace(solver, max_iterations=1)
-    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(_MU_FACTOR))))
+    most = max(1, int(np.ceil(np.log(OutlierPolicy.strict / mu) / np.log(OutlierPolicy.factor))))
     current, spent = plain, 0.0
     for step in range(most):
         weights = {k: truncated_weight(s, mu) for k, s in _squared(current, thresholds).items()}
@@ -94,7 +109,7 @@ def optimize_gnc(
         spent += summary.work
         if progress is not None:
             progress(step + 1, most + 1)
-        mu *= _MU_FACTOR
+        mu *= OutlierPolicy.factor
         if spent >= 0.5 * allowed or all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
             break
     weights = {k: (s < 1.0).astype(np.float64) for k, s in _squared(current, thresholds).items()}
@@ -105,19 +120,11 @@ def optimize_gnc(
     return current, summary, weights
 
 
-_THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}
-"""Whitened norm beyond which an edge of so many dimensions is an outlier: one good edge in a thousand lies there."""
-
-
 def outlier_thresholds(graph: Graph) -> dict[int, float]:
     """Return by position the threshold of each kind of edges that may hold outliers: priors and successive poses do not."""
     kinds = enumerate(zip(graph.edges, closing(graph), strict=True))
     suspects = [(k, e) for k, (e, loop) in kinds if len(e) and (loop is None or loop.any()) and not isinstance(e, PriorEdges)]
-    return {k: _THRESHOLDS[e.residuals(graph).shape[1]] for k, e in suspects}
-
-
-_STRICT = 100.0
-"""mu at which the surrogate is the truncated square to within a per cent of the threshold."""
+    return {k: _threshold(e.residuals(graph).shape[1]) for k, e in suspects}
 
 
 def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]:
@@ -133,10 +140,7 @@ def _worst(graph: Graph, thresholds: Mapping[int, float]) -> float:
 
 def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tuple[Graph, list[Linearization]]:
     """Return the present estimates with the plain graph's edges weighted, and their linearisation."""
-    edges = tuple(
-        replace(e, weights=weights[k] * e.own_weights) if k in weights else e  # type: ignore[type-var]
-        for k, e in enumerate(plain.edges)
-    )
+    edges = tuple(replace(e, weights=weights[k] * e.own_weights) if k in weights else e for k, e in enumerate(plain.edges))
     graph = replace(current, edges=edges)
     return graph, linearize(graph)
 
@@ -163,11 +167,11 @@ def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
     def parts() -> Iterator[Edges]:
         for e, loop in zip(graph.edges, closing(graph), strict=True):
             if loop is None:
-                yield replace(e, kernel=kernel)  # type: ignore[type-var]
+                yield replace(e, kernel=kernel)
                 continue
             for chosen, used in ((~loop, e.kernel), (loop, kernel)):
                 if chosen.any():
-                    yield replace(e.rows(chosen), kernel=used)  # type: ignore[type-var]
+                    yield replace(e.rows(chosen), kernel=used)
 
     return replace(graph, edges=tuple(parts()))
 
@@ -178,7 +182,7 @@ class Misfit:
 
     closures: int
     off: int
-    """How many of them are off by more than _OFF standard deviations."""
+    """How many of them are outliers."""
     worst: tuple[int, int]
     """The poses of the closure with the largest error; -1 where there is none."""
 
@@ -186,10 +190,6 @@ class Misfit:
     def most(self) -> bool:
         """Most closures are off: they contradict each other, or their stated precision is too high."""
         return 2 * self.off > self.closures
-
-
-_OFF = 4.0
-"""Whitened norm, standard deviations; one good closure in a thousand is farther off."""
 
 
 def misfit(graph: Graph) -> Misfit:
@@ -200,4 +200,4 @@ def misfit(graph: Graph) -> Misfit:
     i, j = (np.concatenate([getattr(e, end) for e in loops]) for end in ("i", "j"))
     norms = np.concatenate([np.linalg.norm(e.residuals(graph), axis=1) for e in loops])
     worst = int(np.argmax(norms))
-    return Misfit(len(norms), int(np.count_nonzero(norms > _OFF)), (int(i[worst]), int(j[worst])))
+    return Misfit(len(norms), int(np.count_nonzero(norms > _threshold(POSE[0]))), (int(i[worst]), int(j[worst])))

@@ -1,21 +1,16 @@
 """The pose graph: the unknowns (poses, anchors, calibration) and the interface of the edges that measure them.
 
-Edges of one kind are one dataclass of arrays. Each kind offers ``residuals(graph)`` and ``linearize(graph)``; both
-are whitened, so that the sum of squares is chi2 in units of the measurements' standard deviations. A new sensor is
-one more dataclass and one more row in the numeric-Jacobian test; the solver does not change. ``pose_edges`` and
-``range_edges`` contain the measurements of wheels, lidar and radio; priors of unknowns are in this module.
+A kind of edges is one dataclass of arrays with ``linearize(graph)``, whitened, so that the sum of squares is chi2. A new
+sensor is one more dataclass and one more row in the numeric-Jacobian test; the solver does not change.
 
-Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) in the map frame and ``calibration``
-(c,), a vector of named scalars. A step moves poses along arcs of constant twist and is added to the rest, see
-``unknowns``; Jacobians are by the coordinates x, y, theta, to which such an arc is the sum to first order. Pose
-residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's: every edge's residual is the
-estimate as seen from the measurement, expected minus measured. What a MapResult states about ranges is the error of the
-measurement, measured minus expected.
+A step moves poses along arcs of constant twist and is added to the rest, see ``unknowns``; Jacobians are by the coordinates
+x, y, theta, to which such an arc is the sum to first order. Residuals are expected minus measured, those of poses in the
+chart of g2o, e = Z^-1 (Xi^-1 Xj). What a MapResult states about ranges is measured minus expected.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -26,6 +21,10 @@ from ..errors import DataError
 from .robust import SQUARED, Kernel
 from .work import Work
 
+WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
+"""Blocks of unknowns, and the scalars of one unknown."""
+POSE: tuple[int, ...] = (WIDTHS["poses"],)
+"""Shape of a pose; POSE * 2 is that of its information."""
 Block = tuple[str, Ints, Floats]
 """(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
 
@@ -40,10 +39,11 @@ class Linearization:
     """An edge may name several unknowns of one block; each is an entry of its own."""
 
 
-class EdgeTable:
+@documented
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Edges:
     """A kind of edges: a dataclass of arrays with a row per edge."""
 
-    __slots__ = ()
     UNKNOWNS: ClassVar[Mapping[str, str]] = {}
     """Block of the unknowns whose indices an array holds, by the array's name; the first one has an index per edge."""
     ROWS: ClassVar[Mapping[str, Shape]] = {}
@@ -51,7 +51,10 @@ class EdgeTable:
     SHARED: ClassVar[tuple[str, ...]] = ()
     """Names of the arrays that all edges share; they are one row."""
 
-    weights: Floats | None
+    kernel: Kernel = SQUARED
+    """Robust kernel applied to each edge's squared whitened norm."""
+    weights: Floats | None = None
+    """(e,) factors on each edge's cost (0 switches it off), None = all 1."""
 
     def __post_init__(self) -> None:
         rows = {name: self.ROWS.get(name, ()) for name in array_fields(type(self))}
@@ -68,7 +71,7 @@ class EdgeTable:
 
     @property
     def own_weights(self) -> Floats:
-        """Factors (e,) on each edge's cost."""
+        """The weights (e,), never None."""
         return np.ones(len(self)) if self.weights is None else np.asarray(self.weights)
 
     @property
@@ -78,16 +81,17 @@ class EdgeTable:
 
     def rows(self, which: Ints | Bools) -> Self:
         """Return some of the edges."""
-        arrays = {name: values[which] for name, values in self.by_edge().items() if len(values)}
-        return replace(self, **arrays)  # type: ignore[type-var]
+        some: dict[str, Any] = {name: values[which] for name, values in self.by_edge().items() if len(values)}
+        return replace(self, **some)
 
     def followed_by(self, *others: Self) -> Self:
         """Return these edges followed by others of their kind; the values that all edges share are taken from these."""
         tables = (self, *others)
-        arrays = {name: np.concatenate([getattr(t, name) for t in tables]) for name in self.by_edge() if name != "weights"}
+        names = [name for name in self.by_edge() if name != "weights"]
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tables]) for name in names}
         if any(t.weights is not None for t in tables):
             arrays["weights"] = np.concatenate([t.own_weights for t in tables])
-        return replace(self, **arrays)  # type: ignore[type-var]
+        return replace(self, **arrays)
 
     def linearize(self, graph: "Graph") -> Linearization:
         """Return whitened residuals and Jacobians."""
@@ -99,35 +103,8 @@ class EdgeTable:
 
     def by_edge(self) -> dict[str, Any]:
         """Return the arrays with a row per edge by their names; those that are left out are empty."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: v for name, v in own.items() if isinstance(v, np.ndarray) and name not in self.SHARED}
-
-
-class Edges(Protocol):
-    """Common interface of all kinds of edges."""
-
-    @property
-    def kernel(self) -> Kernel:
-        """Robust kernel applied to each edge's squared whitened norm."""
-
-    @property
-    def weights(self) -> Floats | None:
-        """(e,) factors on each edge's cost (0 switches it off), None = all 1."""
-
-    @property
-    def own_weights(self) -> Floats:
-        """The same, never None."""
-
-    def __len__(self) -> int: ...
-
-    def rows(self, which: Ints | Bools) -> Self:
-        """Return some of the edges."""
-
-    def residuals(self, graph: "Graph") -> Floats:
-        """Return whitened residuals (e, d)."""
-
-    def linearize(self, graph: "Graph") -> Linearization:
-        """Return whitened residuals and Jacobians."""
 
 
 class UnknownKey(NamedTuple):
@@ -200,7 +177,8 @@ class Graph:
     """To which the operations on this graph, and on all that are made from it, are added; see graph/work.py."""
 
     def __post_init__(self) -> None:
-        settle(self, "Graph", {"poses": ("n", 3), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)})
+        rows: dict[str, Shape] = {"poses": ("n", *POSE), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)}
+        settle(self, "Graph", rows)
         require_type(self.calibration, "Graph.calibration", Calibration)
         values = self.calibration.values
         if len(values) != len(self.calibration.keys):
@@ -215,10 +193,9 @@ class Graph:
             raise DataError(f"Graph.edges must be a tuple of tables of edges, not {type(self.edges).__name__}")
         object.__setattr__(self, "edges", tuple(self.edges))
         for k, edges in enumerate(self.edges):
-            if isinstance(edges, EdgeTable):
-                edges.require_unknowns(counts)
-            elif not hasattr(edges, "linearize"):
+            if not isinstance(edges, Edges):
                 raise DataError(f"Graph.edges[{k}] is a {type(edges).__name__}, which is no table of edges")
+            edges.require_unknowns(counts)
 
     @property
     def calibration_priors(self) -> "tuple[PriorEdges, ...]":
@@ -283,7 +260,7 @@ def whiten(sqrt_information: Floats, values: Floats) -> Floats:
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class PriorEdges(EdgeTable):
+class PriorEdges(Edges):
     """Priors of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""
 
     block: str
@@ -291,15 +268,13 @@ class PriorEdges(EdgeTable):
     index: Ints
     """(e,) which unknown."""
     value: Floats
-    """(e, k) with k = 3, 2, 1 by block; angles in rad."""
+    """(e, k) with k of WIDTHS; angles in rad."""
     sqrt_information: Floats
     """(e, k, k) L with information = L^T L."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"index": ""}
 
     def __post_init__(self) -> None:
-        width = {"poses": 3, "anchors": 2, "calibration": 1}.get(self.block)
+        width = WIDTHS.get(self.block)
         if width is None:
             raise DataError(f"a prior on {self.block!r}: it must be on poses, anchors or calibration")
         shapes: dict[str, Shape] = {"value": ("e", width), "sqrt_information": ("e", width, width)}

@@ -6,21 +6,39 @@ With the same factor a further unknown that the model does not have is estimated
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
+from .. import se2
 from ..arrays import Floats, Ints
-from ..errors import SolverError
-from .eliminated import Blocks, WithBlocks, rows_of
-from .factorization import counted
-from .graph import Edges, Graph, edge_weights
+from ..errors import SINGULAR, SolverError
+from .eliminated import TRACE, Blocks, WithBlocks, rows_of
+from .graph import POSE, Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class MarginalsPolicy:
+    """Numerical tolerances, and bounds on the memory."""
+
+    dependent: ClassVar[float] = 1e-13
+    """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
+    rounding: ClassVar[float] = 1e-9
+    """Share of an unknown's effect on the residuals below which what others leave of it is rounding error."""
+    open: ClassVar[float] = 1e12
+    """m^2; variance of an anchor that no edge touches."""
+    variances: ClassVar[Floats] = np.geomspace(1e-4, 4.0, 12)[:, None]
+    """Of common errors, from a hundredth to twice the size that is expected."""
+    columns_at_once: ClassVar[int] = 16
+    """Columns of an inverse, each of which has the length of all unknowns."""
+    pairs_at_once: ClassVar[int] = 1 << 14
+    """Pairs of poses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +70,14 @@ def about_best_fit(poses: Floats, covariance: Floats) -> Floats:
     ----------
     poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
     """
-    count = len(poses)
+    count, size = poses.shape
     x, y = (poses[:, :2] - poses[:, :2].mean(axis=0)).T
-    moves = np.tile(np.eye(3), (count, 1, 1))
+    moves = np.tile(np.eye(size), (count, 1, 1))
     moves[:, 0, 2], moves[:, 1, 2] = -y, x
-    fit = np.zeros((3, count, 3))
-    fit[:, :, :2] = np.linalg.pinv(moves[:, :2].reshape(-1, 3)).reshape(3, count, 2)
-    left = np.eye(3 * count) - moves.reshape(-1, 3) @ fit.reshape(3, -1)
-    whole = (left @ covariance @ left.T).reshape(count, 3, count, 3)
+    fit = np.zeros((size, count, size))
+    fit[:, :, :2] = np.linalg.pinv(moves[:, :2].reshape(-1, size)).reshape(size, count, 2)
+    left = np.eye(poses.size) - moves.reshape(-1, size) @ fit.reshape(size, -1)
+    whole = (left @ covariance @ left.T).reshape(count, size, count, size)
     return np.asarray(whole[np.arange(count), :, np.arange(count), :])
 
 
@@ -73,16 +91,10 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
     poses : (k, 3), spread so that they represent all. covariance : (3 k, 3 k) of them with each other.
     """
     places = poses[:, :2] - poses[:, :2].mean(axis=0)
-    own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)
+    own = covariance.reshape(*poses.shape, *poses.shape)[:, :2, :, :2].reshape(places.size, places.size)
     turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
     return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
-
-
-_VARIANCES = np.geomspace(1e-4, 4.0, 12)[:, None]
-"""Variances of common errors, from a hundredth to twice the size that is expected."""
-_DEPENDENT = 1e-13
-"""Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
 
 
 class Marginals:
@@ -94,18 +106,17 @@ class Marginals:
 
     def __init__(self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
-        self._factor = factor_of(normal, further)
-        self._unseen = np.append(normal.diagonal <= 0, False)
-        self._among = np.asarray(among, dtype=np.intp)
+        self._factor = _factor(normal, further)
+        self.unseen = np.append(normal.diagonal <= 0, False)
+        """(size + 1,) scalars that no edge touches."""
+        self._chosen = np.asarray(among, dtype=np.intp)
 
     @cached_property
     def covariances(self) -> Covariances:
         """Covariances of single unknowns, and among the chosen poses."""
         blocks = self._block_diagonal()
-        chosen = self.unknowns.number["poses"][self._among].ravel()
-        parts = [chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(chosen), 1), _COLUMNS_AT_ONCE)]
-        among = np.concatenate([self.columns(part)[chosen] for part in parts], axis=1)
-        return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._among, among)
+        among = self.among(self.unknowns.number["poses"][self._chosen].ravel())
+        return Covariances(blocks["poses"], blocks["anchors"], np.sqrt(blocks["calibration"][:, 0, 0]), self._chosen, among)
 
     def estimated(self, edges: Edges, shifts: sparse.csr_matrix) -> Floats:
         """Return the values (k,) of errors that edges of the graph have in common, estimated with all other unknowns.
@@ -118,15 +129,20 @@ class Marginals:
         ----------
         shifts : S (e d, k), change of their whitened residuals by each error of the size that is expected.
         """
-        weighted, slopes = self._weighted(edges, shifts), self.slopes(edges, shifts)
-        moves = self._factor.solve(slopes.toarray())
-        seen = weighted.T @ edges.residuals(self._graph).ravel() - moves.T @ self._gradient
-        products = (weighted.T @ shifts).toarray() - slopes.T @ moves
+        total, explained, seen = self.score(edges, shifts)
+        products, variances = total - explained, MarginalsPolicy.variances
         values, vectors = np.linalg.eigh(0.5 * (products + products.T))
-        inside, z = 1.0 + _VARIANCES * np.maximum(values, 0.0), vectors.T @ seen
-        worth = 0.5 * np.sum(_VARIANCES * z**2 / inside - np.log(inside), axis=1)
+        inside, z = 1.0 + variances * np.maximum(values, 0.0), vectors.T @ seen
+        worth = 0.5 * np.sum(variances * z**2 / inside - np.log(inside), axis=1)
         likely = np.exp(worth - worth.max())
-        return np.asarray(-vectors @ (likely @ (_VARIANCES / inside) / likely.sum() * z))
+        return np.asarray(-vectors @ (likely @ (variances / inside) / likely.sum() * z))
+
+    def score(self, edges: Edges, shifts: sparse.csr_matrix) -> tuple[Floats, Floats, Floats]:
+        """Return S^T W S (k, k), its part S^T W J H^-1 J^T W S that the graph explains, and S^T P r (k,); see estimated."""
+        weighted, slopes = self._weighted(edges, shifts), self.slopes(edges, shifts)
+        moves = self.solve(slopes.toarray())
+        seen = weighted.T @ edges.residuals(self._graph).ravel() - moves.T @ self._gradient
+        return (weighted.T @ shifts).toarray(), slopes.T @ moves, seen
 
     def slopes(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csc_matrix:
         """Return J^T W S (unknowns, k) of errors of edges; see estimated."""
@@ -140,16 +156,18 @@ class Marginals:
 
     def _block_diagonal(self) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
-        numbers = self.unknowns.number
-        rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}
-        columns = {name: np.broadcast_to(n[:, None, :], (*n.shape, n.shape[1])) for name, n in numbers.items()}
-        row, column = (np.concatenate([part[name].ravel() for name in numbers]) for part in (rows, columns))
+        found = {}
+        for name, number in self.unknowns.number.items():
+            rows, columns = np.broadcast_arrays(number[:, :, None], number[:, None, :])
+            found[name] = rows, columns
+        row, column = (np.concatenate([pair[k].ravel() for pair in found.values()]) for k in (0, 1))
         free = row >= 0
         values = np.zeros(len(row))
         values[free] = selected_inverse(self._factor, row[free], column[free])
-        values[self._unseen[row] & (row == column)] = np.inf
-        ends = np.cumsum([part.size for part in rows.values()])[:-1]
-        return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
+        values[self.unseen[row] & (row == column)] = np.inf
+        shapes = {name: rows.shape for name, (rows, _) in found.items()}
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
+        return {name: v.reshape(shapes[name]) for name, v in zip(shapes, np.split(values, ends), strict=True)}
 
     def solve(self, right: Floats) -> Floats:
         """Return H^-1 times right (size, m)."""
@@ -160,31 +178,33 @@ class Marginals:
         right = np.zeros((self.unknowns.size + 1, len(numbers)))
         right[numbers, np.arange(len(numbers))] = 1.0
         right[-1] = 0.0
-        right[:-1] = self._factor.solve(right[:-1])
+        right[:-1] = self.solve(right[:-1])
         return right
 
+    def among(self, numbers: Ints) -> Floats:
+        """Return the covariance (m, m) of scalars with each other; that of fixed ones (-1) is 0."""
+        step = MarginalsPolicy.columns_at_once
+        parts = [numbers[first : first + step] for first in range(0, max(len(numbers), 1), step)]
+        return np.concatenate([self.columns(part)[numbers] for part in parts], axis=1)
 
-def factor_of(normal: NormalEquations, further: Blocks | None = None) -> SuperLU | WithBlocks:
+
+def _factor(normal: NormalEquations, further: Blocks | None) -> SuperLU | WithBlocks:
     """Factorise H, and further measurements with it, where it is regular, else with a trace of damping that leaves open
     directions open."""
-    diagonal = normal.diagonal
-    seen = diagonal > 0
+    seen = normal.diagonal > 0
+    once = np.where(seen, normal.diagonal, 1.0)
     try:
-        factor = _factor(normal, further, np.where(seen, 0.0, 1.0))
+        factor = _damped(normal, further, np.where(seen, 0.0, 1.0))
         pivots = factor.U.diagonal()[factor.perm_c[: len(seen)]]
-        if np.all(pivots > _DEPENDENT * np.where(seen, diagonal, 1.0)):
+        if np.all(pivots > MarginalsPolicy.dependent * once):
             return factor
     except SolverError:
         pass
-    return _factor(normal, further, np.where(seen, 1e-12 * diagonal, 1.0))
+    return _damped(normal, further, np.where(seen, TRACE * once, 1.0))
 
 
-def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) -> SuperLU | WithBlocks:
-    if further is None:
-        return cast(SuperLU, normal.factor(damping))
-    found = WithBlocks(sparse.csc_matrix(normal.matrix + sparse.diags(damping)), further)
-    counted(found, normal.spent)
-    return found
+def _damped(normal: NormalEquations, further: Blocks | None, damping: Floats) -> SuperLU | WithBlocks:
+    return cast(SuperLU, normal.factor(damping)) if further is None else WithBlocks(normal, further, damping)
 
 
 def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None) -> Marginals:
@@ -192,22 +212,72 @@ def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns],
 
     Parameters
     ----------
+    among : poses (k,) whose joint covariance is wanted.
     further : gives measurements beside the graph's edges by the numbers of its unknowns, see graph/eliminated.py.
     """
     normal = filled(graph, subtrees=True)
     return Marginals(graph, normal, among, None if further is None else further(normal.unknowns))
 
 
-_COLUMNS_AT_ONCE = 16
-"""Columns of an inverse solved for at once; a bound on the memory, since each has the length of all unknowns."""
+class JointCovariance:
+    """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
+
+    def __init__(self, graph: Graph, poses: Ints) -> None:
+        found = marginals(graph)
+        whole = found.among(found.unknowns.number["poses"][poses].ravel())
+        self._graph, self._row = graph, np.full(len(graph.poses), -1)
+        self._row[poses] = np.arange(len(poses))
+        self._blocks = whole.reshape(len(poses), *POSE, len(poses), *POSE).swapaxes(1, 2)
+
+    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
+        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
+        found = np.empty((len(i), *POSE, *POSE))
+        for first in range(0, len(i), MarginalsPolicy.pairs_at_once):
+            part = slice(first, first + MarginalsPolicy.pairs_at_once)
+            by_a, by_b = se2.between_jacobians(self._graph.poses[i[part]], self._graph.poses[j[part]])
+            a, b = self._row[i[part]], self._row[j[part]]
+            mixed = by_a @ self._blocks[a, b] @ by_b.transpose(0, 2, 1)
+            own = by_a @ self._blocks[a, a] @ by_a.transpose(0, 2, 1) + by_b @ self._blocks[b, b] @ by_b.transpose(0, 2, 1)
+            found[part] = own + mixed + mixed.transpose(0, 2, 1)
+        return found
+
+
+def calibration_covariance(graph: Graph) -> Floats:
+    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are fixed.
+
+    Raises
+    ------
+    SolverError : the measurements leave a direction open.
+    """
+    normal = filled(graph)
+    number = normal.unknowns.number["calibration"][:, 0]
+    free, covariance = np.flatnonzero(number >= 0), np.zeros((len(number), len(number)))
+    right = np.zeros((normal.unknowns.size, len(free)))
+    right[number[free], np.arange(len(free))] = 1.0
+    found = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)[number[free]]
+    # SuperLU accepts negative pivots.
+    if not np.all(np.diagonal(found) > 0.0):
+        raise SolverError(SINGULAR)
+    covariance[np.ix_(free, free)] = 0.5 * (found + found.T)
+    return covariance
+
+
+def anchor_covariance(graph: Graph, anchors: Ints) -> Floats:
+    """Return the covariance (2a, 2a) of the places of some free anchors (a,); huge in directions that are open."""
+    found = marginals(graph)
+    number = found.unknowns.number["anchors"][anchors].ravel()
+    covariance, unseen = found.among(number), np.flatnonzero(found.unseen[number])
+    covariance[unseen, unseen] = MarginalsPolicy.open
+    return covariance
 
 
 def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, Floats]:
     """Estimate, each alone, further unknowns of some edges of an optimised graph, to first order.
 
     With J, r and W of the whole graph and s the change of the residuals by one unit of the unknown: its value is -b / a and its
-    standard deviation a^-1/2, with a = s^T W s - s^T W J H^-1 J^T W s and b = s^T W r - s^T W J H^-1 J^T W r (C. R. Rao, Large
-    sample tests of statistical hypotheses, 1948). The part that the graph explains by its own unknowns is subtracted.
+    standard deviation a^-1/2, with a = s^T P s and b = s^T P r, P = W - W J H^-1 J^T W (C. R. Rao, Large sample tests of
+    statistical hypotheses, 1948). The part that the graph explains by its own unknowns is subtracted.
 
     Parameters
     ----------
@@ -217,17 +287,9 @@ def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, F
     -------
     (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly.
     """
-    normal = filled(graph, subtrees=True)
-    lin, weighted = edges.linearize(graph), edge_weights(edges, graph)[:, None] * shifts
-    right = np.asarray(rows_of(lin, normal.unknowns).T @ weighted.reshape(len(shifts), -1).T)
-    solved = factor_of(normal).solve(right)
-    total = np.einsum("ked,ked->k", shifts, weighted)
-    left = total - np.einsum("nk,nk->k", right, solved)
-    score = np.einsum("ked,ed->k", weighted, lin.residuals) - solved.T @ normal.gradient
-    seen = left > _ROUNDING * total
+    total, explained, score = marginals(graph).score(edges, sparse.csr_matrix(shifts.reshape(len(shifts), -1).T))
+    whole = np.diagonal(total)
+    left = whole - np.diagonal(explained)
+    seen = left > MarginalsPolicy.rounding * whole
     divisor = np.where(seen, left, 1.0)
     return np.where(seen, -score / divisor, 0.0), np.where(seen, 1.0 / np.sqrt(divisor), np.inf)
-
-
-_ROUNDING = 1e-9
-"""Share of the shifts below which the remainder is rounding error."""

@@ -17,9 +17,9 @@ from scipy import sparse
 from ..arrays import WIDE, Floats, Ints
 from .elimination import choose_ordering
 from .factorization import Blocks, Factor, IterativeLayout, Layout, SparseLayout, counted, make_layout
-from .graph import Graph, Linearization, kernel_weights, linearize
-from .schwarz_cg import chains, cut
-from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
+from .graph import WIDTHS, Graph, Linearization, kernel_weights, linearize
+from .schwarz_cg import cut
+from .unknowns import Unknowns, free_unknowns, linked_poses
 from .work import PRODUCTS
 
 _AT_ONCE = 1 << 15
@@ -47,16 +47,13 @@ class _Places:
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(
-        self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False, last: Ints | None = None
-    ) -> None:
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
         """Number the unknowns and find the place of every product.
 
         Parameters
         ----------
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
         subtrees : order for the selected inverse, not for speed.
-        last : poses to be eliminated after all others.
         """
         self.spent = graph.work
         """Counts what is done with these equations."""
@@ -74,8 +71,7 @@ class NormalEquations:
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
-        late = None if last is None else node["poses"][last]
-        ordering = choose_ordering(pairs, counts[0], width, subtrees, late)
+        ordering = choose_ordering(pairs, counts[0], width, subtrees)
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
@@ -89,12 +85,11 @@ class NormalEquations:
             number = self.unknowns.number["poses"]
             chain = np.flatnonzero(number[:, 0] >= 0)
             linked = (np.diff(chain) == 1) & linked_poses(len(number), linearized)[chain[:-1]]
-            order, linked = chains(pairs[(pairs < counts[0]).all(axis=1)], counts[0], linked)
-            pieces = cut(number[chain[order]], graph.poses[chain[order]], self.unknowns.size, linked)
+            pieces = cut(number[chain], graph.poses[chain], self.unknowns.size, linked)
             self._layout: Layout = IterativeLayout(blocks, pieces)
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
-        self.work = pieces.work(0, 0) if ordering.iterative else ordering.work
+        self.work = pieces.work() if ordering.iterative else ordering.work
         """Multiplications of a factorisation, where they are many enough to be counted."""
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
@@ -262,9 +257,7 @@ def _same(one: list[_Block], other: list[_Block]) -> bool:
     )
 
 
-def filled(
-    graph: Graph, subtrees: bool = False, last: Ints | None = None, like: NormalEquations | None = None
-) -> NormalEquations:
+def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = None) -> NormalEquations:
     """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations.
 
     Parameters
@@ -272,7 +265,7 @@ def filled(
     like : normal equations of a graph with the same unknowns and edges, if there are any: they are filled again.
     """
     linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees, last) if like is None else like
+    normal = NormalEquations(graph, linearized, subtrees) if like is None else like
     normal.fill(linearized, [kernel_weights(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
     return normal
 

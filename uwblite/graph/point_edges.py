@@ -9,8 +9,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import EdgeTable, Graph, Linearization, whiten
-from .robust import SQUARED, Kernel
+from .graph import Edges, Graph, Linearization, whiten
 
 _LEAST = 1e-6
 """Least distance, m: for smaller ones the direction is not defined."""
@@ -18,7 +17,7 @@ _LEAST = 1e-6
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class AnchorDistanceEdges(EdgeTable):
+class AnchorDistanceEdges(Edges):
     """Distance between two anchors: e = |a_i - a_j| - d."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "anchors", "j": "anchors"}
@@ -31,21 +30,17 @@ class AnchorDistanceEdges(EdgeTable):
     """(e,) m."""
     sigma: Floats
     """(e,) m."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both anchors."""
-        offset = graph.anchors[self.i] - graph.anchors[self.j]
-        length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
-        by_i = (offset / (length * self.sigma)[:, None])[:, None, :]
-        residuals = ((length - self.distance) / self.sigma)[:, None]
+        residuals, along = _distance_error(self, graph.anchors[self.i] - graph.anchors[self.j])
+        by_i = along[:, None]
         return Linearization(residuals, (("anchors", self.i, by_i), ("anchors", self.j, -by_i)))
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class PointDistanceEdges(EdgeTable):
+class PointDistanceEdges(Edges):
     """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.
 
     The points are landmarks as seen from the two poses: their distance in the map has to be the measured one.
@@ -66,33 +61,31 @@ class PointDistanceEdges(EdgeTable):
     """(e,) m."""
     sigma: Floats
     """(e,) m."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
-
-    def _arms(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return both points as seen from their poses, turned into the map (e, 2), their offset (e, 2) and distance (e,)."""
-        one, other = graph.poses[self.i], graph.poses[self.j]
-        arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
-        offset = one[:, :2] + arm_i - other[:, :2] - arm_j
-        return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST)
-
-    def lengths(self, graph: Graph) -> Floats:
-        """Return the distances (e,), m, at the graph's estimates."""
-        return self._arms(graph)[3]
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""
-        arm_i, arm_j, offset, length = self._arms(graph)
-        along = offset / (length * self.sigma)[:, None]
-        by_i = np.column_stack([along, along[:, 1] * arm_i[:, 0] - along[:, 0] * arm_i[:, 1]])[:, None, :]
-        by_j = np.column_stack([-along, along[:, 0] * arm_j[:, 1] - along[:, 1] * arm_j[:, 0]])[:, None, :]
-        residuals = ((length - self.distance) / self.sigma)[:, None]
+        one, other = graph.poses[self.i], graph.poses[self.j]
+        arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
+        residuals, along = _distance_error(self, one[:, :2] + arm_i - other[:, :2] - arm_j)
+        by_i = np.column_stack([along, along[:, 1] * arm_i[:, 0] - along[:, 0] * arm_i[:, 1]])[:, None]
+        by_j = np.column_stack([-along, along[:, 0] * arm_j[:, 1] - along[:, 1] * arm_j[:, 0]])[:, None]
         return Linearization(residuals, (("poses", self.i, by_i), ("poses", self.j, by_j)))
+
+
+def _distance_error(edges: AnchorDistanceEdges | PointDistanceEdges, offset: Floats) -> tuple[Floats, Floats]:
+    """Return whitened residuals (e, 1) and their derivatives (e, 2) by the offset (e, 2) of two points."""
+    length = np.maximum(np.hypot(*offset.T), _LEAST)
+    return ((length - edges.distance) / edges.sigma)[:, None], offset / (length * edges.sigma)[:, None]
+
+
+def distances(edges: AnchorDistanceEdges | PointDistanceEdges, graph: Graph) -> Floats:
+    """Return the distances (e,), m, at the graph's estimates."""
+    return edges.residuals(graph)[:, 0] * edges.sigma + edges.distance
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkEdges(EdgeTable):
+class LandmarkEdges(Edges):
     """Position of a landmark, which is stored as an anchor, in the frame of a pose: e = X^-1 a - z."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"pose": "poses", "anchor": "anchors"}
@@ -106,8 +99,6 @@ class LandmarkEdges(EdgeTable):
     """(e, 2) measured position in the frame of the pose, m."""
     sqrt_information: Floats
     """(e, 2, 2) L with information = L^T L."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose and landmark."""

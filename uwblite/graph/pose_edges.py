@@ -13,20 +13,46 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import Block, EdgeTable, Graph, Linearization, whiten
-from .robust import SQUARED, Kernel
+from .calibration import LASER, WHEELS
+from .graph import POSE, Block, Edges, Graph, Linearization, whiten
 
-# An edge between poses has the error e = Z^-1 (Xi^-1 Xj); with m = tj - ti - R(theta_i) z its plane part is
-# R(theta_i + theta_z)^T m. All its whitened derivatives are combinations of three columns, those by x, y and theta of
-# Xj in the map frame: below they are the *axes*, (3, e) each. Edges run along the last, contiguous axis: ten times the
-# speed of one small matrix product per edge.
+_LEAST_SCALE = 0.1
+"""Least scale that errors are divided by: odometry is not ten times too long."""
 
 
-def _map_axes(sqrt_information: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the columns (3, e) of L [R(heading)^T 0; 0 1]."""
-    x, y, turn = np.ascontiguousarray(sqrt_information.transpose(2, 1, 0))
-    c, s = se2.cos_sin(heading)
-    return x * c - y * s, x * s + y * c, turn
+class _Relative:
+    """The errors e = Z^-1 (Si^-1 Sj) of frames that poses carry, and their derivatives.
+
+    With m = tj - ti - R(theta_i) z the plane part of e is R(theta_i + theta_z)^T m. All whitened derivatives are combinations
+    of three columns, those by x, y and theta of Sj in the map frame: the *axes*, (3, e) each. Edges run along the last,
+    contiguous axis: ten times the speed of one small matrix product per edge.
+    """
+
+    def __init__(self, z: Floats, sqrt_information: Floats, si: Floats, sj: Floats) -> None:
+        """Compute the whitened residuals (3, e); measured poses are (e, 3), those of the frames (3, e)."""
+        x, y, turn = np.ascontiguousarray(sqrt_information.transpose(2, 1, 0))
+        c, s = se2.cos_sin(si[2] + z[:, 2])
+        self.axes = x * c - y * s, x * s + y * c, turn
+        self.si, self.sj = si, sj
+        c, s = se2.cos_sin(si[2])
+        mx = sj[0] - si[0] - (c * z[:, 0] - s * z[:, 1])
+        my = sj[1] - si[1] - (s * z[:, 0] + c * z[:, 1])
+        self.m = mx, my
+        self.residuals = self.along(mx, my) + turn * se2.wrap_angle(sj[2] - si[2] - z[:, 2])
+
+    def along(self, x: Floats, y: Floats) -> Floats:
+        """Return the derivative (3, e) by a motion of Sj in the direction x, y (e,) of the map."""
+        return self.axes[0] * x + self.axes[1] * y
+
+    def turned_about(self, pivot: Floats) -> Floats:
+        """Return the derivative (3, e) by a turn of Si, or back of Sj, about a point (2 or 3, e)."""
+        return self.axes[0] * (self.sj[1] - pivot[1]) - self.axes[1] * (self.sj[0] - pivot[0]) - self.axes[2]
+
+    def by_poses(self, i: Ints, j: Ints, xi: Floats, xj: Floats) -> tuple[Block, Block]:
+        """Return the blocks by poses at xi, xj (3, e), which carry the frames."""
+        x, y, turn = self.axes
+        by_j = turn if xj is self.sj else -self.turned_about(xj)
+        return ("poses", i, _by(-x, -y, self.turned_about(xi))), ("poses", j, _by(x, y, by_j))
 
 
 def _columns(poses: Floats, index: Ints) -> Floats:
@@ -34,33 +60,18 @@ def _columns(poses: Floats, index: Ints) -> Floats:
     return np.ascontiguousarray(poses.T).take(index, axis=1)
 
 
-def _relative_residuals(
-    axes: tuple[Floats, Floats, Floats], z: Floats, xi: Floats, xj: Floats
-) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Return whitened residuals (3, e) and the vector m (2, e); poses are (3, e)."""
-    c, s = se2.cos_sin(xi[2])
-    mx = xj[0] - xi[0] - (c * z[0] - s * z[1])
-    my = xj[1] - xi[1] - (s * z[0] + c * z[1])
-    return axes[0] * mx + axes[1] * my + axes[2] * se2.wrap_angle(xj[2] - xi[2] - z[2]), (mx, my)
-
-
-def _turned_about(axes: tuple[Floats, Floats, Floats], pivot: Floats, point: Floats) -> Floats:
-    """Return the derivative (3, e) by the heading of a pose at the pivot whose edge ends at the point."""
-    return axes[0] * (point[1] - pivot[1]) - axes[1] * (point[0] - pivot[0]) - axes[2]
-
-
-def _by_pose(*columns: Floats) -> Floats:
+def _by(*columns: Floats) -> Floats:
     """Return a Jacobian (e, d, k) from its columns (d, e)."""
     return np.stack(columns).transpose(2, 1, 0)
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class RelativePoseEdges(EdgeTable):
+class RelativePoseEdges(Edges):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses"}
-    ROWS: ClassVar[Mapping[str, Shape]] = {"T_i_j": (3,), "sqrt_information": (3, 3)}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"T_i_j": POSE, "sqrt_information": POSE * 2}
 
     i: Ints
     """(e,) index of the pose measured from."""
@@ -70,38 +81,31 @@ class RelativePoseEdges(EdgeTable):
     """(e, 3) measured pose."""
     sqrt_information: Floats
     """(e, 3, 3) L with information = L^T L in the chart e = Z^-1 (Xi^-1 Xj); may be singular."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses."""
         xi, xj = _columns(graph.poses, self.i), _columns(graph.poses, self.j)
-        axes = _map_axes(self.sqrt_information, xi[2] + self.T_i_j[:, 2])
-        residuals, _ = _relative_residuals(axes, self.T_i_j.T, xi, xj)
-        by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
-        return Linearization(residuals.T, (("poses", self.i, by_i), ("poses", self.j, by_j)))
+        error = _Relative(self.T_i_j, self.sqrt_information, xi, xj)
+        return Linearization(error.residuals.T, error.by_poses(self.i, self.j, xi, xj))
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryEdges(EdgeTable):
+class OdometryEdges(Edges):
     """Motion from pose i to pose j by odometry, corrected by its calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
-    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
-    x and y and by 1 + k in heading: it is the error of the raw odometry, before the correction. Without that, noise alone would
-    bias s and k towards smaller motions (errors in variables).
+    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in x and y
+    and by 1 + k in heading: as that of the raw odometry. Else noise would bias s and k towards smaller motions (errors in
+    variables). It is the error in the middle of the step: a heading error anywhere along the step displaces the end, on
+    average, by half the distance times the error, and the remaining error across is independent of it.
 
-    The wheels turn about the point (-p, 0) of the base, and they measure the motion of a frame there. To their motion v
-    to the left ``v q + u r`` is added and to their motion u ahead ``v w``, both in the frame in the middle of the step: they
-    move sideways 1 + q times as far as counted, deviate by the angle r in forward motion, and by -w in sideways motion.
-
-    The error is that in the middle of the step: a heading error anywhere along the step displaces the end, on average, by half
-    the distance times the error, and the remaining error across is independent of it.
+    The wheels turn about the point (-p, 0) of the base, and measure the motion of a frame there. To their motion v to the left
+    ``v q + u r`` is added and to their motion u ahead ``v w``, both in the frame in the middle of the step.
     """
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
-    ROWS: ClassVar[Mapping[str, Shape]] = {"motion": (3,), "sqrt_information": (3, 3), "calibration": (8,)}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"motion": POSE, "sqrt_information": POSE * 2, "calibration": (len(WHEELS),)}
 
     i: Ints
     j: Ints
@@ -114,10 +118,7 @@ class OdometryEdges(EdgeTable):
     sqrt_information: Floats
     """(e, 3, 3), of the error in the middle of the step."""
     calibration: Ints
-    """(e, 8) indices of s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad), w (rad) in the calibration block; -1 = not an
-    unknown (taken as 0)."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
+    """(e, 8) indices of WHEELS: s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad), w (rad); -1 = no unknown (taken as 0)."""
     slips: Floats | None = None
     """(e,) probability that the wheels slip over each step, by what is no scan; not yet in the information. None = none."""
 
@@ -175,42 +176,36 @@ class OdometryEdges(EdgeTable):
         si, sj = (se2.compose(graph.poses[k], turning).T for k in (self.i, self.j))
         z, direction, s = self._corrected(graph)
         stretch = self.own_scale(graph)
-        axes = _map_axes(self.end_sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
-        residuals, m = _relative_residuals(axes, z.T, si, sj)
-        by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
-        by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
-        blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
+        error = _Relative(z, self.end_sqrt_information / stretch[:, None, :], si, sj)
+        blocks: list[Block] = [*error.by_poses(self.i, self.j, xi, xj)]
         used = graph.has_free(self.calibration)
         if used.any():
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
-            shift = axes[0] * m[0] + axes[1] * m[1]
+            axes, (mx, my) = error.axes, error.m
+            shift = error.along(mx, my)
             # A scale clamped at its least value no longer changes the divisor of errors.
             across, around = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
             by_scale = -axes[0] * nx - axes[1] * ny - shift * across
-            by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
-            by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * around
+            by_delta = axes[0] * (my + half * ny) - axes[1] * (mx + half * nx) - axes[2]
+            by_turn = by_delta * self.motion[:, 2] - (error.residuals - shift) * around
             columns = [by_scale, by_turn, by_delta * self.length, by_delta * self.duration]
             if used[4:].any():
                 cos, sin = (before - after for before, after in zip(se2.cos_sin(xi[2]), se2.cos_sin(xj[2]), strict=True))
-                columns.append(axes[0] * cos + axes[1] * sin)
+                columns.append(error.along(cos, sin))
                 # The middle of the step is turned by (delta + dtheta) / 2.
                 cos, sin = se2.cos_sin(xi[2] + z[:, 2] / 2.0)
                 left, ahead = (1.0 + s) * self._ways()
                 to_left, to_ahead = axes[0] * sin - axes[1] * cos, -axes[0] * cos - axes[1] * sin
                 columns += [to_left * left, to_left * ahead, to_ahead * left]
             for index, column in compress(zip(self.calibration.T, columns, strict=False), used):
-                blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
-        return Linearization(residuals.T, tuple(blocks))
-
-
-_LEAST_SCALE = 0.1
-"""Least scale that errors are divided by: odometry is not ten times too long."""
+                blocks.append(("calibration", np.maximum(index, 0), _by(np.where(index >= 0, column, 0.0))))
+        return Linearization(error.residuals.T, tuple(blocks))
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanEdges(EdgeTable):
+class ScanEdges(Edges):
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
 
     Clouds are in the base frame by the nominal mounting and the clock with which they were made. The true frame of cloud
@@ -220,11 +215,9 @@ class ScanEdges(EdgeTable):
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
     ROWS: ClassVar[Mapping[str, Shape]] = {
-        "T_i_j": (3,),
-        "sqrt_information": (3, 3),
-        "twist_i": (3,),
-        "twist_j": (3,),
-        "calibration": (4,),
+        **dict.fromkeys(("T_i_j", "twist_i", "twist_j"), POSE),
+        "sqrt_information": POSE * 2,
+        "calibration": (len(LASER),),
     }
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
@@ -239,11 +232,9 @@ class ScanEdges(EdgeTable):
     twist_j: Floats
     """(e, 3) velocity at cloud j."""
     calibration: Ints
-    """(4,) indices of C's x, y, theta and of the delay, s, in the calibration block; -1 = not an unknown (taken as 0)."""
+    """(4,) indices of LASER: C's x, y, theta and the delay, s; -1 = no unknown (taken as 0)."""
     made_with: float = 0.0
     """Delay with which the clouds were made, s."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
 
     def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""
@@ -256,7 +247,6 @@ class ScanEdges(EdgeTable):
         return self._moved(graph, graph.poses[poses], twist)
 
     def _moved(self, graph: Graph, base: Floats, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
-        """Return the same of given poses (e, 3) and their velocities (e, 3)."""
         if not np.any(self.calibration >= 0):
             return base, se2.cos_sin(base[:, 2])
         x, y, turn, delay = np.append(graph.calibration.values, 0.0)[self.calibration]
@@ -277,27 +267,21 @@ class ScanEdges(EdgeTable):
         from_pose, heading_i = self.sensor_poses(graph, self.i, self.twist_i)
         to_pose, heading_j = self.sensor_poses(graph, self.j, self.twist_j)
         si, sj = from_pose.T, to_pose.T
-        axes = _map_axes(self.sqrt_information, si[2] + self.T_i_j[:, 2])
-        residuals, _ = _relative_residuals(axes, self.T_i_j.T, si, sj)
-        by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
-        by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
-        blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
+        error = _Relative(self.T_i_j, self.sqrt_information, si, sj)
+        blocks: list[Block] = [*error.by_poses(self.i, self.j, xi, xj)]
         used = graph.has_free(self.calibration[None])
         if used.any():
             c, s = (to - at for at, to in zip(heading_i, heading_j, strict=True))
-            by_turn = axes[2] + _turned_about(axes, si, sj)
-            by_delay = self._along(axes, graph, heading_j, self.twist_j) - self._along(axes, graph, heading_i, self.twist_i)
-            by_delay += by_turn * self.twist_i[:, 2]
-            columns = (axes[0] * c + axes[1] * s, axes[1] * c - axes[0] * s, by_turn, by_delay)
-            for index, column in compress(zip(self.calibration, columns, strict=True), used):
-                blocks.append(("calibration", np.full(len(self), index), _by_pose(column)))
-        return Linearization(residuals.T, tuple(blocks))
+            by_turn = error.axes[2] + error.turned_about(si)
+            x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
 
-    def _along(
-        self, axes: tuple[Floats, Floats, Floats], graph: Graph, heading: tuple[Floats, Floats], twist: Floats
-    ) -> Floats:
-        """Return the derivative (3, e) by the time for which S moves with a base of headings of this cosine and sine (e,)."""
-        c, s = heading
-        x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
-        vx, vy = twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
-        return axes[0] * (c * vx - s * vy) + axes[1] * (s * vx + c * vy) + axes[2] * twist[:, 2]
+            def by_time(heading: tuple[Floats, Floats], twist: Floats) -> Floats:
+                """Return the derivative (3, e) by the time for which S moves with a base of these headings' cosine and sine."""
+                (c, s), vx, vy = heading, twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
+                return error.along(c * vx - s * vy, s * vx + c * vy) + error.axes[2] * twist[:, 2]
+
+            by_delay = by_time(heading_j, self.twist_j) - by_time(heading_i, self.twist_i) + by_turn * self.twist_i[:, 2]
+            columns = (error.along(c, s), error.along(-s, c), by_turn, by_delay)
+            for index, column in compress(zip(self.calibration, columns, strict=True), used):
+                blocks.append(("calibration", np.full(len(self), index), _by(column)))
+        return Linearization(error.residuals.T, tuple(blocks))

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, connected
 from ..errors import SolverError
-from .graph import Edges, EdgeTable, Graph, Linearization, PriorEdges
+from .graph import Edges, Graph, Linearization, PriorEdges
 from .point_edges import LandmarkEdges, PointDistanceEdges
 from .range_edges import RangeEdges
 from .unknowns import free_unknowns
@@ -38,7 +38,7 @@ def what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
 
 def _why_not_finite(edges: Edges, number: int) -> str:
     """Return which value of an edge is not finite, or is a sigma of 0; empty where all are sound."""
-    for name, values in edges.by_edge().items() if isinstance(edges, EdgeTable) else ():
+    for name, values in edges.by_edge().items():
         if len(values) and not (np.isfinite(values[number]).all() and (name != "sigma" or values[number] > 0.0)):
             return f", its {name} is {values[number].tolist()}"
     return ""

@@ -10,28 +10,29 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .graph import Block, EdgeTable, Graph, Linearization
-from .robust import SQUARED, Kernel
+from .calibration import RANGING
+from .graph import Block, Edges, Graph, Linearization
 
+_NEAREST = 1e-3
+"""Least distance of tag and anchor, m: for smaller ones the direction is not defined, and the distance is clamped."""
 _LEAST_SQUARE = 1e-4
 """m^2; a range shorter than the anchor's height keeps a horizontal distance of a centimetre."""
 
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeEdges(EdgeTable):
+class RangeEdges(Edges):
     """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).
 
     The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
     distance D = |x + R(theta) u - a|, the expected range is ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
 
-    A squared height q below 0 is not possible, but descent may pass there, or end there and be set to 0. The root of a
-    negative number is no distance, so the term that q adds for q > 0 is then subtracted: with P^2 = D^2 + height^2, the
-    expected distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; it is negative at the anchor itself.
+    A squared height q below 0 is not possible, but descent may pass there. What q adds for q > 0 is then subtracted: with
+    P^2 = D^2 + height^2, the expected distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; it is negative at the anchor.
     """
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"pose": "poses", "anchor": "anchors", "calibration": "calibration"}
-    ROWS: ClassVar[Mapping[str, Shape]] = {"lever_arm": (2,), "velocity": (2,), "tag": (2,), "calibration": (6,)}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"lever_arm": (2,), "velocity": (2,), "tag": (2,), "calibration": (len(RANGING),)}
     SHARED: ClassVar[tuple[str, ...]] = ("tag",)
 
     pose: Ints
@@ -53,10 +54,8 @@ class RangeEdges(EdgeTable):
     height: Floats
     """(e,) height of the anchor above the tag, m, where it is given, else 0."""
     calibration: Ints
-    """(e, 6) indices of scale, bias (m), q (m^2, unknown squared height), tag x, tag y (m, corrections) and delay (s);
-    -1 = not an unknown (taken as 0)."""
-    kernel: Kernel = SQUARED
-    weights: Floats | None = None
+    """(e, 6) indices of RANGING: scale, bias (m), q (m^2, unknown squared height), tag x, tag y (m, corrections), delay (s);
+    -1 = no unknown (taken as 0)."""
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
     late: Floats = field(default_factory=lambda: np.zeros(0))
@@ -83,10 +82,10 @@ class RangeEdges(EdgeTable):
     def _geometry(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""
         cal = np.append(graph.calibration.values, 0.0)[self.calibration.T]
+        (tx, ty), delay = self.tag[:, None] + cal[-3:-1], cal[-1]
         c, s = se2.cos_sin(self.turn)
-        tx, ty = self.tag[0] + cal[3], self.tag[1] + cal[4]
-        ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * cal[5]
-        uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * cal[5]
+        ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * delay
+        uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * delay
         c, s = self._heading(graph)
         arm = np.stack([c * ux - s * uy, s * ux + c * uy])
         offset = graph.poses[:, :2].T.take(self.pose, axis=1) + arm - graph.anchors.T.take(self.anchor, axis=1)
@@ -102,11 +101,6 @@ class RangeEdges(EdgeTable):
         """Return the expected slant distances (e,), m, before scale and bias."""
         _, _, reach, cal = self._geometry(graph)
         return _slant(reach, cal)
-
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 1), expected minus measured."""
-        _, _, reach, cal = self._geometry(graph)
-        return (((1.0 + cal[0]) * _slant(reach, cal) + cal[1] - self.corrected) / self.sigma)[:, None]
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose, anchor and the calibration that is free."""
@@ -136,7 +130,3 @@ class RangeEdges(EdgeTable):
 def _slant(reach: Floats, calibration: Floats) -> Floats:
     """Return the slant distances (e,) from P and sqrt(P^2 + |q|) (2, e) and the calibration (6, e)."""
     return np.where(calibration[2] < 0.0, 2.0 * reach[0] - reach[1], reach[1])
-
-
-_NEAREST = 1e-3
-"""Least distance of tag and anchor, m: for smaller ones the direction is not defined, and the distance is clamped."""

@@ -1,37 +1,41 @@
-"""Conjugate gradients for long chains of poses with many edges between distant poses.
+"""Conjugate gradients for long chains of poses with many edges between distant poses, whose factor would fill up.
 
-Where thousands of poses share a few rooms and each is matched with many others, a factorisation fills up: the 14,000 poses of
-five hours in one hall need 100 million entries and minutes. Iteration solves their least squares well if errors of all
-wavelengths are reduced together: short ones piece by piece of the chain, long ones by moving whole pieces as rigid bodies (a
-two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996). The number of iterations hardly
-depends on the length of the chain. Anchors and calibration belong to the coarse level; where they are thousands, which would
-make it as large as the matrix, they are in pieces of their own.
+Iteration solves their least squares well if errors of all wavelengths are reduced together: short ones piece by piece of the
+chain, long ones by moving whole pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain
+Decomposition, 1996). The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the
+coarse level; where they are thousands, which would make it as large as the matrix, they are in pieces of their own.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
-from scipy.sparse.csgraph import connected_components, depth_first_order
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SINGULAR, SolverError
+from .graph import WIDTHS
 
-_PIECE = 24
-"""Poses of a piece."""
-_ENOUGH = 1e-3
-"""Relative error of a solution: the next step of the descent corrects it."""
-_MOST = 300
-"""Most iterations; the result by then is still a descent step."""
-_MOST_COARSE = 1000
-"""Number of unknowns other than poses up to which each is in the coarse level."""
-_PER_PRODUCT = 4
-"""Multiplications of a factorisation in the time of one multiplication of a matrix-vector product, which memory access
-limits."""
-_USUAL = 60
-"""Expected iterations, from halls, sites and warehouses of 1,000 to 15,000 poses."""
+
+@dataclass(frozen=True, slots=True)
+class SchwarzPolicy:
+    """Sizes of the two levels, and when the iteration ends."""
+
+    piece: ClassVar[int] = 24
+    """Poses of a piece."""
+    enough: ClassVar[float] = 1e-3
+    """Relative error of a solution: the next step of the descent corrects it."""
+    most: ClassVar[int] = 300
+    """Iterations; the result by then is still a descent step."""
+    most_coarse: ClassVar[int] = 1000
+    """Number of unknowns other than poses up to which each is in the coarse level."""
+    per_product: ClassVar[int] = 4
+    """Multiplications of a factorisation in the time of one of a matrix-vector product, which memory access limits."""
+    usual: ClassVar[int] = 60
+    """Expected iterations, from halls, sites and warehouses of 1,000 to 15,000 poses."""
+    columns_at_once: ClassVar[int] = 256
+    """Of the coarse matrix; a bound on the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,16 +47,16 @@ class Pieces:
     basis: sparse.csr_matrix
     """(n, c) motions of the coarse level: three of each piece as a rigid body, and each unknown that is no pose."""
 
-    def work(self, steps: float, entries: int) -> float:
-        """Return the work, in multiplications of a factorisation, of preparing a solution (the inverses of the pieces and the
-        factor of the coarse matrix) and of iterations with a matrix of so many entries."""
+    def work(self, steps: float = 0.0, entries: int = 0) -> float:
+        """Return the work, in multiplications of a factorisation, of the inverses of the pieces and the factor of the coarse
+        matrix, and of iterations with a matrix of so many entries."""
         return _work((*self.number.shape, int(self.basis.shape[1])), steps, entries)
 
 
 def _work(shape: tuple[int, int, int], steps: float, entries: int) -> float:
     """Return the same of pieces of so many unknowns and a coarse matrix of so many rows."""
     pieces, wide, coarse = map(float, shape)
-    step = _PER_PRODUCT * (entries + pieces * wide**2 + coarse**2)
+    step = SchwarzPolicy.per_product * (entries + pieces * wide**2 + coarse**2)
     return pieces * wide**3 + coarse**3 / 3.0 + steps * step
 
 
@@ -63,43 +67,19 @@ def expected_work(poses: int, others: int, entries: int) -> float:
     ----------
     poses : in one chain or a few. others : scalars that are no poses. entries : of the matrix.
     """
-    pieces, wide = -(-poses // _PIECE), 3 * _PIECE
-    apart = others > _MOST_COARSE
-    pieces, coarse = pieces + (-(-others // wide) if apart else 0), 3 * pieces + (0 if apart else others)
-    return _work((pieces, wide, coarse), _USUAL, entries)
-
-
-def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
-    """Return poses (poses,) in an order in which most share an edge with the next one, and which of them (poses - 1,) do.
-
-    As they are numbered, where that makes chains; else in the order of a depth-first walk through the graph.
-
-    Parameters
-    ----------
-    pairs : (b, 2) poses that share an edge. linked : (poses - 1,) which of them do so with the next one, as numbered.
-    """
-    if _makes_chains(linked):
-        return np.arange(poses), linked
-    links = sparse.csr_matrix((np.ones(len(pairs)), pairs.T), shape=(poses + 1, poses + 1))
-    part = connected_components(links, directed=False)[1][:poses]
-    begin = np.unique(part, return_index=True)[1]
-    # One further node is the start of the walk through every part.
-    rooted = links + sparse.csr_matrix((np.ones(len(begin)), (np.full(len(begin), poses), begin)), shape=links.shape)
-    order = depth_first_order(rooted, poses, directed=False, return_predecessors=False)[1:].astype(np.intp)
-    linked = np.asarray((links + links.T)[order[:-1], order[1:]]).ravel() > 0.0
-    # A star has no chains, and the coarse level has no place for pieces of one pose each.
-    return order, linked if _makes_chains(linked) else np.ones_like(linked)
-
-
-def _makes_chains(linked: Bools) -> bool:
-    return bool(np.count_nonzero(~linked) * _PIECE <= max(len(linked), _PIECE**2))
+    motions = WIDTHS["poses"]
+    pieces, wide = -(-poses // SchwarzPolicy.piece), motions * SchwarzPolicy.piece
+    apart = others > SchwarzPolicy.most_coarse
+    shape = pieces + (-(-others // wide) if apart else 0), wide, motions * pieces + (0 if apart else others)
+    return _work(shape, SchwarzPolicy.usual, entries)
 
 
 def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     """Cut the free poses of a graph into pieces, none of which goes on from one chain to another.
 
     Two chains in one piece, such as the end of a recording and the start of the next, move independently, which the coarse
-    level cannot represent: every such piece costs tens of iterations.
+    level cannot represent: every such piece costs tens of iterations. Where poses make no chains, as those of a star, a piece
+    of each would make the coarse level as large as the matrix: they are cut as they are numbered.
 
     Parameters
     ----------
@@ -108,25 +88,28 @@ def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     size : n, length of the vector.
     linked : (k - 1,) which poses share an edge with the next one.
     """
+    piece_size, motions = SchwarzPolicy.piece, number.shape[1]
+    if np.count_nonzero(~linked) * piece_size > max(len(linked), piece_size**2):
+        linked = np.ones_like(linked)
     each = np.arange(len(number))
     begin = np.maximum.accumulate(np.where(np.append(True, ~linked), each, 0))
-    within = (each - begin) % _PIECE
+    within = (each - begin) % piece_size
     piece = np.cumsum(within == 0) - 1
     pieces = int(piece[-1]) + 1
-    places = np.full((pieces, 3 * _PIECE), size)
-    places[piece[:, None], 3 * within[:, None] + np.arange(3)] = number
+    places = np.full((pieces, motions * piece_size), size)
+    places[piece[:, None], motions * within[:, None] + np.arange(motions)] = number
     centre = np.stack([np.bincount(piece, column) for column in poses[:, :2].T], axis=1) / np.bincount(piece)[:, None]
     arm = poses[:, :2] - centre[piece]
     other = np.setdiff1d(np.arange(size), number)
-    if len(other) > _MOST_COARSE:
+    if len(other) > SchwarzPolicy.most_coarse:
         apart = np.append(other, np.full(-len(other) % places.shape[1], size)).reshape(-1, places.shape[1])
         places, other = np.concatenate([places, apart]), other[:0]
-    one = np.ones(len(number))
     # A turn about the middle moves a pose at the arm (u, v) by (-v, u).
-    rows = np.concatenate([*number.T, number[:, 0], number[:, 1], other])
-    columns = np.concatenate([3 * piece, 3 * piece + 1, *[3 * piece + 2] * 3, 3 * pieces + np.arange(len(other))])
-    values = np.concatenate([one, one, one, -arm[:, 1], arm[:, 0], np.ones(len(other))])
-    return Pieces(places, sparse.csr_matrix((values, (rows, columns)), shape=(size, 3 * pieces + len(other))))
+    rows = np.concatenate([number.ravel(), number[:, 0], number[:, 1], other])
+    own, turn = motions * piece[:, None] + np.arange(motions), motions * piece + 2
+    columns = np.concatenate([own.ravel(), turn, turn, motions * pieces + np.arange(len(other))])
+    values = np.concatenate([np.ones(number.size), -arm[:, 1], arm[:, 0], np.ones(len(other))])
+    return Pieces(places, sparse.csr_matrix((values, (rows, columns)), shape=(size, motions * pieces + len(other))))
 
 
 class LocalPlaces:
@@ -147,9 +130,8 @@ class LocalPlaces:
 
     def blocks(self, data: Floats) -> Floats:
         """Return the blocks (p, w, w) by the matrix's data; 1 on the diagonal where a piece has no unknown."""
-        found = np.zeros(self._nobody.size * self._width)
-        found[self._target] = data[self._source]
-        found = found.reshape(len(self._nobody), self._width, self._width)
+        flat = np.bincount(self._target, data[self._source], self._nobody.size * self._width)
+        found = flat.astype(np.float64, copy=False).reshape(len(self._nobody), self._width, self._width)
         each = np.arange(self._width)
         found[:, each, each] += self._nobody
         return found
@@ -177,12 +159,16 @@ class TwoLevelFactor:
         columns = matrix.copy()
         columns.eliminate_zeros()
         self._matrix = columns.T
-        self._coarse, failed = lapack.dpotrf(_seen_by(columns, pieces.basis, self._onto), lower=1, overwrite_a=1)
+        coarse, by_column = np.empty((pieces.basis.shape[1],) * 2, order="F"), pieces.basis.tocsc()
+        for first in range(0, len(coarse), SchwarzPolicy.columns_at_once):
+            part = slice(first, first + SchwarzPolicy.columns_at_once)
+            coarse[:, part] = (self._onto @ (columns @ by_column[:, part])).toarray()
+        self._coarse, failed = lapack.dpotrf(coarse, lower=1, overwrite_a=1)
         if failed:
             raise SolverError(SINGULAR)
 
     def solve(self, right: Floats) -> Floats:
-        """Solve for right-hand sides (n,) or (n, m).
+        """Solve for right-hand sides (n,) or (n, m), each to a small share of its residual in the metric of the two levels.
 
         Raises
         ------
@@ -190,8 +176,21 @@ class TwoLevelFactor:
         """
         if right.ndim == 2:
             return np.stack([self.solve(column) for column in right.T], axis=1)
-        solution, steps = conjugate_gradients(self._matrix.__matmul__, right, self._nearly, _ENOUGH, _MOST)
-        self.work += self._pieces.work(steps, self._matrix.nnz) - self._pieces.work(0, 0)
+        solution, residual = np.zeros(len(right)), right.copy()
+        direction, steps = self._nearly(residual), 0
+        energy = first = float(residual @ direction)
+        while energy > SchwarzPolicy.enough**2 * first and steps < SchwarzPolicy.most:
+            image = self._matrix @ direction
+            curvature = float(direction @ image)
+            if not curvature > 0.0:
+                raise SolverError(SINGULAR)
+            solution += (energy / curvature) * direction
+            residual -= (energy / curvature) * image
+            near = self._nearly(residual)
+            before, energy = energy, float(residual @ near)
+            direction = near + (energy / before) * direction
+            steps += 1
+        self.work += self._pieces.work(steps, self._matrix.nnz) - self._pieces.work()
         return solution
 
     @property
@@ -211,49 +210,3 @@ class TwoLevelFactor:
 def iterated(factor: object) -> float:
     """Return the work of all iterations with a factor so far, in multiplications of a factorisation; 0 for others."""
     return factor.work if isinstance(factor, TwoLevelFactor) else 0.0
-
-
-def conjugate_gradients(
-    times: Callable[[Floats], Floats], right: Floats, nearly: Callable[[Floats], Floats], enough: float, most: int
-) -> tuple[Floats, int]:
-    """Solve with a symmetric, positive definite matrix by preconditioned conjugate gradients; return how many steps it took.
-
-    Parameters
-    ----------
-    times : multiplies by the matrix. right : (n,). nearly : multiplies by about its inverse.
-    enough : the residual, in the metric of `nearly`, as a share of the first at which it ends. most : steps.
-
-    Raises
-    ------
-    SolverError : the matrix is not positive definite.
-    """
-    solution, residual = np.zeros(len(right)), right.copy()
-    direction = nearly(residual)
-    energy = first = float(residual @ direction)
-    for step in range(most):
-        if not energy > enough**2 * first:
-            return solution, step
-        image = times(direction)
-        curvature = float(direction @ image)
-        if not curvature > 0.0:
-            raise SolverError(SINGULAR)
-        solution += (energy / curvature) * direction
-        residual -= (energy / curvature) * image
-        near = nearly(residual)
-        before, energy = energy, float(residual @ near)
-        direction = near + (energy / before) * direction
-    return solution, most
-
-
-def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix, onto: sparse.csr_matrix) -> Floats:
-    """Return basis^T matrix basis (c, c), nearly full, a few columns at a time; `onto` is basis^T by rows."""
-    by_column = basis.tocsc()
-    seen = np.empty((basis.shape[1], basis.shape[1]), order="F")
-    for first in range(0, basis.shape[1], _COLUMNS_AT_ONCE):
-        part = slice(first, first + _COLUMNS_AT_ONCE)
-        seen[:, part] = (onto @ (matrix @ by_column[:, part])).toarray()
-    return seen
-
-
-_COLUMNS_AT_ONCE = 256
-"""Columns of the coarse matrix made at once; a bound on the memory."""

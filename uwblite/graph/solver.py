@@ -4,32 +4,26 @@ The cost is F(x) = sum_e w_e rho(|r_e(x)|^2) with whitened residuals r_e. One it
 
     q(h) = F + 2 g^T h + h^T H h,    g = sum J_e^T w_e rho' r_e,    H = sum J_e^T w_e rho' J_e,
 
-that is, iteratively reweighted least squares: rho' = weight(|r|^2) is evaluated at the start of the step and its own derivative
-is omitted, so H stays positive semi-definite for every kernel. The step solves
+that is, iteratively reweighted least squares: rho' = weight(|r|^2) is evaluated at the start of the step. The step solves
 
     (H + lambda D) h = -g,    D = largest diag(H) so far (1 where an unknown is measured by nothing),
 
-Marquardt's scaling: lambda is a pure number, the same for metres, radians and scale factors, and the matrix is positive
-definite where the measurements leave a direction undetermined, which then does not change. D never shrinks (J. J. More, The
-Levenberg-Marquardt algorithm, 1978): an anchor that comes into line with its poses loses all curvature across that line, and
-lambda would have to grow until it damped all other directions. The model predicts the decrease h^T (lambda D h - g). A step
-that decreases F is taken, and lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3), with the ratio of the real decrease to the
-predicted one; otherwise it is multiplied by 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method,
-IMM-REP-1999-05; K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
+Marquardt's scaling: lambda is a pure number, and directions that are not measured do not change. D never shrinks (J. J. More,
+The Levenberg-Marquardt algorithm, 1978): an anchor that comes into line with its poses loses all curvature across that line.
+A step that decreases F is taken, and lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3), with the ratio of the real decrease
+to the predicted one, h^T (lambda D h - g); otherwise it is multiplied by 2, 4, 8, ... (K. Madsen, H. B. Nielsen, O. Tingleff,
+Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
 Where a step turns poses by much and misses its prediction, it is tried in two ways that agree to first order, each pose on its
 own and link by link along the trajectory, and the one with the lower cost is taken: an error of the odometry that bends a path
-of hundreds of metres is corrected in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard,
-S. Teller, Fast iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
+of hundreds of metres is corrected in five steps instead of hundreds (after E. Olson, J. Leonard, S. Teller, Fast iterative
+alignment of pose graphs with poor initial estimates, ICRA 2006).
 
 Near the minimum H hardly changes: a step after one of little effect uses the factor of that one. Where its predicted decrease
-is negligible and there are no robust kernels, it is the last, and its cost is the predicted one.
-
-The search ends where the remaining decrease is a negligible fraction of F or every component of the gradient is negligible in
-units of its own curvature, where no step helps, or where the iterations or the work allowed are used up: work is counted, not
-timed, so that the same graph gives the same result. Without robust kernels the decrease to come is extrapolated from the last
-two as a geometric series: exact where convergence is linear, conservative where it is quadratic. With robust kernels,
-reweighting converges linearly at an unknown rate, and the last decrease itself is used.
+is negligible and there are no robust kernels, it is the last, and its cost is the predicted one. The search ends where the
+decrease to come is negligible: without robust kernels it is extrapolated from the last two as a geometric series, with them,
+as reweighting converges linearly at an unknown rate, it is the last one itself. Work is counted, not timed, so that the same
+graph gives the same result.
 """
 
 from collections.abc import Callable
@@ -153,6 +147,33 @@ def minimise(
     return graph, SolverSummary(converged, reason, len(history), chi2_initial, chi2, size, graph, history, descent.work)
 
 
+@dataclass(frozen=True, slots=True)
+class DescentPolicy:
+    """When the damping changes, a factor is used again, and a step is the last."""
+
+    negligible: ClassVar[float] = 1e-12
+    """chi2 that never matters, and its share that the rounding of thousands of residuals hides."""
+    little: ClassVar[float] = 1e-4
+    """Share of chi2 above which a predicted decrease that was not reached is no sign of a minimum, even in a coarse search."""
+    old: ClassVar[float] = 1e-3
+    """The same of a decrease that an old factor predicts, as a share of what counts with a new one."""
+    free: ClassVar[float] = 1e-2
+    """lambda up to which small steps indicate a minimum and not only strong damping."""
+    patience: ClassVar[int] = 8
+    """Accepted steps that together indicate a minimum if their decrease was negligible, for any damping."""
+    near: ClassVar[float] = 5e-2
+    nearly_free: ClassVar[float] = 1e-6
+    """A step that decreased chi2 by less than this share, with less damping, hardly changed H: the next uses its factor."""
+    as_predicted: ClassVar[float] = 0.9
+    """Share of the predicted decrease from which on the other way of moving has little to gain."""
+    quadratic: ClassVar[float] = 0.5
+    """Share of the predicted decrease below which the cost is not quadratic along a step, and predicts no later ones."""
+    least: ClassVar[float] = 1e-14
+    first: ClassVar[float] = 1e-5
+    most: ClassVar[float] = 1e12
+    """lambda at least, at least after a step that failed, and at most."""
+
+
 class _Descent:
     """State of a search: the estimate, the edges linearised there, and the damping of the next step."""
 
@@ -203,53 +224,45 @@ class _Descent:
         steps = iterated(self.factor) - before if reused else iterated(self.factor)
         self.graph.work[ENTRIES] += int(steps)
         self.work += steps if reused else steps + self.normal.work
-        negligible = self.config.relative_decrease * self.chi2 + _NOTHING
+        negligible = self.config.relative_decrease * self.chi2 + DescentPolicy.negligible
         if reused and not self.robust and 0 < promised <= negligible:
             self.graph, self.chi2 = moved(self.graph, self.normal.unknowns, step), self.chi2 - promised
             self.history.append(self.chi2)
             return NO_DECREASE
-        enough = self.chi2 - _AS_PREDICTED * promised
-        trial, linearized, chi2 = cheaper_move(self.graph, self.normal.unknowns, step, self.linked, enough)
-        self.history.append(chi2)
-        self.moved = promised > 0 and chi2 <= self.chi2
-        if self.moved:
-            over = self._take(trial, linearized, chi2, promised, negligible, reused)
-        else:
-            over = self._refuse(promised, negligible, reused)
-        if not over and self.damping > _MOST_DAMPING:
+        enough = self.chi2 - DescentPolicy.as_predicted * promised
+        trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked, enough)
+        self.history.append(trial[-1])
+        self.moved = promised > 0 and trial[-1] <= self.chi2
+        rest = promised, negligible, reused
+        over = self._take(trial, *rest) if self.moved else self._refuse(*rest)
+        if not over and self.damping > DescentPolicy.most:
             # At a minimum no step helps either: then the remaining decrease is below the rounding error.
-            lost = np.max(self.normal.gradient**2 / self.scale) <= _ROUNDING * self.chi2
+            lost = np.max(self.normal.gradient**2 / self.scale) <= DescentPolicy.negligible * self.chi2
             return NO_DECREASE if lost else STUCK
         return NO_DECREASE if over else ""
 
-    def _take(
-        self,
-        trial: Graph,
-        linearized: list[Linearization],
-        chi2: float,
-        promised: float,
-        negligible: float,
-        reused: bool,
-    ) -> bool:
+    def _take(self, trial: "_Trial", promised: float, negligible: float, reused: bool) -> bool:
         """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
+        graph, linearized, chi2 = trial
         decrease = self.chi2 - chi2
-        over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
-        self.decreases = [*self.decreases[1 - _PATIENCE :], decrease]
-        over = over or (len(self.decreases) == _PATIENCE and sum(self.decreases) <= negligible)
-        near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
+        over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= DescentPolicy.free
+        self.decreases = [*self.decreases[1 - DescentPolicy.patience :], decrease]
+        over = over or (len(self.decreases) == DescentPolicy.patience and sum(self.decreases) <= negligible)
+        near = not reused and decrease <= DescentPolicy.near * self.chi2 and self.damping <= DescentPolicy.nearly_free
         self.factor = self.factor if near else None
-        self.graph, self.linearized, self.last_decrease, self.chi2 = trial, linearized, decrease, chi2
-        self.damping, self.raised_by = max(self.damping * relaxed(decrease / promised), _LEAST_DAMPING), 2.0
+        self.graph, self.linearized, self.last_decrease, self.chi2 = graph, linearized, decrease, chi2
+        self.damping, self.raised_by = max(self.damping * relaxed(decrease / promised), DescentPolicy.least), 2.0
         return over
 
     def _refuse(self, promised: float, negligible: float, reused: bool) -> bool:
         """Reject the step, with more damping unless it used an old factor; return whether its predicted decrease was
         negligible."""
         self.factor = None
-        if 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * self.chi2) and self.damping <= _FREE:
+        little = (DescentPolicy.old if reused else 1.0) * min(negligible, DescentPolicy.little * self.chi2)
+        if 0 < promised <= little and self.damping <= DescentPolicy.free:
             return True
         if not reused:
-            self.damping, self.raised_by = max(self.damping * self.raised_by, _FIRST_BRAKE), self.raised_by * 2.0
+            self.damping, self.raised_by = max(self.damping * self.raised_by, DescentPolicy.first), self.raised_by * 2.0
         return False
 
 
@@ -259,33 +272,9 @@ STUCK = "no step decreases chi2"
 USED_UP = "iterations used up"
 ALL_WORK_DONE = "the work allowed is done"
 
-_NOTHING = 1e-12
-"""chi2, in standard deviations squared, that never matters."""
-_LITTLE = 1e-4
-"""Share of chi2 above which a predicted decrease that was not reached is no sign of a minimum, even in a coarse search."""
-_FREE = 1e-2
-"""lambda up to which small steps indicate a minimum and not only strong damping."""
-_PATIENCE = 8
-"""Accepted steps that together indicate a minimum if their decrease was negligible, for any damping."""
-_NEAR = 5e-2
-"""A step that decreased chi2 by less than this fraction of it changed H so little that the next one uses its factor."""
-_NEARLY_FREE = 1e-6
-"""lambda up to which that is valid."""
-_ROUNDING = 1e-12
-"""Share of chi2 that the rounding of thousands of residuals hides."""
-_LEAST_DAMPING = 1e-14
-_FIRST_BRAKE = 1e-5
-"""Least lambda after a step that failed."""
-_MOST_DAMPING = 1e12
-
 
 def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
-    """Return the factor used, the step and its predicted decrease (not positive: the factorisation failed).
-
-    Parameters
-    ----------
-    factor : of a step before, to be used again; None = factorise again.
-    """
+    """Return the factor used (an earlier one where given), the step and its predicted decrease; not positive: no factor."""
     try:
         if factor is not None:
             step = factor.solve(-normal.gradient)
@@ -297,11 +286,10 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     return factor, step, float(step @ (damping * step - normal.gradient))
 
 
-_AS_PREDICTED = 0.9
-"""Share of the predicted decrease from which on the other way of moving has little to gain."""
-def cheaper_move(
-    graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools, enough: float
-) -> tuple[Graph, list[Linearization], float]:
+_Trial = tuple[Graph, list[Linearization], float]
+
+
+def cheaper_move(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools, enough: float) -> _Trial:
     """Return the graph moved by a step, linearised there, and its cost.
 
     Where the step turns poses by much, and the first way of moving them costs more than enough, by whichever way costs less.
@@ -313,19 +301,15 @@ def cheaper_move(
     return along if along[2] < straight[2] else straight
 
 
-def _linearized(graph: Graph) -> tuple[Graph, list[Linearization], float]:
+def _linearized(graph: Graph) -> _Trial:
     linearized = linearize(graph)
     return graph, linearized, linearized_cost(graph, linearized)
-
-
-_KEPT = 0.5
-"""Share of the predicted decrease below which the cost along a step is not quadratic, so that it predicts no later steps."""
 
 
 def extrapolated(decrease: float, last: float, promised: float) -> float:
     """Return the sum of the geometric series that the last two decreases begin, where the steps reach their predicted
     decrease."""
-    if not np.isfinite(last) or decrease < _KEPT * promised:
+    if not np.isfinite(last) or decrease < DescentPolicy.quadratic * promised:
         return max(decrease, promised)
     return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
 

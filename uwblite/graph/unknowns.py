@@ -9,9 +9,6 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .graph import Graph, Linearization
 
-WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
-"""Blocks of unknowns, and the scalars of one unknown."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
@@ -30,8 +27,7 @@ class Unknowns:
 def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
     """Return the graph moved by a step: poses along the arc of a constant twist, the rest straight.
 
-    With the turn w of a pose and its shift t in the map frame, x -> x + V(w) t: to first order addition, and the shift
-    turns with the pose. Long bent chains need about two iterations fewer than with plain addition.
+    Long bent chains need about two iterations fewer than with plain addition, which it is to first order.
     """
     shift = unknowns.spread("poses", step)
     arc = se2.exp(shift)
@@ -43,10 +39,7 @@ def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
 
 def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
     """Return the graph moved by a step, poses link by link: each relative pose changes by the step to first order,
-    and the chain is put together again from these.
-
-    The same as `moved` to first order. Where a step turns poses by much, this keeps the relative poses of neighbours
-    for any turn; `moved` keeps loops closed.
+    and the chain is put together again from these. It keeps relative poses for any turn; `moved` keeps loops closed.
 
     Parameters
     ----------

@@ -1,7 +1,4 @@
-"""A raster for every cloud in which each cell names the nearest point.
-
-Looking up a million points is a handful of array operations and no tree.
-"""
+"""A raster for every cloud in which each cell names the nearest point: a look-up of a million points needs no tree."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import WIDE, Floats, Ints
-from ..graph.work import LOOK_UPS, Work
+from ..graph.work import LOOK_UPS
 from .clouds import Clouds
 
 _CLOUDS_AT_ONCE = 64
@@ -25,12 +22,9 @@ NOBODY = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudRasters:
-    """A raster for every cloud: which of its points is nearest to each cell around it.
+    """Rasters: columns of cells are cut into runs, and only runs that name a point are kept; most cells are far from any."""
 
-    Most of the box around a cloud is far from any of its points. Columns of cells are cut into runs, and only runs that name a
-    point are kept.
-    """
-
+    clouds: Clouds
     cell: float
     """m."""
     origin: Floats
@@ -40,12 +34,10 @@ class CloudRasters:
     start: NDArray[np.int32]
     """(k,) first run of each raster in `run`; those in y follow each other."""
     run: NDArray[np.int32]
-    """(runs,) first cell of each run in `nearest`; the first run is that of what lies outside of all rasters."""
+    """(runs,) first cell of each run in `nearest`; the first run stands for what lies outside of all rasters."""
     nearest: NDArray[np.signedinteger]
     """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice. Those of the
     first run name none: they stand for all runs that name none."""
-    work: Work
-    """To which look-ups are added: that of the clouds."""
 
     def cells(self, k: int) -> NDArray[np.signedinteger]:
         """Return the raster (x, y) of one cloud."""
@@ -68,12 +60,8 @@ class ScanClouds:
 
 
 def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
-    """Build the rasters: each point with a normal writes its number into the cells within reach, nearest cells last.
-
-    Parameters
-    ----------
-    cell, reach : cell size and distance up to which a point is a neighbour, m.
-    """
+    """Build rasters with cells of a size, m: each point with a normal writes its number into those within reach, m, the nearest
+    last."""
     low, high = _boxes(clouds)
     filled = np.isfinite(low[:, :1])
     margin = reach + cell
@@ -88,13 +76,17 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     for some in _blocks(clouds):
         rows = slice(start[some.start], start[some.stop])
         block = np.full((rows.stop - rows.start, _RUN), NOBODY, dtype=kind)
-        _claim_cells(clouds, some, block.reshape(-1), (start[some] - rows.start) * _RUN, low, shape, cell, offsets)
+        usable, owner, x, y = _usable(clouds, some)
+        number = (usable - clouds.offsets[owner]).astype(kind)
+        stride = -(-shape[owner, 1] // _RUN) * _RUN
+        cx, cy = ((x - low[owner, 0]) / cell).astype(np.intp), ((y - low[owner, 1]) / cell).astype(np.intp)
+        _claim_cells(block.reshape(-1), (start[owner] - rows.start) * _RUN + cx * stride + cy, stride, number, offsets)
         # All bits of -1 are set: the words of a run that names no point are -1 together, too.
         named = np.flatnonzero(reduce(np.bitwise_and, block.view(WIDE).T) != NOBODY)
         run[rows][named] = (count + np.arange(len(named))) * _RUN
         kept.append(block[named])
         count += len(named)
-    return CloudRasters(cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1), clouds.work)
+    return CloudRasters(clouds, cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1))
 
 
 def _offsets(reach: float) -> list[tuple[int, int]]:
@@ -107,32 +99,20 @@ def _offsets(reach: float) -> list[tuple[int, int]]:
 
 
 def _blocks(clouds: Clouds) -> Iterator[slice]:
-    """Yield the clouds a bounded number at a time."""
     for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
         yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
 
 
 def _claim_cells(
-    clouds: Clouds, some: slice, cells: NDArray[np.signedinteger], start: Ints, low: Floats, shape: Ints, cell: float,
+    cells: NDArray[np.signedinteger], base: Ints, stride: Ints, number: NDArray[np.signedinteger],
     offsets: list[tuple[int, int]],
 ) -> None:
-    """Write the points of some clouds into the cells at these offsets from their own; later offsets overwrite earlier ones.
-
-    Parameters
-    ----------
-    cells : of these clouds, all runs of each. start : (s,) first of each cloud's. low, shape : (k, 2), see CloudRasters.
-    """
-    usable, owner, x, y = _usable(clouds, some)
-    rows = (usable - clouds.offsets[owner]).astype(cells.dtype)
-    stride = -(-shape[owner, 1] // _RUN) * _RUN
-    cx, cy = ((x - low[owner, 0]) / cell).astype(np.intp), ((y - low[owner, 1]) / cell).astype(np.intp)
-    base = cx * stride + cy + start[owner - some.start]
-    # Of points in one cell, the last one counts in every cell.
-    cells[base] = rows
-    last = cells[base] == rows
-    base, stride, rows = base[last], stride[last], rows[last]
+    """Write the numbers of points into the cells at offsets from their own, base; later offsets overwrite earlier ones."""
+    cells[base] = number
+    last = cells[base] == number
+    base, stride, number = base[last], stride[last], number[last]
     for dx, dy in offsets:
-        cells[base + (dx * stride + dy)] = rows
+        cells[base + (dx * stride + dy)] = number
 
 
 def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
@@ -157,7 +137,7 @@ def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
 
 def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
     """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
-    raster.work[LOOK_UPS] += x.size
+    raster.clouds.work[LOOK_UPS] += x.size
     per_cell = 1.0 / raster.cell
     # Truncation puts coordinates up to a cell below the raster into its rim, which names no point.
     cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
@@ -173,17 +153,13 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.s
     return raster.nearest.take(cy)
 
 
-def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
-    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell of cloud 0's raster.
-
-    d is the distance from the cell's centre to the point that the raster names; 0 where it names none.
-    """
-    high = int(raster.shape[0, 1])
-    nearest = raster.cells(0).reshape(-1).astype(np.intp)
-    cells = np.flatnonzero(nearest >= 0)
-    own = nearest[cells]
-    centre = raster.origin[0] + (np.column_stack([cells // high, cells % high]) + 0.5) * raster.cell
-    square = np.sum((centre - clouds.points[own]) ** 2, axis=1)
-    field = np.zeros(len(nearest), np.complex64)
-    field[cells] = np.exp(-0.5 * square / spread**2) * (clouds.normals[own, 0] + 1j * clouds.normals[own, 1])
+def surface_field(raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
+    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell (x, y) of cloud 0's raster, at
+    the distance d from its point; 0 where it names none."""
+    clouds, nearest = raster.clouds, raster.cells(0).astype(np.intp)
+    cells = np.argwhere(nearest >= 0)
+    own = nearest[tuple(cells.T)]
+    square = np.sum((raster.origin[0] + (cells + 0.5) * raster.cell - clouds.points[own]) ** 2, axis=1)
+    field = np.zeros(nearest.shape, np.complex64)
+    field[tuple(cells.T)] = np.exp(-0.5 * square / spread**2) * (clouds.normals[own] @ np.array([1.0, 1j]))
     return field

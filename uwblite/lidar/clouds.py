@@ -1,7 +1,6 @@
 """Lidar clouds of all keyframes as one array: averaged in small cells, with normals that face the laser.
 
-One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes. Single precision,
-a few micrometres at the reach of a lidar, and coordinates in one piece each: hours of clouds fit into memory.
+Single precision is a few micrometres at the reach of a lidar; hours of clouds fit into memory.
 """
 
 from collections.abc import Sequence
@@ -13,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Bools, Floats, Ints, concatenated, dots
 from ..config import setting
 from ..graph.work import Work
 from ..odometry.attached import ScanPoints
-from . import beam_gaps
 from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_by_key
 
 _TURN = 8.0
 """rad; more than all bearings differ by."""
 _BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
+_STRAIGHT = 0.6
+"""Least linearity of a line through single points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,31 +97,44 @@ class Clouds:
 
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
-    """Average rays in cells, drop lone points, estimate normals and order each cloud by bearing.
-
-    Parameters
-    ----------
-    rays : points of all keyframes of a block, numbered from 0.
-    keyframes : k, number of keyframes.
-    """
-    owner, points, origins = _average_cells(beam_gaps.filled(rays), config.voxel)
+    """Average rays of k keyframes, numbered from 0, in cells, drop lone points, estimate normals and order each cloud by
+    bearing."""
+    rays = filled(rays)
+    cell = cell_number(rays.keyframe, rays.points, config.voxel)
+    one, mean = mean_by_key(cell, np.concatenate([rays.points, rays.origins], axis=1))
     # Points come by owner: to sort one number in runs takes a tenth of the time of two keys.
-    order = np.argsort(_TURN * owner + se2.bearing(points), kind="stable")
-    owner, points, origins = owner[order], points[order], origins[order]
-    lines, normals = _lines(owner, points, origins, config)
-    straight = lines.linearity >= config.linearity
+    order = np.argsort(_TURN * rays.keyframe[one] + se2.bearing(mean[:, :2]), kind="stable")
+    owner, points, origins = rays.keyframe[one[order]], mean[order, :2], mean[order, 2:]
+    lines = _lines(owner, points, config)
+    straight = (lines.linearity >= config.linearity)[:, None]
     kept = lines.neighbours > config.min_neighbours
-    normals = np.where(straight[:, None], normals, 0.0)[kept]
-    centres = np.where(straight[:, None], lines.centers, points)[kept]
-    owner = owner[kept]
-    offsets = np.searchsorted(owner, np.arange(keyframes + 1))
+    normals = np.where(straight, facing(lines.normals, origins - points), 0.0)[kept]
+    centres, owner = np.where(straight, lines.centers, points)[kept], owner[kept]
     return Clouds(
-        offsets.astype(np.intp),
+        np.searchsorted(owner, np.arange(keyframes + 1)).astype(np.intp),
         centres.astype(np.float32, order="F"),
         normals.astype(np.float32, order="F"),
         owner.astype(np.int32),
         lines.normal_variance[kept].astype(np.float32),
     )
+
+
+def facing(normals: Floats, way: Floats) -> Floats:
+    """Return normals (n, 2) turned to the side to which ways (n, 2) lead."""
+    return normals * np.where(dots(normals, way) < 0.0, -1.0, 1.0)[:, None]
+
+
+def _lines(owner: Ints, points: Floats, config: CloudConfig) -> Lines:
+    """Fit lines to all neighbourhoods; a block of clouds shares one tree, in which they lie side by side."""
+    parts = []
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
+    width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
+    for first, last in pairwise(blocks):
+        block = points[first:last]
+        apart = block.copy()
+        apart[:, 0] += owner[first:last] * (width + 2.0 * config.normal_radius)
+        parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
+    return concatenated(parts)
 
 
 def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clouds:
@@ -156,37 +169,75 @@ def make_cloud(
     straight = lines.linearity >= _STRAIGHT
     normals = np.where(straight[:, None], lines.normals, 0.0)
     if viewpoints is not None:
-        away = np.einsum("ni,ni->n", viewpoints - points, normals) < 0.0
-        normals = np.where(away[:, None], -normals, normals)
+        normals = facing(normals, viewpoints - points)
     variance = np.where(straight, lines.normal_variance, 0.0)
     arrays = (lines.centers, normals, np.zeros(len(points), dtype=np.int32), variance)
     return Clouds(np.array([0, len(points)]), *arrays, Work() if work is None else work)
 
 
-_STRAIGHT = 0.6
-"""Least linearity of a line through single points."""
+@dataclass(frozen=True, slots=True)
+class GapPolicy:
+    """Surfaces between the beams of a coarse lidar: points on the chord of two beams that hit one straight surface.
 
-
-def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:
-    """Return owner, mean point and mean origin of each cell of each keyframe."""
-    key = cell_number(rays.keyframe, rays.points, size)
-    one, mean = mean_by_key(key, np.concatenate([rays.points, rays.origins], axis=1))
-    return rays.keyframe[one], mean[:, :2], mean[:, 2:]
-
-
-def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:
-    """Fit lines to all neighbourhoods; return them and normals (p, 2) turned towards the laser.
-
-    A block of clouds shares one tree, in which they lie side by side.
+    With beams a degree apart, hits on a wall are 0.1 m apart at 6 m already, too far for a line. Where three neighbouring beams
+    hit one line, it is taken as the surface between them; elsewhere the space between two beams is unknown.
     """
-    parts = []
-    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
-    width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
-    for first, last in pairwise(blocks):
-        block = points[first:last]
-        apart = block.copy()
-        apart[:, 0] += owner[first:last] * (width + 2.0 * config.normal_radius)
-        parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
-    lines = concatenated(parts)
-    facing = np.einsum("pi,pi->p", lines.normals, origins - points)
-    return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]
+
+    spacing: ClassVar[float] = 0.1
+    """Distance between points, m, that makes lines: a neighbourhood of 0.2 m holds four others."""
+    coarse: ClassVar[float] = 0.0075
+    """Angle between two beams, rad (0.43 degrees), from which on they are coarse. Finer beams that hit far apart graze a
+    surface, whose shape between them is not measured; where they do not graze it they are dense enough."""
+    widest: ClassVar[float] = 0.6
+    """Wider gaps are not filled, m: they may contain niches and doors."""
+    reach: ClassVar[float] = 15.0
+    """Gaps farther away are not filled, m: the memory of rasters grows with the square of a cloud's extent."""
+    noise: ClassVar[float] = 0.04
+    """Largest distance of the next hit from the line through two others, m."""
+    bend: ClassVar[float] = 0.08
+    """The same as a share of its distance along this line."""
+    least_beside: ClassVar[float] = 0.4
+    """Least ratio of neighbouring gaps on one line, at any grazing angle."""
+
+
+def filled(rays: ScanPoints) -> ScanPoints:
+    """Return the points of scans with further ones in the gaps between beams that hit one straight surface."""
+    first = _on_one_line(rays)
+    step = rays.points[first + 1] - rays.points[first]
+    parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / GapPolicy.spacing).astype(np.intp)
+    own = np.repeat(np.arange(len(first)), parts - 1)
+    number = np.arange(len(own)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
+    share = (number / parts[own])[:, None]
+    rows = np.concatenate([np.arange(len(rays.ray)), first[own]])
+    order = np.argsort(rows, kind="stable")
+
+    def column(values: Floats) -> Floats:
+        between = values[first[own]] + share * (values[first[own] + 1] - values[first[own]])
+        return np.concatenate([values, between])[order]
+
+    rows = rows[order]
+    return replace(rays.rows(rows), points=column(rays.points), origins=column(rays.origins))
+
+
+def _on_one_line(rays: ScanPoints) -> Ints:
+    """Return the hits behind which there is a gap to be filled: to the next beam's, on a line with the one before or behind."""
+    step = np.diff(rays.points, axis=0, append=np.nan)
+    gap = np.hypot(step[:, 0], step[:, 1])
+    beside = np.append((np.diff(rays.scan) == 0) & (np.diff(rays.ray) == 1), False)
+    short = beside & (gap < GapPolicy.widest)
+    wide = np.flatnonzero(short & (gap > GapPolicy.spacing))
+    beam = rays.points[wide] - rays.origins[wide]
+    reach = np.hypot(beam[:, 0], beam[:, 1])
+    coarse = np.abs(step[wide, 0] * beam[:, 1] - step[wide, 1] * beam[:, 0]) > GapPolicy.coarse * reach * reach
+    wide = wide[coarse & (reach < GapPolicy.reach)]
+    # There is no gap behind the last hit and none before the first: the last one stands for it.
+    before, after = (short[wide + k] & _continues(step[wide], step[wide + k]) for k in (-1, 1))
+    return np.asarray(wide[before | after])
+
+
+def _continues(step: Floats, other: Floats) -> Bools:
+    """Return which steps (p, 2) from hit to hit continue neighbouring ones (p, 2) in a straight line with similar lengths."""
+    length = np.hypot(step[:, 0], step[:, 1])
+    along = np.sum(step * other, axis=1) / length
+    across = np.abs(step[:, 0] * other[:, 1] - step[:, 1] * other[:, 0]) / length
+    return np.asarray((along > GapPolicy.least_beside * length) & (across < GapPolicy.noise + GapPolicy.bend * along))

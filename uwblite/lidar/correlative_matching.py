@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import maximum_filter
 
 from .. import se2
 from ..arrays import Floats, Ints
@@ -25,7 +26,14 @@ from .clouds import Clouds
 
 Singles = NDArray[np.float32]
 
+Window = tuple[float, float, float]
+"""Half widths of a grid of poses in x and y, m, and heading, rad."""
+
 _CELLS_PER_REACH = 4
+_NEIGHBOURHOOD = 3
+"""Cells across in which a local maximum is the largest."""
+_ROUNDING = 1e-9
+"""Share of a step by which a grid may fall short of its window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,97 +67,57 @@ class SearchResult:
 
 
 def search(
-    target: Clouds,
-    source: Clouds,
-    T_target_source: Floats,
-    window: tuple[float, float, float],
-    config: CorrelativeConfig | None = None,
+    target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig | None = None
 ) -> SearchResult:
-    """Score every pose of a grid around a guess and return the best few.
-
-    Parameters
-    ----------
-    target, source : one cloud each, in its own frame.
-    T_target_source : (3,) centre of the grid; m, m, rad.
-    window : half widths of the grid in x, y, m, and heading, rad.
-
-    Returns
-    -------
-    SearchResult; without candidates where nothing fits at all.
-    """
+    """Score every pose of a grid around a guess (3,) of one cloud in another, and return the best few; none where none fits."""
     config = config or CorrelativeConfig()
     scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
-    found = _peaks(scores, config)
-    poses = np.stack(
-        [
-            T_target_source[0] + shift_x[found[:, 2]] * config.resolution,
-            T_target_source[1] + shift_y[found[:, 1]] * config.resolution,
-            se2.wrap_angle(headings[found[:, 0]]),
-        ],
-        axis=-1,
-    )
-    return SearchResult(poses, scores[tuple(found.T)].astype(np.float64))
+    turn, row, column = found = _peaks(scores, config).T
+    shift = np.stack([shift_x[column], shift_y[row]], axis=1) * config.resolution
+    poses = np.column_stack([T_target_source[:2] + shift, se2.wrap_angle(headings[turn])])
+    return SearchResult(poses, scores[tuple(found)].astype(np.float64))
 
 
 def score_grid(
-    target: Clouds, source: Clouds, T_target_source: Floats, window: tuple[float, float, float], config: CorrelativeConfig
+    target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig
 ) -> tuple[Singles, Floats, Ints, Ints]:
-    """Score every pose of the grid.
-
-    Returns
-    -------
-    scores : (h, r, c) by heading, shift along y, shift along x.
-    headings : (h,) rad.
-    shift_x, shift_y : (c,), (r,) cells from the guess.
-    """
-    half = [int(np.ceil(w / config.resolution - 1e-9)) for w in window[:2]]
-    turns = int(np.ceil(window[2] / config.angle_step - 1e-9))
+    """Return the scores (h, r, c) of a grid by heading, y and x, headings (h,), rad, and shifts in x (c,) and y (r,), cells."""
+    steps = np.array([config.resolution, config.resolution, config.angle_step])
+    wide, tall, turns = np.ceil(np.array(window) / steps - _ROUNDING).astype(np.intp).tolist()
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step
-    shift_x, shift_y = (np.arange(-n, n + 1) for n in half)
+    shift_x, shift_y = np.arange(-wide, wide + 1), np.arange(-tall, tall + 1)
     scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)
-    if target.normals.any() and source.normals.any():
-        raster = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution)
-        field = surface_field(target, raster, config.spread).reshape(raster.shape[0]).T
-        # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
-        shape = tuple(fft.next_fast_len(field.shape[k] + 2 * half[1 - k]) for k in (0, 1))
-        spectrum = fft.fft2(field, shape)
-        normals = source.normals[:, 0] + 1j * source.normals[:, 1]
-        for k, heading in enumerate(headings):
-            image = _source_image(source, normals, heading, T_target_source, raster.origin[0], field.shape, half, shape, config)
-            product = np.conj(fft.fft2(image)) * spectrum
-            product *= np.complex64(np.exp(-1j * heading))
-            rows = fft.ifft(product, axis=0)[shift_y]
-            target.work[SCORES] += image.size
-            scores[k] = fft.ifft(rows, axis=1)[:, shift_x].real
-        scores /= len(source.points)
+    if not (target.normals.any() and source.normals.any()):
+        return scores, headings, shift_x, shift_y
+    raster, reach = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution), np.array([tall, wide])
+    field = surface_field(raster, config.spread).T
+    # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
+    shape = tuple(fft.next_fast_len(int(size)) for size in field.shape + 2 * reach)
+    spectrum, normals = fft.fft2(field, shape), source.normals @ np.array([1.0, 1j])
+    for k, heading in enumerate(headings):
+        place = se2.transform([*T_target_source[:2], heading], source.points) - raster.origin[0]
+        cell = np.floor(place / config.resolution).astype(np.intp)[:, ::-1]
+        inside = np.all((cell >= -reach) & (cell < field.shape + reach), axis=1)
+        product = np.conj(fft.fft2(_image(cell[inside] % shape, normals[inside], shape))) * spectrum
+        product *= np.complex64(np.exp(-1j * heading))
+        target.work[SCORES] += product.size
+        scores[k] = fft.ifft(fft.ifft(product, axis=0)[shift_y], axis=1)[:, shift_x].real
+    scores /= len(source.points)
     return scores, headings, shift_x, shift_y
 
 
-def _source_image(
-    source: Clouds, normals: NDArray[np.complex128], heading: float, guess: Floats, origin: Floats,
-    field: tuple[int, ...], half: list[int], shape: tuple[int, ...], config: CorrelativeConfig,
-) -> NDArray[np.complex64]:
-    """Return the source turned to the heading and put at the guess, its normals summed in the cells of the target's field."""
-    c, s = np.cos(heading), np.sin(heading)
-    x, y = source.points.T
-    column = np.floor((c * x - s * y + guess[0] - origin[0]) / config.resolution).astype(np.intp)
-    row = np.floor((s * x + c * y + guess[1] - origin[1]) / config.resolution).astype(np.intp)
-    inside = (column >= -half[0]) & (column < field[1] + half[0]) & (row >= -half[1]) & (row < field[0] + half[1])
-    cell = (row[inside] % shape[0]) * shape[1] + column[inside] % shape[1]
-    image = np.empty(shape[0] * shape[1], np.complex64)
-    image.real = np.bincount(cell, normals.real[inside], len(image))
-    image.imag = np.bincount(cell, normals.imag[inside], len(image))
-    return image.reshape(shape)
+def _image(cell: Ints, values: NDArray[np.complex128], shape: tuple[int, ...]) -> NDArray[np.complex64]:
+    """Return the sums of values (n,) in their cells (n, 2) of an image of a shape."""
+    number, image = np.ravel_multi_index(tuple(cell.T), shape), np.empty(shape, np.complex64)
+    image.real, image.imag = (
+        np.bincount(number, part, image.size).reshape(shape) for part in (values.real, values.imag)
+    )
+    return image
 
 
 def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     """Return indices (c, 3) of local maxima, the best first, none within the separation of a better one."""
-    around = scores.copy()
-    for axis in range(3):
-        now, before = np.moveaxis(around, axis, 0), np.moveaxis(around.copy(), axis, 0)
-        np.maximum(now[1:], before[:-1], out=now[1:])
-        np.maximum(now[:-1], before[1:], out=now[:-1])
-    best = scores.max(initial=0.0)
+    best, around = scores.max(initial=0.0), maximum_filter(scores, _NEIGHBOURHOOD)
     peaks = np.argwhere((scores == around) & (scores >= config.least_share * best) & (scores > 0.0))
     peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")]
     unit = np.array([config.separation_angle / config.angle_step, *[config.separation / config.resolution] * 2])
@@ -157,4 +125,4 @@ def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     while len(peaks) and len(chosen) < config.candidates:
         chosen.append(peaks[0])
         peaks = peaks[(np.abs(peaks - peaks[0]) >= unit).any(axis=1)]
-    return np.array(chosen, dtype=np.intp).reshape(-1, 3)
+    return np.array(chosen, dtype=np.intp).reshape(-1, scores.ndim)

@@ -6,18 +6,53 @@ sign), the clock offset (the lag at which both agree best) and the wheels' headi
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, renumbered, sigma_of_median
+from ..arrays import Floats, Ints, renumbered
 from ..sensor_log import LaserScans, SensorLog
 
-PAIRS = 1000
-"""Scan pairs matched at most."""
-LEAST_PAIRS = 20
-"""Fewer pairs give no result."""
-_LAGS = np.arange(-1.0, 1.001, 0.02)
+
+@dataclass(frozen=True, slots=True)
+class TurningPolicy:
+    """Pairs of scans, and what is clear of them."""
+
+    pairs: ClassVar[int] = 1000
+    """Scan pairs matched at most."""
+    least_pairs: ClassVar[int] = 20
+    """Fewer pairs give no result, nor half as many clear ones: single pairs of a post or two fit upright and upside down."""
+    least_beams: ClassVar[int] = 30
+    beams: ClassVar[int] = 180
+    """Beams of a scan that are compared, or up to twice as many."""
+    reach: ClassVar[float] = 12.0
+    """Longer readings count as none, m."""
+    apart: ClassVar[float] = 0.5
+    """Time between the scans of a pair, s."""
+    longest: ClassVar[float] = 2.0
+    """Longest time between them, where scans are missing, s."""
+    turn: ClassVar[float] = 0.05
+    """Least turn between them, rad."""
+    view: ClassVar[float] = 0.4
+    """Largest turn between them, and of the match, as a share of the lidar's view."""
+    spot: ClassVar[tuple[float, float]] = (0.15, 0.3)
+    """Largest distance between them, m, and as a multiple of the turn: the robot turns in place."""
+    driving: ClassVar[float] = 1.0
+    """The same where few pairs turn in place, m."""
+    noise: ClassVar[float] = 0.02
+    """Mean difference of ranges that means nothing, m."""
+    least_seen: ClassVar[float] = 0.05
+    """Least share of beams with a reading."""
+    widest: ClassVar[float] = 3.0
+    """Factor by which the wheels' turns may be wrong."""
+    farthest: ClassVar[float] = 0.3
+    """Difference of turns that no pair exceeds, rad."""
+    clearly: ClassVar[float] = 0.7
+    """Share of the difference of turns without a clock offset that it leaves at most."""
+
+
+LAGS = np.linspace(-1.0, 1.0, 101)
 """Clock offsets tried, s."""
 
 
@@ -41,7 +76,6 @@ class Turning:
     """Without it the turns agree clearly less."""
     ratio: float
     """Turn by the laser / turn by the wheels; nan where there are too few clear turns."""
-    ratio_sigma: float
 
     @property
     def agree(self) -> bool:
@@ -54,90 +88,66 @@ class Turning:
         return self.other < 0.5 * self.as_given
 
 
-def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
-    """Compare the turns that laser and wheels see; None where scans, turns in place or scans that show turns are too few.
-
-    Parameters
-    ----------
-    pairs : scan pairs to match at most.
-    """
-    scans = log.scans
+def compare(log: SensorLog, pairs: int = TurningPolicy.pairs) -> Turning | None:
+    """Compare the turns that laser and wheels see between so many pairs of scans at most; None where these are too few."""
+    c, scans = TurningPolicy, log.scans
     assert scans is not None
-    if scans.ranges.shape[1] < 30 or len(scans.stamps) < LEAST_PAIRS:
+    if scans.ranges.shape[1] < c.least_beams or len(scans.stamps) < c.least_pairs:
         return None
     first, second = _turning_pairs(log, scans, pairs)
-    if len(first) < LEAST_PAIRS:
+    if len(first) < c.least_pairs:
         return None
     middle = 0.5 * scans.time_increment * scans.ranges.shape[1]
-    wheels = _wheel_turns(log, scans, first, second, middle + _LAGS)
-    sign = -1.0 if log.mounting.laser_flipped else 1.0
-    both = [_differences(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0)]
-    if any(errors.shape[1] < _LEAST_CLEAR for _, errors in both):
+    wheels = _wheel_turns(log, scans, first, second, middle + LAGS)
+    sign, shift = -1.0 if log.mounting.laser_flipped else 1.0, _laser_shift(log, scans, first, second)
+    both = [_differences(*_matched_turn(scans, first, second, shift * (1.0, s)), wheels, s) for s in (sign, -sign)]
+    if any(2 * errors.shape[1] < c.least_pairs for _, errors in both):
         return None
     as_given, other = misfits = [errors.mean(axis=1) for _, errors in both]
     right = int(other.min() < 0.5 * as_given.min())
     (turn, errors), misfit = both[right], misfits[right]
-    best, centre = int(np.argmin(misfit)), len(_LAGS) // 2
+    best, centre = int(np.argmin(misfit)), len(LAGS) // 2
     gain = errors[centre] - errors[best]
-    clear = misfit[best] < 0.7 * misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
+    clear = misfit[best] < c.clearly * misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
     return Turning(
         len(first), float(np.median(np.abs(wheels[centre]))), float(as_given.min()), float(other.min()),
-        float(misfit[best]), float(_LAGS[best]), bool(clear), *_ratio(turn, wheels[best]),
+        float(misfit[best]), float(LAGS[best]), bool(clear), _ratio(turn, wheels[best]),
     )
 
 
-def _ratio(laser: Floats, wheels: Floats) -> tuple[float, float]:
-    """Return the median ratio of turns and its standard deviation; nan where there are too few clear ones."""
-    clear = np.abs(wheels) > 0.1
-    if clear.sum() < LEAST_PAIRS:
-        return float("nan"), float("nan")
-    ratio = laser[clear] / wheels[clear]
-    return float(np.median(ratio)), sigma_of_median(ratio)
+def _ratio(laser: Floats, wheels: Floats) -> float:
+    """Return the median ratio of turns; nan where there are too few clear ones."""
+    clear = np.abs(wheels) > 2.0 * TurningPolicy.turn
+    return float(np.median(laser[clear] / wheels[clear])) if clear.sum() >= TurningPolicy.least_pairs else float("nan")
 
 
-def _differences(
-    log: SensorLog, scans: LaserScans, first: Ints, second: Ints, wheels: Floats, sign: float
-) -> tuple[Floats, Floats]:
-    """Return turns (p,) by the laser, rad, under one assumption of its mounting, and how far the wheels' are off.
-
-    Returns
-    -------
-    Turns, counter-clockwise, and differences without sign (lags, pairs) of the clearer half of the pairs, rad; at most 0.3.
-    """
-    turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
+def _differences(turn: Floats, sharp: Floats, wheels: Floats, sign: float) -> tuple[Floats, Floats]:
+    """Return turns (p,) by the laser, rad, counter-clockwise, and how far the wheels' are off (lags, pairs), rad, of the
+    clearer half of the pairs."""
     some = sharp > 0.0
     clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else some
     # A wrong track width makes all turns wrong by one factor; they go the same way all the same.
-    by_wheels, seen = wheels[len(wheels) // 2], sign * turn
-    large = clear & (np.abs(by_wheels) > 0.05)
-    factor = float(np.clip(np.median(seen[large] / by_wheels[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
-    return seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3)
-
-
-_LEAST_CLEAR = LEAST_PAIRS // 2
-"""Fewer in the clearer half give no result: where a laser sees only a post or two, single pairs fit upright and upside down."""
-_NOISE = 0.02
-"""Mean difference of ranges that means nothing, m."""
-_LEAST_SEEN = 0.05
-"""Least share of beams with a reading."""
-_WIDEST = 3.0
-"""Factor by which the wheels' turns may be wrong."""
+    by_wheels, seen, widest = wheels[len(wheels) // 2], sign * turn, TurningPolicy.widest
+    large = clear & (np.abs(by_wheels) > TurningPolicy.turn)
+    factor = float(np.clip(np.median(seen[large] / by_wheels[large]), 1.0 / widest, widest)) if large.any() else 1.0
+    return seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), TurningPolicy.farthest)
 
 
 def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints, Ints]:
     """Choose scan pairs about half a second apart between which the robot turns and hardly drives, or drives least."""
-    step = max(1, round(0.5 / max(float(np.median(np.diff(scans.stamps))), 1e-3)))
+    c = TurningPolicy
+    step = max(1, round(c.apart / max(float(np.median(np.diff(scans.stamps))), float(np.finfo(np.float32).eps))))
     first = np.arange(len(scans.stamps) - step)
     second = first + step
-    near = scans.stamps[second] - scans.stamps[first] < 2.0
+    near = scans.stamps[second] - scans.stamps[first] < c.longest
     motion = log.odometry.motion(scans.stamps[first], scans.stamps[second])
     turn, travel = np.abs(motion[:, 2]), np.hypot(motion[:, 0], motion[:, 1])
-    view = abs(scans.angle_increment) * scans.ranges.shape[1]
-    clear = near & (turn > 0.05) & (turn < 0.4 * view)
-    chosen = np.flatnonzero(clear & (travel < 0.15 + 0.3 * turn))
-    if len(chosen) < LEAST_PAIRS:
-        driving = np.flatnonzero(clear & (travel < 1.0))
-        chosen = np.sort(driving[np.argsort(travel[driving] - 0.3 * turn[driving], kind="stable")[: 2 * LEAST_PAIRS]])
+    view, beyond = abs(scans.angle_increment) * scans.ranges.shape[1], travel - c.spot[1] * turn
+    clear = near & (turn > c.turn) & (turn < c.view * view)
+    chosen = np.flatnonzero(clear & (beyond < c.spot[0]))
+    if len(chosen) < c.least_pairs:
+        driving = np.flatnonzero(clear & (travel < c.driving))
+        chosen = np.sort(driving[np.argsort(beyond[driving], kind="stable")[: 2 * c.least_pairs]])
     chosen = chosen[:: max(1, len(chosen) // pairs)]
     return first[chosen], second[chosen]
 
@@ -157,13 +167,9 @@ def _laser_shift(log: SensorLog, scans: LaserScans, first: Ints, second: Ints) -
 
 
 def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -> tuple[Floats, Floats]:
-    """Return the turn (p,) between scans by the shift of beams that matches best, rad, and how clear it is (0..1).
-
-    The first scan is seen from where the laser moved (p, 2), so that only the turn is left; the mean absolute
-    difference of clipped ranges is taken over all turns up to 40 % of the beams.
-    """
-    every = max(1, scans.ranges.shape[1] // 180)
-    reach = min(scans.range_max, 12.0)
+    """Return the turn (p,) between scans by the shift of beams that matches best, rad, and how clear it is (0..1)."""
+    c = TurningPolicy
+    every, reach = max(1, scans.ranges.shape[1] // c.beams), min(scans.range_max, c.reach)
     angles = scans.angles[::every]
     used, one, other = renumbered(first, second)
     profile = np.nan_to_num(scans.ranges[used, ::every].astype(np.float64), nan=reach, posinf=reach)
@@ -171,7 +177,7 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     # Pairs last: each beam of all pairs lies in one piece.
     both = _seen_from(profile[one], angles, shift, reach), profile[other]
     before, after = (np.ascontiguousarray(seen.T, np.float32) for seen in both)
-    beams, most = len(angles), int(0.4 * len(angles))
+    beams, most = len(angles), int(c.view * len(angles))
     turns = range(-most, most + 1)
     cost = np.empty((len(first), len(turns)))
     for column, turn in enumerate(turns):
@@ -180,10 +186,10 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     best = np.clip(np.argmin(cost, axis=1), 1, len(turns) - 2)
     rows = np.arange(len(first))
     left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]
-    fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, 1e-9)
+    fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, np.finfo(np.float32).tiny)
     # Scans without readings fit every turn exactly equally well, and a single wall fits best where it leaves the view.
-    clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
-    seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
+    clear = 1.0 - (middle + c.noise) / (np.median(cost, axis=1) + c.noise)
+    seen = np.mean(profile < reach, axis=1) > c.least_seen
     clear *= seen[one] & seen[other]
     return np.asarray(fine * every * scans.angle_increment, dtype=np.float64), clear
 

@@ -16,27 +16,23 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import expit
 
-from ..arrays import Bools, Floats, Ints, Table, concatenated
+from ..arrays import Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .free_space import free_space
-from .scan_matching import Correspondences, PairFactors, PairPoints, condensed, correspondences, pair_points
-from .visibility import in_free_space, nearest_by_bearing
+from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
+from .visibility import free_ranges, in_free_space, nearest_by_bearing
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectPolicy:
     """Likelihood of surfaces."""
 
-    gate: ClassVar[float] = 0.15
-    """Farthest match, m."""
-    correlation: ClassVar[float] = 8.0
-    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
     outlier: ClassVar[float] = 9.0
     """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
     gap: ClassVar[float] = 0.4
-    """Distance between neighbouring points that ends an object, m."""
+    """Distance between neighbouring points that ends an object, m, and along both axes to where none belongs."""
     moves: ClassVar[float] = 0.03
     """Probability that an object moves by itself, before any was seen: one in a room of thirty things."""
     unlikely: ClassVar[float] = 0.5
@@ -47,16 +43,12 @@ class ObjectPolicy:
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
     fits: ClassVar[float] = 5.0 / 6.0
     """Share of the points in view that match in the true place."""
-    points: ClassVar[int] = 150
-    """Points looked up per pair."""
-    largest: ClassVar[float] = 50.0
-    """Largest exponent; beyond it a probability is one or none to rounding."""
-    aside: ClassVar[float] = 0.4
-    """Distance along both axes at which no point is where it belongs, m; along a wall, points match all the same."""
+    chance: ClassVar[tuple[float, float]] = (1.0, 3.0)
+    """Matches by chance and points beforehand (Laplace's rule of succession)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class _Judged:
     """How the objects of some pairs (e,) agree with their targets."""
 
     static: Floats
@@ -68,31 +60,11 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CloudPairs(Table):
-    """Pairs (e) of clouds of which one is placed in the other."""
-
-    i: Ints
-    """(e,) targets."""
-    j: Ints
-    """(e,) sources."""
-    points: PairPoints
-    """Of the sources."""
-
-    def __len__(self) -> int:
-        return len(self.i)
-
-
-def pairs_of(clouds: Clouds, i: Ints, j: Ints) -> CloudPairs:
-    """Return pairs of targets i (e,) and sources j (e,)."""
-    return CloudPairs(i, j, pair_points(clouds, j, ObjectPolicy.points))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ObjectLikelihood:
     """Clouds whose surfaces are compared with each other."""
 
-    clouds: Clouds
     raster: CloudRasters
+    """Of the clouds."""
     sigma: float
     """Standard deviation of a match, m."""
     chance: Floats
@@ -107,70 +79,58 @@ class ObjectLikelihood:
     """Probability that an object moves by itself."""
 
     @classmethod
-    def of(cls, clouds: Clouds, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
-        """Return that of clouds with their raster, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
-        chance = matched_by_chance(clouds, raster, pairs, poses)
-        nearest = nearest_by_bearing(clouds)
-        free = free_space(np.zeros((len(nearest), 3)), nearest).ranges
-        return cls(clouds, raster, sigma, chance, free, *objects(clouds, ObjectPolicy.gap))
+    def of(cls, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
+        """Return that of a raster's clouds, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
+        free = free_ranges(nearest_by_bearing(raster.clouds))
+        return cls(raster, sigma, matched_by_chance(raster, pairs, poses), free, *objects(raster.clouds, ObjectPolicy.gap))
+
+    @property
+    def clouds(self) -> Clouds:
+        """Those that are compared."""
+        return self.raster.clouds
 
     def learnt(self, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
-        """Return the likelihood with the probability that an object moves as pairs where matching ended, at poses (e, 3), show.
-
-        An empty hall has few things that move and a museum many: what contradicts the place of a cloud counts accordingly.
-        """
+        """Return the likelihood with the probability that an object moves as pairs where matching ended, at poses (e, 3), show:
+        an empty hall has few things that move and a museum many."""
         moved = stood = 0.0
-        for _, judged in self._judged(pairs, poses, ObjectPolicy.gate):
+        for _, judged in self._judged(pairs, poses, PairPolicy.gate):
             moved += float(np.sum(judged.static < ObjectPolicy.unlikely))
             stood += float(np.sum(judged.static > ObjectPolicy.sure))
         return replace(self, moves=(1.0 + moved) / (1.0 / ObjectPolicy.moves + moved + stood))
 
     def log_likelihood(self, pairs: CloudPairs, poses: Floats) -> Floats:
         """Return the log likelihood (e,) of sources at poses (e, 3) by that in unknown space."""
-        return np.concatenate([judged.likelihood for _, judged in self._judged(pairs, poses, ObjectPolicy.gate)])
+        return np.concatenate([judged.likelihood for _, judged in self._judged(pairs, poses, PairPolicy.gate)])
 
     def match(
         self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None
-    ) -> tuple[PairFactors, list[Judged]]:
-        """Return factors of the objects that do not move, and how each pair agrees, at poses (e, 3)."""
+    ) -> tuple[PairFactors, Floats, Floats]:
+        """Return factors of the objects that do not move at poses (e, 3), the log likelihood (e,), and the most it can be."""
         parts, agreement = [], []
         for found, judged in self._judged(pairs, poses, gate, covariance):
             weight = np.take_along_axis(judged.static, self.number[found.row], axis=1) * found.good
-            parts.append(condensed(self.clouds, found, max(gate / 2.0, 3.0 * self.sigma), np.sqrt(weight)))
-            agreement.append(judged)
-        return concatenated(parts), agreement
-
-    def moving(self, pairs: CloudPairs, poses: Floats, covariance: Floats) -> Bools:
-        """Return which points (p,) of all clouds belong to objects of sources that moved by themselves.
-
-        Parameters
-        ----------
-        poses, covariance : (e, 3) T_i_j and (e, 3, 3).
-        """
-        moves = np.zeros(len(self.clouds.points), dtype=bool)
-        for found, judged in self._judged(pairs, poses, ObjectPolicy.gate, covariance):
-            for source, static in zip(pairs.j[found.pairs].tolist(), judged.static, strict=True):
-                rows = slice(int(self.clouds.offsets[source]), int(self.clouds.offsets[source + 1]))
-                own = self.number[rows]
-                moves[rows] |= (static[np.minimum(own, len(static) - 1)] < ObjectPolicy.unlikely) & (own < len(static))
-        return moves
+            scale = max(gate / 2.0, np.sqrt(ObjectPolicy.outlier) * self.sigma)
+            parts.append(condensed(self.clouds, found, scale, np.sqrt(weight)))
+            agreement.append([judged.likelihood, judged.most])
+        likelihood, most = np.hstack(agreement)
+        return concatenated(parts), likelihood, most
 
     def _judged(
         self, pairs: CloudPairs, poses: Floats, gate: float, covariance: Floats | None = None
-    ) -> Iterator[tuple[Correspondences, Judged]]:
+    ) -> Iterator[tuple[Correspondences, _Judged]]:
         """Yield some pairs at a time, what their points match, and how their objects agree."""
-        covariance = np.zeros((len(pairs), 3, 3)) if covariance is None else covariance
-        for found in correspondences(self.clouds, self.raster, pairs.i, poses, pairs.points, gate):
+        for found in correspondences(self.raster, pairs, poses, gate):
             some = found.pairs
-            yield found, self._judge(found, pairs.i[some], poses[some], covariance[some])
+            yield found, self._judge(found, pairs.i[some], poses[some], None if covariance is None else covariance[some])
 
-    def _judge(self, found: Correspondences, i: Ints, pose: Floats, covariance: Floats) -> Judged:
+    def _judge(self, found: Correspondences, i: Ints, pose: Floats, covariance: Floats | None) -> _Judged:
         """Judge the objects of some pairs (e,) at poses (e, 3), whose covariance (e, 3, 3) is left out of the residuals."""
-        c, usable = ObjectPolicy, found.row >= 0
+        c, usable, variance = ObjectPolicy, found.row >= 0, np.full(found.row.shape, self.sigma**2)
         (nx, ny), (rx, ry) = found.normal, found.arm
-        jacobian = np.stack([nx, ny, ny * rx - nx * ry])
-        # What the prior leaves open shifts a surface without making it a thing that moves.
-        variance = self.sigma**2 + np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
+        if covariance is not None:
+            # What the prior leaves open shifts a surface without making it a thing that moves.
+            jacobian = np.stack([nx, ny, ny * rx - nx * ry])
+            variance += np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
         squared = np.square(found.distance) / variance
         cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
         through, in_view = in_free_space(self.free, i, rx + pose[:, :1], ry + pose[:, 1:2])
@@ -183,37 +143,30 @@ class ObjectLikelihood:
         many = int(group.max(initial=0)) + 1
         key = (np.arange(len(i))[:, None] * many + group)[usable]
         chi2, matched, asked = (
-            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / c.correlation
+            np.bincount(key, v[usable], len(i) * many).reshape(len(i), many) / PairPolicy.correlation
             for v in (cost, found.good.astype(np.float64), usable.astype(np.float64))
         )
         # An object longer than any that moves by itself would be several that move together.
         most = np.full((len(i), many), -np.log(self.moves))
         most.reshape(-1)[key] *= np.maximum(self.length[found.row[usable]] / c.long, 1.0)
-        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * c.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
+        gain = np.log(np.maximum(c.fits / chance, 1.0)) + np.log(2.0 * PairPolicy.gate / (np.sqrt(2.0 * np.pi) * self.sigma))
         stays, fixed = np.minimum(gain * matched, most) - 0.5 * chi2, np.log1p(-np.exp(-most))
-        return Judged(
-            1.0 / (1.0 + np.exp(np.clip(-most - stays, -ObjectPolicy.largest, ObjectPolicy.largest))),
-            np.logaddexp(fixed + stays, -most).sum(axis=1),
-            np.logaddexp(fixed + np.minimum(gain * asked, most), -most).sum(axis=1),
+        likelihood, largest = (
+            np.logaddexp(fixed + agree, -most).sum(axis=1) for agree in (stays, np.minimum(gain * asked, most))
         )
+        return _Judged(expit(most + stays), likelihood, largest)
 
 
-def matched_by_chance(clouds: Clouds, raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> Floats:
-    """Return the share (k,) of points of sources that match each target cloud where they do not belong: aside.
-
-    Parameters
-    ----------
-    mean : (e, 3) about where these belong, T_i_j.
-    """
-    matched = np.ones(len(pairs))
-    for x in (-ObjectPolicy.aside, ObjectPolicy.aside):
-        for y in (-ObjectPolicy.aside, ObjectPolicy.aside):
-            aside = mean + np.array([x, y, 0.0])
-            for found in correspondences(clouds, raster, pairs.i, aside, pairs.points, ObjectPolicy.gate):
-                matched[found.pairs] += found.good.sum(axis=1)
-    # One match of three beforehand (Laplace's rule of succession).
-    chance = np.full(len(clouds), 1.0 / 3.0)
-    chance[pairs.i] = matched / (4 * (pairs.points.row >= 0).sum(axis=1) + 3)
+def matched_by_chance(raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> Floats:
+    """Return the share (k,) of points of sources that match each target aside of where they about belong, T_i_j (e, 3)."""
+    beforehand, points = ObjectPolicy.chance
+    sides = ObjectPolicy.gap * np.array([[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    matched = np.full(len(pairs), beforehand)
+    for aside in sides:
+        for found in correspondences(raster, pairs, mean + aside, PairPolicy.gate):
+            matched[found.pairs] += found.good.sum(axis=1)
+    chance = np.full(len(raster.clouds), beforehand / points)
+    chance[pairs.i] = matched / (len(sides) * (pairs.points >= 0).sum(axis=1) + points)
     return chance
 
 

@@ -17,9 +17,8 @@ from .. import se2
 from ..arrays import WIDE, Bools, Floats, Ints, Wides
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .free_space import FreeSpace, seen_beyond
-from .scan_matching import Correspondences, correspondences, pair_points
-from .visibility import VisibilityPolicy
+from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_of
+from .visibility import FreeSpace, seen_beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,84 +31,70 @@ class OverlapPolicy:
     """Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true
     place five of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) /
     (1/2)) = 2.2."""
-    points_at_once: ClassVar[int] = 1 << 16
-    """Points brought into the map's frame at once."""
+    points: ClassVar[int] = 1000
+    """Most points of either cloud that are looked up."""
     surface_cell: ClassVar[float] = 0.5
     """Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
+    facings: ClassVar[int] = 8
+    """Directions in which such a cell may face."""
 
 
-def directional_overlap(
-    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float
-) -> Floats:
+_POINTS_AT_ONCE = 1 << 16
+"""Points brought into the map's frame at once."""
+
+Weights = Callable[[Correspondences, CloudPairs, Floats], Floats]
+"""Gives the weights (e, n) of points of sources that were looked up in their targets at poses (e, 3)."""
+
+
+def directional_overlap(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, gate: float) -> Floats:
     """Return the least share (e,) over all directions of clouds i and j (e,) that matches when laid at poses (e, 3).
 
     With A = sum n n^T over the points looked up and M the same sum over those that match, the share that matches in a
-    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u.
-
-    Parameters
-    ----------
-    limit : most points looked up per cloud. gate : farthest match, m.
+    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u. No match is beyond the gate, m.
     """
-
-    def looked_up(found: Correspondences, *_: Ints | Floats) -> Floats:
-        return (found.row >= 0).astype(np.float64)
-
-    def good(found: Correspondences, *_: Ints | Floats) -> Floats:
-        return found.good.astype(np.float64)
-
-    asked, matched = _both_ways(clouds, raster, i, j, T_i_j, limit, gate, looked_up, good)
+    asked, matched = _both_ways(
+        raster, i, j, T_i_j, gate, lambda found, *_: (found.row >= 0).astype(float), lambda found, *_: found.good.astype(float)
+    )
     noise = OverlapPolicy.noise * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
     root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))
     return np.asarray(np.linalg.eigvalsh(root @ matched @ np.swapaxes(root, 1, 2))[:, 0])
 
 
 def net_overlap(
-    clouds: Clouds, raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, limit: int,
-    gate: float, spacing: float,
+    raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, gate: float
 ) -> Floats:
-    """Return the net matching surface (e,), m, of clouds i and j (e,) at relative poses (e, 3), counted both ways.
+    """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), counted both ways.
 
-    Two stretches of a recording that overlap share only a part of their surfaces: the share of all points that match shows how
-    long they overlap, not whether the place is right. Points that the other cloud cannot have seen do not count; each point
-    with a match counts for the place, each in view without a match counts against it.
+    Of two stretches of a recording, the share of all points that match shows how long they overlap, not whether the place is
+    right. Each point with a match counts for the place, each in view without a match against it, and others do not count.
 
     Parameters
     ----------
-    free : observed free space of each cloud; None = all points count as in view.
-    limit : most points looked up per cloud. gate : farthest match, m.
-    spacing : distance between neighbouring points of a cloud, m.
+    free : observed free space of each cloud; None = all points count as in view. gate : farthest match, m.
     """
 
-    def weight(found: Correspondences, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
+    def weight(found: Correspondences, pairs: CloudPairs, T_i_j: Floats) -> Floats:
         missed = (found.row >= 0) & ~found.good
         if free is not None:
-            missed &= _in_view(clouds, free, i, T_i_j, found)
+            missed &= _in_view(raster.clouds, free, pairs.i, T_i_j, found)
         # The points looked up stand for those left out.
         asked = np.maximum((found.row >= 0).sum(axis=1), 1)
-        return np.asarray((found.good - OverlapPolicy.against * missed) * (clouds.counts[j] / asked)[:, None])
+        return np.asarray((found.good - OverlapPolicy.against * missed) * (raster.clouds.counts[pairs.j] / asked)[:, None])
 
-    (both,) = _both_ways(clouds, raster, i, j, T_i_j, limit, gate, weight)
-    return np.asarray(spacing * np.linalg.eigvalsh(both)[:, 0])
+    (both,) = _both_ways(raster, i, j, T_i_j, gate, weight)
+    return np.asarray(np.linalg.eigvalsh(both)[:, 0])
 
 
-def _both_ways(
-    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float,
-    *weights: Callable[[Correspondences, Ints, Ints, Floats], Floats],
-) -> Floats:
-    """Return for each kind of weights the sums w n n^T (k, e, 2, 2), in the frames of i, over the points of both clouds.
-
-    Parameters
-    ----------
-    weights : give the weights (e, n) of points of clouds j (e,) that were looked up in clouds i (e,) at poses (e, 3).
-    """
+def _both_ways(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, gate: float, *weights: Weights) -> Floats:
+    """Return for each kind of weights the sums w n n^T (k, e, 2, 2), in the frames of i, over the points of both clouds."""
 
     def one_way(i: Ints, j: Ints, T_i_j: Floats) -> Floats:
-        sums = np.zeros((len(weights), len(i), 2, 2))
-        for found in correspondences(clouds, raster, i, T_i_j, pair_points(clouds, j, limit), gate):
+        sums, pairs = np.zeros((len(weights), len(i), 2, 2)), pairs_of(raster.clouds, i, j, OverlapPolicy.points)
+        for found in correspondences(raster, pairs, T_i_j, gate):
             some = found.pairs
-            normals = se2.rotate(T_i_j[some, 2, None], clouds.normals[found.row])
+            normals = se2.rotate(T_i_j[some, 2, None], raster.clouds.normals[found.row])
             for own, weight in zip(sums, weights, strict=True):
-                own[some] = np.einsum("en,enk,enl->ekl", weight(found, i[some], j[some], T_i_j[some]), normals, normals)
+                own[some] = np.einsum("en,enk,enl->ekl", weight(found, pairs.rows(some), T_i_j[some]), normals, normals)
         return sums
 
     turn = se2.rotation(T_i_j[:, 2])[:, :2, :2]
@@ -119,20 +104,18 @@ def _both_ways(
 def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, found: Correspondences) -> Bools:
     """Return which points (e, n) were in view from the places at which clouds i (e,) were seen."""
     points = se2.transform(T_i_j[:, None, :], clouds.points[found.row])
-    seen = [seen_beyond(free[k], p, VisibilityPolicy.margin)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)]
-    return np.array(seen, dtype=bool)
+    return np.array([seen_beyond(free[k], p)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
 
 
 def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
-    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
-    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
+    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of some facings."""
+    usable, many = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1)), OverlapPolicy.facings
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
-    for first in range(0, len(usable), OverlapPolicy.points_at_once):
-        part = slice(first, first + OverlapPolicy.points_at_once)
-        owner = clouds.owner[usable[part]]
-        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / OverlapPolicy.surface_cell)
-        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
-        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.intp) % 8
+    for part in _parts(len(usable)):
+        rows, owner = usable[part], clouds.owner[usable[part]]
+        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[rows]) / OverlapPolicy.surface_cell)
+        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[rows]))
+        facing[part] = np.floor(bearing * (many / (2.0 * np.pi)) + 0.5).astype(np.intp) % many
     cell -= cell.min(axis=0, initial=0)
     wide = int(cell[:, 1].max(initial=0)) + 1
     row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
@@ -143,12 +126,17 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     return seen
 
 
+def _parts(many: int) -> Iterator[slice]:
+    """Yield rows a bounded number at a time, one part at least."""
+    for first in range(0, max(many, 1), _POINTS_AT_ONCE):
+        yield slice(first, first + _POINTS_AT_ONCE)
+
+
 def _seen_cells(
     owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
 ) -> Iterator[tuple[Wides, Wides]]:
     """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
-    for first in range(0, max(len(owner), 1), OverlapPolicy.points_at_once):
-        part = slice(first, first + OverlapPolicy.points_at_once)
-        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * 8 + facing[part]
+    for part in _parts(len(owner)):
+        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * OverlapPolicy.facings + facing[part]
         many = int(key.max(initial=0)) + 1
         yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)

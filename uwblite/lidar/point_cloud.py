@@ -38,11 +38,8 @@ def voxel_filter(points: ArrayLike, size: float) -> Floats:
 
 
 def statistical_outlier_filter(points: ArrayLike, neighbours: int, std_ratio: float) -> Bools:
-    """Return which points (n, 2), m, are not unusually far from their nearest neighbours; a small cloud uses all its points.
-
-    A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
-    that distance over the whole cloud.
-    """
+    """Return which points (n, 2), m, have a mean distance to their nearest neighbours of at most mean + std_ratio * standard
+    deviation of that distance over the whole cloud; a small cloud uses all its points."""
     points = as_points(points)
     k = min(neighbours, len(points) - 1)
     if k < 1:
@@ -70,12 +67,7 @@ def cell_number(owner: Ints, points: Floats, size: float) -> Wides:
 
 
 def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
-    """Average the rows of values (p, v) that share a key (p,).
-
-    Returns
-    -------
-    One row of each key (m,), by key, and the means (m, v).
-    """
+    """Return one row of each key (m,), by key, and the means (m, v) of the values (p, v) that share a key (p,)."""
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     if not len(first):
@@ -115,10 +107,7 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
 
     Parameters
     ----------
-    points : (n, 2), m.
-    tree : kd-tree of the points.
-    radius : of the neighbourhood, m.
-    min_neighbours : other points a neighbourhood needs to give a line.
+    points : (n, 2), m, and their tree. radius : of the neighbourhood, m. min_neighbours : others that it needs to give a line.
     """
     n = len(points)
     i, j = np.ascontiguousarray(tree.query_pairs(radius, output_type="ndarray").T)

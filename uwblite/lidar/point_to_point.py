@@ -1,6 +1,6 @@
 """Iterative closest point as in the paper: nearest neighbours within a fixed distance, motion in closed form."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -59,16 +59,13 @@ class Registration:
 
 
 def align(
-    target: cKDTree | ArrayLike,
-    source: ArrayLike,
-    T_target_source: ArrayLike = (0.0, 0.0, 0.0),
+    target: cKDTree | ArrayLike, source: ArrayLike, T_target_source: ArrayLike = (0.0, 0.0, 0.0),
     config: IcpConfig | None = None,
 ) -> Registration:
     """Find the pose of the source in the target's frame from an initial guess.
 
-    The motion that minimises the squared distances of matched points is known in closed form: with a, b these points
-    less their means, theta = atan2(sum a x b, sum a . b), and t follows from the means (the planar case of Umeyama's
-    solution).
+    The motion that minimises the squared distances of matched points is known in closed form (the planar case of Umeyama's
+    solution), see se2.align.
 
     Parameters
     ----------
@@ -86,7 +83,7 @@ def align(
     require_finite(pose, "T_target_source")
     for name, size in (("target", target.n), ("source", len(source))):
         if size < config.min_matches:
-            return _failure(pose, f"the {name} has {size} points, fewer than {config.min_matches}", source)
+            return _failure(pose, f"the {name} has {size} points, fewer than {config.min_matches}")
     bound = np.nextafter(config.max_correspondence_distance, np.inf)
     small, iteration = False, 0
     while not small and iteration < config.max_iterations:
@@ -95,59 +92,41 @@ def align(
         matched = index < target.n
         if matched.sum() < config.min_matches:
             reason = f"no overlap: {matched.sum()} of {len(source)} source points have a partner"
-            return _failure(_wrapped(pose), reason, source, iteration, int(matched.sum()))
+            pose[2] = se2.wrap_angle(pose[2])
+            return replace(_failure(pose, reason), iterations=iteration, overlap=float(matched.mean()))
         near, far = source[matched], target.data[index[matched]]
-        new = se2.align(near, far)
-        small = _small(np.append(new[:2] - pose[:2], se2.wrap_angle(new[2] - pose[2])), config)
-        pose = new
-    return _result(target, source, near, far, _wrapped(pose), small, iteration, config)
+        before, pose = pose, se2.align(near, far)
+        way, turn = np.hypot(*(pose - before)[:2]), abs(se2.wrap_angle(pose[2] - before[2]))
+        small = bool(way <= config.tolerance_translation and turn <= config.tolerance_rotation)
+    pose[2] = se2.wrap_angle(pose[2])
+    fitness, converged, reason = fitness_score(target, source, pose), small, "step below tolerance"
+    if not small:
+        reason = f"stopped after {iteration} iterations, still moving"
+    elif fitness > config.fitness_sigma:
+        converged, reason = False, f"fitness score {fitness:.3g} m2 above {config.fitness_sigma:.3g} m2"
+    square = float(np.sum((se2.transform(pose, near) - far) ** 2))
+    variance = max(square / max(2 * len(near) - len(pose), 1), config.min_sigma**2)
+    return Registration(
+        T_target_source=pose, converged=converged, reason=reason, iterations=iteration,
+        overlap=len(near) / len(source), rmse=float(np.sqrt(square / len(near))), fitness=fitness,
+        information=_information(near) / variance,
+    )
 
 
 def fitness_score(target: cKDTree, points: Floats, T_target_source: Floats) -> float:
     """Return the mean squared distance, m^2, from source points (m, 2) to the nearest target points; inf without any."""
     if target.n == 0 or len(points) == 0:
         return float("inf")
-    distance = target.query(se2.transform(T_target_source, points))[0]
-    return float(np.mean(distance**2))
+    return float(np.mean(target.query(se2.transform(T_target_source, points))[0] ** 2))
 
 
-def _failure(pose: Floats, reason: str, source: Floats, iterations: int = 0, matches: int = 0) -> Registration:
-    return Registration(
-        T_target_source=pose, converged=False, reason=reason, iterations=iterations,
-        overlap=matches / max(len(source), 1), rmse=float("inf"), fitness=float("inf"), information=np.zeros((3, 3)),
-    )
-
-
-def _small(step: Floats, config: IcpConfig) -> bool:
-    return bool(np.hypot(step[0], step[1]) <= config.tolerance_translation and abs(step[2]) <= config.tolerance_rotation)
-
-
-def _wrapped(pose: Floats) -> Floats:
-    return np.append(pose[:2], se2.wrap_angle(pose[2]))
-
-
-def _result(
-    target: cKDTree, source: Floats, near: Floats, far: Floats, pose: Floats, small: bool, iterations: int, config: IcpConfig
-) -> Registration:
-    """Collect the result of matched points near and far (m, 2)."""
-    fitness = fitness_score(target, source, pose)
-    converged, reason = small, "step below tolerance"
-    if not small:
-        reason = f"stopped after {iterations} iterations, still moving"
-    elif fitness > config.fitness_sigma:
-        converged, reason = False, f"fitness score {fitness:.3g} m2 above {config.fitness_sigma:.3g} m2"
-    square = float(np.sum((se2.transform(pose, near) - far) ** 2))
-    variance = max(square / max(2 * len(near) - 3, 1), config.min_sigma**2)
-    return Registration(
-        T_target_source=pose, converged=converged, reason=reason, iterations=iterations,
-        overlap=len(near) / len(source), rmse=float(np.sqrt(square / len(near))), fitness=fitness,
-        information=_information(near) / variance,
-    )
+def _failure(pose: Floats, reason: str) -> Registration:
+    return Registration(pose, False, reason, 0, 0.0, float("inf"), float("inf"), np.zeros((len(pose), len(pose))))
 
 
 def _information(points: Floats) -> Floats:
     """Return sum J^T J (3, 3) over source points (m, 2); by e = between(measured, true), J = R [1, perp(s)] and R^T R = 1."""
-    jacobian = np.zeros((len(points), 2, 3))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = -points[:, 1], points[:, 0]
-    return np.asarray(np.einsum("nij,nik->jk", jacobian, jacobian))
+    x, y = points.T
+    one, zero = np.ones(len(points)), np.zeros(len(points))
+    jacobian = np.concatenate([np.column_stack([one, zero, -y]), np.column_stack([zero, one, x])])
+    return np.asarray(jacobian.T @ jacobian)

@@ -2,71 +2,123 @@
 
 All rays of a keyframe on a wall share its normal, and their equations are combinations of four figures of a ray: 1, the place
 along the wall where it should end, the cosine of incidence, and the residual. So ten weighted sums of products replace any
-number of rays, exactly (as the point clusters of BALM: Z. Liu, X. Liu, F. Zhang, IEEE Transactions on Robotics 2023).
+number of rays, exactly (as the point clusters of BALM: Z. Liu, X. Liu, F. Zhang, IEEE Transactions on Robotics 2023). On a
+column the figures are six. Derivatives are taken where the ray should have ended: noise along an oblique ray is both in its
+residual and in its lever arm, and the product of both would turn every scan, along a wall always to the same side.
+
+Residuals also show the noise: its size, and the correlation of residuals in one place, since walls are not straight, columns
+not round, and errors of neighbouring rays are correlated: the variance of the sum of n residuals is then n times a factor, the
+design effect (L. Kish, Survey sampling, 1965), and n rays have the information of n divided by that factor.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Floats, Ints
-from .columns import to_circle
-from .ray_noise import RayNoise, learnt_noise
-from .surface_rays import ROUGHNESS, MeasuredSurfaces, SurfaceRays, Surfaces, in_map
+from ..arrays import Bools, Floats, Ints, spread
+from .surface_rays import MeasuredSurfaces, RayNoise, ShapePolicy, SurfaceRays, Surfaces, to_circle
 
-_LEAST = 0.05
-"""Least cosine of incidence; smaller ones are replaced by it."""
-_PIECE, _SECTOR = 1.0, np.pi / 4.0
-"""Length of a place on a wall, m, and angle of one on a column, rad, within which residuals may be correlated."""
+
+@dataclass(frozen=True, slots=True)
+class RayPolicy:
+    """Linearisation and noise of rays."""
+
+    incidence: ClassVar[float] = 0.05
+    """Least cosine of incidence; smaller ones are replaced by it."""
+    piece: ClassVar[float] = 1.0
+    """Length of a place on a wall, m, within which residuals may be correlated."""
+    sector: ClassVar[float] = np.pi / 4.0
+    """The same of one on a column, rad."""
+    fewest: ClassVar[int] = 200
+    """Least number of rays from which their noise is learnt."""
+    clip: ClassVar[float] = 3.0
+    """Standard deviations at which residuals are clipped: outliers give no information about the noise of inliers."""
+    places: ClassVar[int] = 5
+    """Least number of places of a surface from which the correlation of its residuals is learnt."""
+
+
+_POSE, _SURFACE = slice(0, 3), slice(3, 7)
+"""Derivatives among those of a ray: by x, y, theta of the keyframe, and by the step of Surfaces.moved; last, the residual."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RayEquations:
-    """Whitened residuals of rays and their derivatives."""
+class LinearRays:
+    """Rays (m) of keyframes on surfaces, in groups (g) of one keyframe on one surface, linearised."""
 
-    residual: Floats
-    """(m,)."""
-    by_pose: Floats
-    """(m, 3) by x, y, theta of the keyframe."""
-    by_surface: Floats
-    """(m, 4) by the step of Surfaces.moved."""
+    figures: Floats
+    """(f, m) of which all derivatives are combinations; the last one is the residual, m."""
+    combined: Floats
+    """(g, 8, f) or (8, f) derivatives by the pose, by the surface, and the residual, by the figures."""
+    information: Floats
+    """(m,) 1/m^2, of the residual by data sheets."""
+    place: Floats
+    """(m,) where on its surface each ray ends, in places."""
+
+    def products(self, first: Ints, weight: Floats) -> Floats:
+        """Return for each group, from its first ray (g,) on, the weighted sums (g, 8, 8) of products of what is combined."""
+        many = len(self.figures)
+        products = np.empty((len(first), many, many))
+        for a in range(many):
+            weighted = weight * self.figures[a]
+            for b in range(a, many):
+                products[:, a, b] = products[:, b, a] = np.add.reduceat(weighted * self.figures[b], first)
+        return np.asarray(self.combined @ products @ np.swapaxes(self.combined, -1, -2))
 
 
-def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayEquations:
-    """Linearise rays at their surfaces.
+def linearized(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats) -> LinearRays:
+    """Linearise rays, all on walls or all on columns, at their surfaces.
 
     Parameters
     ----------
-    sensors : (k, 3) frames of the clouds in the map, where the laser's mounting and clock put them. poses : (k, 3) of the
-        base, about which these turn.
+    first : (g,) first ray of each group. sensors : (k, 3) frames of the clouds in the map, where the laser's mounting and clock
+        put them. poses : (k, 3) of the base, about which these turn.
     """
-    at, direction = in_map(rays, sensors)
-    at -= surfaces.offset[rays.surface, None] * direction
-    away, curved = at - surfaces.place.take(rays.surface, axis=0), surfaces.round[rays.surface]
-    normal, shift = surfaces.normal.take(rays.surface, axis=0), np.zeros(len(away))
-    round_ones = np.flatnonzero(curved)
-    if len(round_ones):
-        radius = surfaces.radius[rays.surface[round_ones]]
-        shift[round_ones], normal[round_ones], _ = to_circle(away[round_ones], direction[round_ones], radius)
-    incidence = (normal * direction).sum(axis=1)
-    incidence = np.where(np.abs(incidence) > _LEAST, incidence, -_LEAST)
-    residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
-    ahead = -(residual / incidence)[:, None] * direction
-    arm, away = at + ahead - poses[:, :2].take(rays.keyframe, axis=0), away + ahead
-    root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
-    by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-    turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
-    by_surface = np.column_stack(
-        [
-            np.where(curved, -normal[:, 0], turn),
-            np.where(curved, -normal[:, 1], -1.0),
-            -incidence,
-            np.where(curved, -1.0, 0.0),
-        ]
-    )
-    return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
+    if surfaces.round[rays.surface[0]]:
+        return _at_columns(rays, surfaces, sensors, poses)
+    return _at_walls(rays, first, surfaces, sensors, poses)
+
+
+def _at_columns(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> LinearRays:
+    column, (at, direction) = surfaces.rows(rays.surface), rays.in_map(sensors)
+    at -= column.offset[:, None] * direction
+    shift, normal, incidence = to_circle(at - column.place, direction, column.radius)
+    incidence = _bounded(incidence)
+    (nx, ny), (x, y) = normal.T, (at + shift[:, None] * direction - poses[:, :2].take(rays.keyframe, axis=0)).T
+    # In the order of the derivatives by a column: its place, offset and radius.
+    figures = np.stack([nx, ny, incidence, np.ones(len(nx)), ny * x - nx * y, -shift * incidence])
+    unit = np.eye(len(figures))
+    combined = np.concatenate([unit[[0, 1, -2]], -unit[:-2], unit[-1:]])
+    place = se2.bearing(at - column.place) / RayPolicy.sector
+    return LinearRays(figures, combined, _information(rays, incidence), place)
+
+
+def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats, poses: Floats) -> LinearRays:
+    wall, keyframe = surfaces.rows(rays.surface[first]), rays.keyframe[first]
+    sensor, (nx, ny) = sensors[keyframe], wall.normal.T
+    (c, s), (x, y) = se2.cos_sin(sensor[:, 2]), (sensor[:, :2] - wall.place).T
+    before, beside = nx * x + ny * y, nx * y - ny * x
+    of = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(rays.keyframe))))
+    mx, my = (c * nx + s * ny).take(of), (c * ny - s * nx).take(of)
+    (x, y), (u, v) = (v.T.astype(np.float64, order="C") for v in (rays.points, rays.directions))
+    facing, sideways, offset = mx * u + my * v, mx * v - my * u, wall.offset.take(of)
+    residual = mx * x + my * y + before.take(of) - offset * facing
+    incidence, along = _bounded(facing), mx * y - my * x - offset * sideways
+    figures = np.stack([np.ones(len(of)), along - residual / incidence * sideways, incidence, residual])
+    arm, nothing = (sensors - poses)[keyframe], np.zeros(len(first))
+    shared = np.column_stack([nx, ny, ny * arm[:, 0] - nx * arm[:, 1], beside, nothing - 1.0, nothing, nothing, nothing])
+    others = np.array([[0, 0, -1, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, -1, 0, 0], [0, 0, 0, 0, 0, 0, 0, 1]], dtype=np.float64)
+    combined = np.stack(np.broadcast_arrays(shared, *others), axis=-1)
+    return LinearRays(figures, combined, _information(rays, incidence), (along + beside.take(of)) / RayPolicy.piece)
+
+
+def _bounded(incidence: Floats) -> Floats:
+    return np.where(np.abs(incidence) > RayPolicy.incidence, incidence, -RayPolicy.incidence)
+
+
+def _information(rays: SurfaceRays, incidence: Floats) -> Floats:
+    return np.asarray(1.0 / ((rays.sigma.astype(np.float64) * incidence) ** 2 + ShapePolicy.roughness**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,131 +142,66 @@ class RaySums:
 
 
 def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> RaySums:
-    """Return the normal equations of rays, robustly weighted, in standard deviations of the noise that was learnt.
-
-    Parameters
-    ----------
-    sensors, poses : see linearized. kernel : width of the Geman-McClure kernel, standard deviations.
-    """
-    k, s = len(poses), len(found.surfaces.facing)
-    of_poses, of_surfaces = np.zeros((k, 3, 4)), np.zeros((s, 4, 5))
-    across, where = [np.zeros((0, 4, 3))], [np.zeros((2, 0), dtype=np.intp)]
+    """Return the normal equations of rays, robustly weighted by a Geman-McClure kernel of a width, in standard deviations of
+    the noise that was learnt; for the parameters see linearized."""
+    k, s, end = len(poses), len(found.surfaces.facing), _SURFACE.stop
+    of_poses, of_surfaces = np.zeros((k, end + 1, end + 1)), np.zeros((s, end + 1, end + 1))
+    across, where = [np.zeros((0, end + 1, end + 1))], [np.zeros((2, 0), dtype=np.intp)]
     for rays in found.rays.in_parts(found.surfaces):
         first = _groups(rays)
-        keyframe, surface = pair = np.stack([rays.keyframe[first], rays.surface[first]]).astype(np.intp)
-        products = _products(rays, first, found, sensors, poses, kernel)
-        np.add.at(of_poses, keyframe, products[:, :3, [0, 1, 2, 7]])
-        np.add.at(of_surfaces, surface, products[:, 3:7, 3:])
-        across.append(products[:, 3:7, :3])
+        pair = np.stack([rays.keyframe[first], rays.surface[first]]).astype(np.intp)
+        lines = linearized(rays, first, found.surfaces, sensors, poses)
+        share, narrow = found.noise.weights(bool(found.surfaces.round[rays.surface[0]]), kernel)
+        weight = share * lines.information / (1.0 + lines.figures[-1] ** 2 * lines.information * narrow) ** 2
+        products = lines.products(first, weight)
+        for sums, own in zip((of_poses, of_surfaces), pair, strict=True):
+            np.add.at(sums, own, products)
+        across.append(products)
         where.append(pair)
     keyframe, surface = np.concatenate(where, axis=1)
-    of_both = np.concatenate(across)
     return RaySums(
-        of_poses[:, :, :3], of_poses[:, :, 3], of_surfaces[:, :, :4], of_surfaces[:, :, 4], keyframe, surface, of_both
+        of_poses[:, _POSE, _POSE], of_poses[:, _POSE, -1], of_surfaces[:, _SURFACE, _SURFACE], of_surfaces[:, _SURFACE, -1],
+        keyframe, surface, np.concatenate(across)[:, _SURFACE, _POSE],
     )
-
-
-def _products(rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float) -> Floats:
-    """Return for each group the sums (g, 8, 8) of products of derivatives by the pose (3), by the surface (4), and residual."""
-    sums = _sums_on_columns if found.surfaces.round[rays.surface[0]] else _sums_on_walls
-    return sums(rays, first, found, sensors, poses, kernel)
 
 
 def _groups(rays: SurfaceRays) -> Ints:
     """Return the first ray (g,) of each keyframe on each surface."""
-    new = np.ones(len(rays.keyframe), dtype=bool)
-    new[1:] = (np.diff(rays.keyframe) != 0) | (np.diff(rays.surface) != 0)
-    return np.flatnonzero(new)
-
-
-def _sums_on_columns(
-    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
-) -> Floats:
-    lines, (share, narrow) = linearized(rays, found.surfaces, sensors, poses), found.noise.weights(True, kernel)
-    rows = np.column_stack([lines.by_pose, lines.by_surface, lines.residual])
-    rows *= (np.sqrt(share) / (1.0 + lines.residual**2 * narrow))[:, None]
-    products = np.empty((len(first), 8, 8))
-    for a in range(8):
-        products[:, a, a:] = products[:, a:, a] = np.add.reduceat(rows[:, a:] * rows[:, a, None], first, axis=0)
-    return products
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _AtWalls:
-    """Rays (m,) at their walls, and the walls as their keyframes (g,) see them."""
-
-    of: Ints
-    """(m,) group of each ray."""
-    normal: Floats
-    """(g, 2) in the map."""
-    beside: Floats
-    """(g,) m, where along the wall the lidar stands, from the wall's own point."""
-    along: Floats
-    """(m,) m, where along the wall the ray ended, from the lidar."""
-    sideways: Floats
-    """(m,) of the ray's direction, along the wall."""
-    incidence: Floats
-    """(m,) cosine of incidence, with a lower bound."""
-    residual: Floats
-    """(m,) m."""
-    information: Floats
-    """(m,) 1/m^2, of the residual by data sheets."""
-
-
-def _at_walls(rays: SurfaceRays, first: Ints, surfaces: Surfaces, sensors: Floats) -> _AtWalls:
-    """Return rays at their walls; a wall's direction is its normal turned left."""
-    wall, sensor = rays.surface[first], sensors[rays.keyframe[first]]
-    normal, (c, s) = surfaces.normal[wall], se2.cos_sin(sensor[:, 2])
-    away = sensor[:, :2] - surfaces.place[wall]
-    before = normal[:, 0] * away[:, 0] + normal[:, 1] * away[:, 1]
-    beside = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
-    of = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(rays.keyframe))))
-    nx, ny = (c * normal[:, 0] + s * normal[:, 1]).take(of), (c * normal[:, 1] - s * normal[:, 0]).take(of)
-    (x, y), (u, v) = (v.T.astype(np.float64, order="C") for v in (rays.points, rays.directions))
-    facing, sideways = nx * u + ny * v, nx * v - ny * u
-    offset = surfaces.offset[wall].take(of)
-    residual = nx * x + ny * y + before.take(of) - offset * facing
-    incidence = np.where(np.abs(facing) > _LEAST, facing, -_LEAST)
-    information = 1.0 / ((rays.sigma.astype(np.float64) * incidence) ** 2 + ROUGHNESS**2)
-    return _AtWalls(of, normal, beside, nx * y - ny * x - offset * sideways, sideways, incidence, residual, information)
-
-
-def _sums_on_walls(
-    rays: SurfaceRays, first: Ints, found: MeasuredSurfaces, sensors: Floats, poses: Floats, kernel: float
-) -> Floats:
-    on, (share, narrow) = _at_walls(rays, first, found.surfaces, sensors), found.noise.weights(False, kernel)
-    weight = share * on.information / (1.0 + on.residual**2 * on.information * narrow) ** 2
-    should_end = on.along - on.residual / on.incidence * on.sideways
-    parts = np.stack([np.ones(len(weight)), should_end, on.incidence, on.residual])
-    products = np.empty((len(first), 4, 4))
-    for a in range(4):
-        weighted = weight * parts[a]
-        for b in range(a, 4):
-            products[:, a, b] = products[:, b, a] = np.add.reduceat(weighted * parts[b], first)
-    arm = (sensors - poses)[rays.keyframe[first], :2]
-    by_part = np.zeros((len(first), 8, 4))
-    by_part[:, :2, 0] = on.normal
-    by_part[:, 2, 0] = on.normal[:, 1] * arm[:, 0] - on.normal[:, 0] * arm[:, 1]
-    by_part[:, 3, 0], by_part[:, 4, 0] = on.beside, -1.0
-    by_part[:, 2, 1], by_part[:, 3, 1], by_part[:, 5, 2], by_part[:, 7, 3] = -1.0, 1.0, -1.0, 1.0
-    return np.asarray(by_part @ products @ by_part.transpose(0, 2, 1))
+    return np.flatnonzero(np.diff(np.stack([rays.keyframe, rays.surface]), axis=1, prepend=-1).any(axis=0))
 
 
 def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayNoise:
     """Learn the noise of rays from their residuals; for the parameters see linearized."""
-    shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts(surfaces)]
-    residual, place = (np.concatenate(part) for part in zip(*shown, strict=True))
-    return learnt_noise(residual, place, rays.surface, surfaces.round)
+    residual, place = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.int32)]
+    for some in rays.in_parts(surfaces):
+        lines = linearized(some, _groups(some), surfaces, sensors, poses)
+        residual.append((lines.figures[-1] * np.sqrt(lines.information)).astype(np.float32))
+        place.append(np.floor(lines.place).astype(np.int32))
+    return learnt_noise(np.concatenate(residual), np.concatenate(place), rays.surface, surfaces.round)
 
 
-def _shown(
-    rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return the residuals (m,) of rays in standard deviations, and where on its surface each ends."""
-    if surfaces.round[rays.surface[0]]:
-        away = in_map(rays, sensors)[0] - surfaces.place[rays.surface]
-        place, residual = se2.bearing(away) / _SECTOR, linearized(rays, surfaces, sensors, poses).residual
-    else:
-        on = _at_walls(rays, _groups(rays), surfaces, sensors)
-        place, residual = (on.along + on.beside.take(on.of)) / _PIECE, on.residual * np.sqrt(on.information)
-    return residual.astype(np.float32), np.floor(place).astype(np.int32)
+def learnt_noise(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> RayNoise:
+    """Learn the noise of rays from their residuals (m,), in standard deviations by data sheets, the place and the surface (m,)
+    of each, and which surfaces (s,) are columns."""
+    c = RayPolicy
+    ratio = max(spread(residual), ShapePolicy.quietest) if len(residual) >= c.fewest else 1.0
+    clipped = np.where(np.abs(residual) < c.clip * ratio, residual / ratio, 0.0)
+    return RayNoise(ratio, _design_effects(clipped, place, surface, curved))
+
+
+def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> Floats:
+    """Return the ratios (2,) of the squared sums of residuals over places to their sums of squares, of walls and of columns."""
+    first = int(place.min(initial=0))
+    many = int(place.max(initial=0)) - first + 1
+    number = surface.astype(np.intp) * many + (place - first)
+    shown = np.flatnonzero(np.bincount(number))
+    sums, squares, of = np.bincount(number, residual)[shown], np.bincount(number, residual**2)[shown], shown // many
+    places = np.bincount(of, minlength=len(curved))
+    # The unknowns of a wall's line or a column's circle reduce the sums.
+    share = np.where(places >= RayPolicy.places, places / np.maximum(places - (2 + curved), 1), 0.0)[of]
+    found = np.full(2, ShapePolicy.alike)
+    for kind in range(2):
+        own = (curved[of] == bool(kind)) & (share > 0.0)
+        if own.any():
+            found[kind] = max(1.0, float((share * sums**2)[own].sum() / max(squares[own].sum(), 1.0)))
+    return found

@@ -9,62 +9,41 @@ are compared by their evidence, the marginal likelihood of the source's surfaces
 where the sum is that of object_likelihood. Two clouds may also show nothing of each other's place; then neither part gains.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import expit, logit
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..odometry.slips import FalseMotions
 from . import correlative_matching
-from .cloud_rasters import rasterize
-from .degeneracy import measured_part
-from .object_likelihood import CloudPairs, ObjectLikelihood, ObjectPolicy
-from .raster_search import Window, best_poses
-from .scan_matching import PairFactors, nondegenerate_step, pair_points
+from .correlative_matching import CorrelativeConfig
+from .object_likelihood import ObjectLikelihood
+from .scan_matching import SINGULAR, CloudPairs, PairFactors, PairPolicy, limited, measured_part, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationConfig:
     """Descent and search."""
 
-    first_gate: ClassVar[float] = 0.5
-    """Farthest match at the beginning of the descent, m; the reach of the rasters."""
     fewest: ClassVar[int] = 6
     """Matches from which on a pose is measured: twice its unknowns."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
-    same: ClassVar[float] = 16.27
-    """Squared Mahalanobis distance up to which two modes are one; one in a thousand exceeds it by chance."""
-    worth: ClassVar[float] = 0.02
-    """Posterior odds of a slip below which it is not searched for."""
-    good_share: ClassVar[float] = 0.75
-    """Share of matching points from which on matching begins at no further places."""
+    contradicts: ClassVar[float] = 16.266
+    """Squared Mahalanobis distance beyond which two poses are not the same; one in a thousand exceeds it by chance."""
+    doubtful: ClassVar[float] = 0.02
+    """Probability of a slip from which on it is searched for."""
     least_share: ClassVar[float] = 0.5
-    """The same of an exhaustive search."""
-    places: ClassVar[int] = 4
-    """Best places of an exhaustive search from which matching descends."""
-    scored: ClassVar[int] = 120
-    """Points that such a search looks up."""
-    cell: ClassVar[float] = 0.1
-    """Step of such a search in x and y, m."""
-    wide: ClassVar[float] = 3.0
-    """Half-width of a search from which on one correlation of all shifts takes less time, m."""
-    linear: ClassVar[float] = 0.1
-    """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
-    iterations: ClassVar[int] = 20
-    shrink: ClassVar[float] = 0.8
-    """Gate of an iteration as a share of the one before."""
+    """Share of matching points below which the search is exhaustive."""
     cooling: ClassVar[float] = 0.6
     """Covariance of the prior that residuals may still have in an iteration, as a share of the one before."""
     cold: ClassVar[float] = 0.05
     """Share of the prior's covariance from which on descent may end."""
-    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
-    """Longest step of one iteration, m and rad."""
-    converged: ClassVar[float] = 1e-3
-    """Steps below this end the descent, m or rad."""
+    linear: ClassVar[float] = 0.1
+    """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,12 +69,8 @@ class Prior(Table):
 
     @classmethod
     def about(cls, mean: Floats, sound: Floats, slip: Floats, loss: Floats) -> "Prior":
-        """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3).
-
-        Parameters
-        ----------
-        slip, loss : (e, 3) standard deviations of what is not counted while wheels slip or messages are lost, m, m, rad.
-        """
+        """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3), and standard deviations (e, 3) of what
+        they do not count while they slip, or messages are lost, m, m, rad."""
         return cls(*(Gaussian(mean, sound + more[:, :, None] ** 2 * np.eye(3)) for more in (np.zeros_like(slip), slip, loss)))
 
 
@@ -117,7 +92,7 @@ class Placed(Table):
     @property
     def share(self) -> Floats:
         """(e,) share of the points looked up that match, 0..1."""
-        return self.factors.matched / np.maximum(self.factors.asked, 1)
+        return self.factors.share
 
     @property
     def shown(self) -> Bools:
@@ -131,8 +106,8 @@ class Placed(Table):
     def log_prior(self, prior: Gaussian) -> Floats:
         """Return the log of a prior's density (e,), summed over the poses that the matches leave open."""
         off = _difference(self.pose, prior.mean)
-        volume = np.linalg.slogdet(np.eye(3) + prior.covariance @ self.information)[1]
-        return np.asarray(-0.5 * (np.einsum("ei,ei->e", off, _solved(prior.covariance, off)) + volume))
+        squared = np.einsum("ei,ei->e", off, _solved(prior.covariance, off))
+        return np.asarray(-0.5 * (squared + _volume(prior, self.information)))
 
     def evidence(self, prior: Gaussian) -> Floats:
         """Return the log marginal likelihood (e,) of the sources under a prior, by Laplace."""
@@ -145,18 +120,14 @@ class Placed(Table):
         return concatenated([self, others]).rows(which)
 
     def measured(self, variance: float) -> tuple[Floats, Floats]:
-        """Return what the matches alone measure, without the prior: T_i_j (e, 3), and the roots (e, 3, 3) of information.
+        """Return what the matches alone, with a variance, m^2, measure: T_i_j (e, 3), and the roots (e, 3, 3) of information.
 
         A direction whose own optimum lies beyond what holds for linear surfaces was not measured: the prior placed it.
-
-        Parameters
-        ----------
-        variance : of a match, m^2.
         """
         step, root = nondegenerate_step(self.factors)
         along = np.einsum("eij,ej->ei", root, step)
         root = np.where((np.abs(along) <= RegistrationConfig.linear * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
-        z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=1e-9), root, step)
+        z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=SINGULAR), root, step)
         z[:, 2] = se2.wrap_angle(z[:, 2])
         return z, np.asarray(root @ se2.rotation(z[:, 2]) / np.sqrt(variance))
 
@@ -199,12 +170,7 @@ class Placement:
         return self.candidates.rows(which), evidence[which]
 
     def log_odds(self, more: Floats | float = 0.0) -> Floats:
-        """Return the log of the evidence (e,) for a slip by that against it; 0 where the clouds say nothing.
-
-        Parameters
-        ----------
-        more : (e,) what adds to the evidence of a slip over each.
-        """
+        """Return the log of the evidence (e,), with more (e,), for a slip by that against it; 0 where clouds say nothing."""
         sound, slipped = (self.likeliest(part)[1] for part in (self.prior.sound, self.prior.slipped))
         odds = of_fallible(self.bound, RegistrationConfig.useless)
         odds[self.searched] = odds_by_views(sound[None], (slipped + more)[None])[self.searched]
@@ -223,12 +189,8 @@ class Placement:
         return motions
 
     def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
-        """Return the likelier place (e) of each pair, sound or slipped, with its covariance (e, 3, 3) and probability (e,).
-
-        Parameters
-        ----------
-        slips : probability of a slip beforehand.
-        """
+        """Return the likelier place (e) of each pair, sound or slipped with a probability beforehand, its covariance (e, 3, 3)
+        and probability (e,)."""
         useless = RegistrationConfig.useless
         (sound, usual), (slipped, wide) = (self.likeliest(part) for part in (self.prior.sound, self.prior.slipped))
         of_sound, of_slip = np.log1p(-slips) + usual, np.log(slips) + wide
@@ -236,44 +198,31 @@ class Placement:
         narrow, broad = sound.covariance(self.prior.sound), slipped.covariance(self.prior.slipped)
         off, slid = _difference(slipped.pose, sound.pose), of_slip > of_sound
         spread = np.linalg.solve(narrow, broad + off[:, :, None] * off[:, None, :])
-        same = np.einsum("eii->e", spread) < RegistrationConfig.same
+        same = np.einsum("eii->e", spread) < RegistrationConfig.contradicts
         likely = np.where(same, np.logaddexp(of_sound, of_slip), np.maximum(of_sound, of_slip)) - every
         place = sound.replaced(np.arange(len(same)), slipped, slid)
         # Any of them may be favoured falsely, however much.
         return place, np.where(slid[:, None, None], broad, narrow), (1.0 - useless) * np.exp(likely)
 
 
-Starts = Callable[[ObjectLikelihood, CloudPairs, Gaussian], list[Floats]]
-"""Gives poses (e, 3) from which matching begins."""
-
-
 def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: Floats) -> Placement:
-    """Place the sources of pairs (e,) in their targets.
-
-    Parameters
-    ----------
-    other : (e, 3) further poses to start from.
-    """
+    """Place the sources of pairs (e,) in their targets, from the prior's mean and other poses (e, 3)."""
     c = RegistrationConfig
     sound = descend(objects, pairs, prior.sound.mean, prior.sound)
     bound = np.where(sound.factors.asked > 0, _most_odds(sound, prior), 0.0)
-    rows = np.flatnonzero((bound > np.log(c.worth)) & (sound.factors.asked > 0))
+    rows = np.flatnonzero((bound > np.log(c.doubtful)) & (sound.factors.asked > 0))
     some, wide = pairs.rows(rows), prior.slipped.rows(rows)
     slipped = descend(objects, some, other[rows], wide)
-    for least, starts in ((c.good_share, _shares), (c.least_share, _searched)):
-        poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < least)
-        found, part = _from_best(objects, some.rows(poor), wide.rows(poor), starts), wide.rows(poor)
-        slipped = slipped.replaced(poor, found, found.evidence(part) > slipped.rows(poor).evidence(part))
+    poor = np.flatnonzero(np.maximum(slipped.share, sound.share[rows]) < c.least_share)
+    part = wide.rows(poor)
+    found = search(objects, some.rows(poor), part)
+    slipped = slipped.replaced(poor, found, found.evidence(part) > slipped.rows(poor).evidence(part))
     return Placement(prior, sound, np.arange(len(pairs)), bound, rows).followed_by(rows, slipped)
 
 
 def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placement, expected: FalseMotions) -> Placement:
-    """Return a placement with what their neighbours show of the wheels' false motions in the prior of slips, and places there.
-
-    Parameters
-    ----------
-    pairs : see register. found : of these. expected : see FalseMotions.by_neighbours.
-    """
+    """Return a placement of pairs with what neighbours tell of false motions, see FalseMotions.by_neighbours, in the prior of
+    slips, and places there."""
     rows, slipped = found.searched, found.prior.slipped
     sigma = np.sqrt(np.einsum("eii->ei", slipped.covariance[rows]))
     spread = np.linalg.inv(expected.matrix[rows])
@@ -289,41 +238,23 @@ def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placeme
 
 def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets, wherever the prior allows."""
-    return _from_best(objects, pairs, prior, _searched)
-
-
-def _from_best(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian, starts: Starts) -> Placed:
-    """Place pairs (e,), each from the best of several starts."""
-    placed = [descend(objects, pairs, start, prior) for start in starts(objects, pairs, prior)]
+    placed = [descend(objects, pairs, start, prior) for start in _starts(objects, pairs, prior)]
     best = np.argmax([each.evidence(prior) for each in placed], axis=0)
     return concatenated(placed).rows(best * len(pairs) + np.arange(len(pairs)))
 
 
-def _shares(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
-    """Return the poses (e, 3) of robots that moved all, half or none of what their wheels counted."""
-    return [share * prior.mean for share in (1.0, 0.5, 0.0)]
-
-
-def _searched(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
-    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view.
-
-    Where the wheels counted metres, the window is as large as the clouds: all its shifts are one correlation there.
-    """
-    c, clouds, within = RegistrationConfig, objects.clouds, 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
-    starts = np.tile(prior.mean, (c.places, 1, 1))
-    for row, (target, source) in enumerate(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)):
-        own, other = (clouds.chosen(np.array([k])) for k in (target, source))
-        view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (own, other))
-        low, high = (np.clip(prior.mean[row, :2] + side * within[row, :2], -view, view) for side in (-1.0, 1.0))
-        middle, half = np.append(0.5 * (low + high), prior.mean[row, 2]), 0.5 * (high - low)
-        turn = min(float(within[row, 2]), np.pi)
-        if half[:2].max() > c.wide:
-            found = correlative_matching.search(own, other, middle, (float(half[0]), float(half[1]), turn)).poses
-        else:
-            pair, raster = clouds.chosen(np.array([target, source])), rasterize(own, c.cell, c.first_gate)
-            points = pair_points(pair, np.array([1]), c.scored).of(0)
-            found = best_poses(pair, raster, points, middle, Window(float(half.max()), turn), c.places)
-        starts[: len(found), row] = found[: c.places]
+def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
+    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view."""
+    config, within = CorrelativeConfig(), 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
+    starts = np.tile(prior.mean, (config.candidates, 1, 1))
+    for row, (mean, reach) in enumerate(zip(prior.mean, within, strict=True)):
+        target, source = (objects.clouds.chosen(which[row : row + 1]) for which in (pairs.i, pairs.j))
+        view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (target, source))
+        low, high = (np.clip(mean[:2] + side * reach[:2], -view, view) for side in (-1.0, 1.0))
+        middle, (wide, tall) = np.append(0.5 * (low + high), mean[2]), 0.5 * (high - low)
+        window = float(wide), float(tall), min(float(reach[2]), np.pi)
+        found = correlative_matching.search(target, source, middle, window, config).poses
+        starts[: len(found), row] = found
     return list(starts)
 
 
@@ -331,49 +262,39 @@ def _most_odds(placed: Placed, prior: Prior) -> Floats:
     """Return the log of the odds (e,) of a slip after which everything agrees, with the information found here."""
     off = _difference(placed.pose, prior.sound.mean)
     lost = placed.most - placed.likelihood + 0.5 * np.einsum("ei,ei->e", off, _solved(prior.sound.covariance, off))
-    here, there = (np.linalg.slogdet(np.eye(3) + p.covariance @ placed.information)[1] for p in (prior.sound, prior.slipped))
+    here, there = (_volume(part, placed.information) for part in (prior.sound, prior.slipped))
     return np.asarray(lost + 0.5 * (here - there))
 
 
 def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets by matches and a prior, each from its start (e, 3)."""
-    c, scale = RegistrationConfig, objects.sigma**2 * ObjectPolicy.correlation
+    c, scale = PairPolicy, objects.sigma**2 * PairPolicy.correlation
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-    pose, gate, temper, left = start.copy(), c.first_gate, 1.0, np.arange(len(pairs))
+    pose, gate, temper, left = start.copy(), c.reach, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
-        factors, _ = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)
+        factors = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)[0]
         matches, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
         pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
-        step = -np.linalg.solve(matches / scale + information[left], (gradient / scale + pull)[..., None])[..., 0]
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / c.farthest[0], np.abs(step[:, 2]) / c.farthest[1])
-        step /= np.maximum(reach, 1.0)[:, None]
+        step = -limited(_solved(matches / scale + information[left], gradient / scale + pull))
         pose[left] += step
-        if gate <= ObjectPolicy.gate and temper < c.cold:
+        if gate <= c.gate and temper < RegistrationConfig.cold:
             left = left[np.abs(step).max(axis=1) >= c.converged]
-        gate, temper = max(gate * c.shrink, ObjectPolicy.gate), temper * c.cooling
+        gate, temper = max(gate * c.shrink, c.gate), temper * RegistrationConfig.cooling
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
-    factors, judged = objects.match(pairs, pose, ObjectPolicy.gate)
-    likelihood, most = (np.concatenate([getattr(part, name) for part in judged]) for name in ("likelihood", "most"))
+    factors, likelihood, most = objects.match(pairs, pose, c.gate)
     matches = measured_part(factors.hessian, factors.spurious, factors.gradient)[0] / scale
     return Placed(pose, factors, matches, likelihood, most)
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:
-    """Return the log odds (e,) by evidence that is the other way round with a probability.
-
-    Where people crowd about the robot, one pair of clouds can favour a false place by any factor: the model of the surfaces is
-    wrong there, and only several pairs in a row tell.
-    """
-    favoured = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -ObjectPolicy.largest, ObjectPolicy.largest)))
-    right = (1.0 - wrong) * favoured + wrong * (1.0 - favoured)
-    return np.asarray(np.log(right) - np.log1p(-right))
+    """Return the log odds (e,) by evidence that is the other way round with a probability, as where people crowd about."""
+    favoured = expit(log_odds)
+    return np.asarray(logit((1.0 - wrong) * favoured + wrong * (1.0 - favoured)))
 
 
 def odds_by_views(here: Floats, there: Floats) -> Floats:
-    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views.
-
-    A view may show nothing of either, and favour the false one.
-    """
+    """Return the log odds (n,) for places against one, by the log of their evidence (v, n) and of its own (v, 1) in views, each
+    of which may show nothing of either, and favour the false one."""
     none = np.log(RegistrationConfig.useless)
     each = np.logaddexp(there, none) - np.logaddexp(here, none)
     # They see the same surfaces: together they say no more of these than the one that sees most.
@@ -385,6 +306,11 @@ def _difference(pose: Floats, mean: Floats) -> Floats:
     off = pose - mean
     off[:, 2] = se2.wrap_angle(off[:, 2])
     return off
+
+
+def _volume(prior: Gaussian, information: Floats) -> Floats:
+    """Return the log (e,) of a prior's volume by that with further information (e, 3, 3)."""
+    return np.asarray(np.linalg.slogdet(np.eye(information.shape[-1]) + prior.covariance @ information)[1])
 
 
 def _solved(matrix: Floats, vector: Floats) -> Floats:

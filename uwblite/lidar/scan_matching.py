@@ -2,10 +2,16 @@
 
 Nearest neighbours come from one raster per cloud. A pair's matches are condensed into the quadratic form of its relative
 pose (3 x 3), which is all that the graph needs.
+
+Degenerate directions are those in which only the scatter of the normals seems to constrain a pose: scattered normals of a wall
+add spurious information about the motion along it. With the variance v of a normal's angle and the Jacobian J_t of the tangent,
+N = sum w v J_t^T J_t is the information of scatter alone. In the basis B that diagonalises both, H = B V diag(l) V^T B^T and
+N = B B^T, a direction was measured where its l exceeds a multiple of 1. That depends neither on units nor on the frame.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +20,64 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
-from .degeneracy import MEASURED, relative_eigen
 
-_AT_ONCE = 16384
+
+@dataclass(frozen=True, slots=True)
+class PairPolicy:
+    """Matches and descent."""
+
+    points: ClassVar[int] = 150
+    """Points looked up per pair."""
+    fewest: ClassVar[int] = 30
+    """Clouds with fewer points with a normal measure nothing."""
+    reach: ClassVar[float] = 0.5
+    """Farthest match at the beginning of a descent, m; the reach of the rasters."""
+    gate: ClassVar[float] = 0.15
+    """The same at its end, m."""
+    good_share: ClassVar[float] = 0.75
+    """Share of matching points from which on a pair needs no further search."""
+    correlation: ClassVar[float] = 8.0
+    """Matches that together weigh as one: errors of neighbouring rays are correlated."""
+    same_facing: ClassVar[float] = float(np.sqrt(0.5))
+    """Least cosine between the normals of two matched points."""
+    measured: ClassVar[float] = 2.0
+    """Multiple of the spurious information that a direction must exceed to have been measured."""
+    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
+    """Longest step of one iteration, m and rad."""
+    shrink: ClassVar[float] = 0.8
+    """Gate of an iteration as a share of the one before, at most."""
+    gate_per_step: ClassVar[float] = 10.0
+    """Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
+    converged: ClassVar[float] = 1e-3
+    """Steps below this end the descent, m or rad."""
+    iterations: ClassVar[int] = 20
+
+
+_AT_ONCE = 1 << 14
 """Points looked up at once, so that they fit into the processor's cache; it also bounds the memory."""
-_PAIRS_AT_ONCE = 4096
+_PAIRS_AT_ONCE = 1 << 12
 """Pairs whose points are listed at once; a bound on the memory."""
-_SAME_FACING = float(np.sqrt(0.5))
-"""Least cosine between the normals of two matched points."""
+_TINY = float(np.finfo(np.float32).tiny)
+SINGULAR = 1e-9
+"""Share of the largest information below which a direction has none."""
+_FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+"""N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
+and y, whatever the frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudPairs(Table):
+    """Pairs (e) of clouds, and the points of the sources that are looked up in the targets."""
+
+    i: Ints
+    """(e,) targets."""
+    j: Ints
+    """(e,) sources."""
+    points: NDArray[np.int32]
+    """(e, n) rows in the clouds' arrays, a pair's own in front; -1 behind them where a pair has fewer than others."""
+
+    def __len__(self) -> int:
+        return len(self.i)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +87,7 @@ class PairFactors(Table):
     hessian: Floats
     """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
     spurious: Floats
-    """(e, 3, 3) spurious part of it, by the scatter of the normals alone, see degeneracy."""
+    """(e, 3, 3) spurious part of it, by the scatter of the normals alone."""
     gradient: Floats
     """(e, 3) sum of w J^T r."""
     matched: Ints
@@ -43,47 +99,43 @@ class PairFactors(Table):
     weight: Floats
     """(e,) sum of w."""
 
+    @property
+    def share(self) -> Floats:
+        """(e,) share of the points looked up that match, 0..1."""
+        return self.matched / np.maximum(self.asked, 1)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PairPoints(Table):
-    """The points that pairs look up: those of cloud j with a normal, thinned."""
-
-    row: NDArray[np.int32]
-    """(e, n) rows in the clouds' arrays, a pair's own in front; -1 behind them where a pair has fewer than others."""
-
-    def of(self, pair: int) -> Ints:
-        """Return the rows of one pair."""
-        rows = self.row[pair]
-        return np.asarray(rows[rows >= 0], dtype=np.intp)
+    @property
+    def variance(self) -> float:
+        """m^2, mean squared distance of the matches of all pairs."""
+        return float(self.squared.sum() / max(self.weight.sum(), 1.0))
 
 
-def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
-    """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
+def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = PairPolicy.points) -> CloudPairs:
+    """Return pairs of targets i (e,) and sources j (e,), with up to `limit` evenly spread points with a normal of each."""
     usable = np.any(clouds.normals != 0.0, axis=1)
     ranks = np.concatenate([[0], np.cumsum(usable)])
     rows = np.append(np.flatnonzero(usable), NOBODY).astype(np.int32)
     begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
     take = np.minimum(end - begin, limit)
     rank = np.arange(take.max(initial=0))
-    row = np.empty((len(j), len(rank)), dtype=np.int32)
+    points = np.empty((len(j), len(rank)), dtype=np.int32)
     for first in range(0, len(j), _PAIRS_AT_ONCE):
         part = slice(first, first + _PAIRS_AT_ONCE)
         number, taken = (end - begin)[part, None], take[part, None]
         picked = begin[part, None] + (rank * number) // np.maximum(taken, 1)
-        row[part] = rows[np.where(rank < taken, picked, len(rows) - 1)]
-    return PairPoints(row)
+        points[part] = rows[np.where(rank < taken, picked, len(rows) - 1)]
+    return CloudPairs(i, j, points)
 
 
 def match(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float | Floats,
-    scale: float | Floats, weight: Floats | None = None,
+    raster: CloudRasters, pairs: CloudPairs, T_i_j: Floats, gate: float | Floats, scale: float | Floats,
+    weight: Floats | None = None,
 ) -> PairFactors:
-    """Match the listed points of each pair's source cloud to lines of its target cloud i.
+    """Match the listed points of each pair's source cloud to lines of its target cloud.
 
     Parameters
     ----------
-    i : (e,) target clouds. T_i_j : (e, 3) present relative poses.
-    points : what to look up, see pair_points.
+    T_i_j : (e, 3) present relative poses.
     gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m; of all pairs or each (e,).
     scale : width of the Geman-McClure kernel on the point-to-line distance, m; of all pairs or each (e,).
     weight : (p,) of the clouds' points as source points; None = 1 each.
@@ -93,10 +145,13 @@ def match(
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
     root = None if weight is None else np.sqrt(weight)
-    found = correspondences(clouds, raster, i, T_i_j, points, gate)
-    scale = np.broadcast_to(scale, len(i))
+    scale = np.broadcast_to(scale, len(pairs))
+    found = correspondences(raster, pairs, T_i_j, gate)
     return concatenated(
-        [condensed(clouds, some, scale[some.pairs, None], None if root is None else root.take(some.row)) for some in found]
+        [
+            condensed(raster.clouds, some, scale[some.pairs, None], None if root is None else root.take(some.row))
+            for some in found
+        ]
     )
 
 
@@ -121,37 +176,36 @@ class Correspondences:
 
 
 def correspondences(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float | Floats
+    raster: CloudRasters, pairs: CloudPairs, T_i_j: Floats, gate: float | Floats
 ) -> Iterator[Correspondences]:
     """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
     # Each coordinate of points and normals in one piece.
-    surface = [np.ascontiguousarray(column) for column in (*clouds.points.T, *clouds.normals.T)]
-    at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
-    square = np.broadcast_to(np.square(gate), len(i))[:, None]
-    for first in range(0, max(len(i), 1), at_once):
+    surface = [np.ascontiguousarray(column) for column in (*raster.clouds.points.T, *raster.clouds.normals.T)]
+    at_once = max(_AT_ONCE // max(pairs.points.shape[1], 1), 1)
+    gate = np.broadcast_to(gate, len(pairs))
+    for first in range(0, max(len(pairs), 1), at_once):
         part = slice(first, first + at_once)
-        yield _looked_up(clouds, surface, raster, part, i[part], T_i_j[part], points.row[part], square[part])
+        yield _looked_up(surface, raster, part, pairs.rows(part), T_i_j[part], gate[part])
 
 
 def _looked_up(
-    clouds: Clouds, surface: Sequence[Floats], raster: CloudRasters, pairs: slice, i: Ints, T_i_j: Floats,
-    row: NDArray[np.int32], square: Floats,
+    surface: Sequence[Floats], raster: CloudRasters, part: slice, pairs: CloudPairs, T_i_j: Floats, gate: Floats
 ) -> Correspondences:
-    """Look up the points of some pairs (e,), whose squared gates are columns (e, 1) as other per-pair values are."""
-    rows = row.astype(np.intp)  # Once, and not at every use.
+    """Look up the points of some pairs (e,) with gates (e,)."""
+    rows, square = pairs.points.astype(np.intp), np.square(gate)[:, None]  # Once, and not at every use.
     c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
     px, py, sx, sy = (column.take(rows) for column in surface)
     rx, ry = c * px - s * py, s * px + c * py
     x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
-    found = look_up(raster, i, x, y)
+    found = look_up(raster, pairs.i, x, y)
     near = found >= 0
-    target = found + clouds.offsets[i, None]
+    target = found + raster.clouds.offsets[pairs.i, None]
     target *= near
     qx, qy, nx, ny = (column.take(target) for column in surface)
     dx, dy = x - qx, y - qy
     facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
-    good = near & (dx * dx + dy * dy <= square) & (facing > _SAME_FACING) & (rows >= 0)
-    return Correspondences(pairs, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
+    good = near & (dx * dx + dy * dy <= square) & (facing > PairPolicy.same_facing) & (rows >= 0)
+    return Correspondences(part, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
 def condensed(
@@ -165,39 +219,62 @@ def condensed(
     weighted = np.empty((len(row), 4, row.shape[1]))
     wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
     weighted[:, 2] = wy * rx - wx * ry
-    weighted[:, 3] = root * r
+    weighted[:, -1] = root * r
     summed = weighted @ weighted.transpose(0, 2, 1)
     # The tangent (-ny, nx) replaces the normal; the variance of the normal is a further weight.
-    tangent = np.empty((len(row), 3, row.shape[1]))
+    tangent = np.empty_like(weighted[:, :-1])
     np.negative(wy, out=tangent[:, 0])
     tangent[:, 1] = wx
     np.add(wx * rx, wy * ry, out=tangent[:, 2])
     scatter = clouds.normal_variance.take(found.target) + clouds.normal_variance.take(row)
     spurious = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
     return PairFactors(
-        hessian=summed[:, :3, :3],
+        hessian=summed[:, :-1, :-1],
         spurious=spurious,
-        gradient=summed[:, :3, 3],
+        gradient=summed[:, :-1, -1],
         matched=good.sum(axis=1),
         asked=(row >= 0).sum(axis=1),
-        squared=summed[:, 3, 3],
+        squared=summed[:, -1, -1],
         weight=np.einsum("en,en->e", root, root),
     )
 
 
+def _relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return (..., 3, 3) B V, its inverse, and the eigenvalues (..., 3) of B^-1 H B^-T, N kept from vanishing."""
+    floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _TINY
+    basis = np.asarray(np.linalg.cholesky(spurious + floor[..., None] * np.eye(len(_FLOOR))), dtype=np.float64)
+    inverse = _inverse(basis)
+    values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
+    return basis @ vectors, np.swapaxes(vectors, -1, -2) @ inverse, values
+
+
+def _inverse(lower: Floats) -> Floats:
+    """Return the inverse of lower triangular matrices (..., 3, 3), in a tenth of the time of a general one."""
+    x, y, z = (1.0 / lower[..., k, k] for k in range(lower.shape[-1]))
+    inverse = np.zeros_like(lower)
+    inverse[..., 0, 0], inverse[..., 1, 1], inverse[..., 2, 2] = x, y, z
+    inverse[..., 1, 0], inverse[..., 2, 1] = -lower[..., 1, 0] * x * y, -lower[..., 2, 1] * y * z
+    inverse[..., 2, 0] = (lower[..., 1, 0] * lower[..., 2, 1] * y - lower[..., 2, 0]) * x * z
+    return inverse
+
+
+def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added: a
+    direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m."""
+    basis, inverse, values = _relative_eigen(information, spurious)
+    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _TINY), 0.0)
+    share = (basis * kept[..., None, :]) @ inverse
+    return share @ information, (share @ gradient[..., None])[..., 0]
+
+
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
-    L^T L the information in those directions (unscaled by noise).
-
-    In the basis B that diagonalises both, spurious = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
-    of 1, see degeneracy.
-    """
-    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.spurious)
-    kept = np.maximum(values - MEASURED, 0.0)
+    L^T L the information in those directions, see measured_part (unscaled by noise)."""
+    basis, inverse, values = _relative_eigen(factors.hessian, factors.spurious)
+    kept = np.maximum(values - PairPolicy.measured, 0.0)
     divisor = np.where(kept > 0.0, values, np.inf)
-    within = np.swapaxes(vectors, 1, 2) @ inverse
-    step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)
-    return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis @ vectors, 1, 2)
+    step = -np.einsum("eji,ej->ei", inverse, np.einsum("eij,ej->ei", inverse, factors.gradient) / divisor)
+    return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis, 1, 2)
 
 
 def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -205,8 +282,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
 
     Parameters
     ----------
-    T_i_j : (e, 3) poses about which the factors were made.
-    variance : (e,) m^2, variance of one match.
+    T_i_j : (e, 3) poses about which the factors were made. variance : (e,) m^2, of one match.
 
     Returns
     -------
@@ -215,9 +291,71 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
     step, root = nondegenerate_step(factors)
     z = T_i_j + step
     z[:, 2] = se2.wrap_angle(z[:, 2])
-    c, s = se2.cos_sin(z[:, 2])
-    turn = np.zeros((len(z), 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = c
-    turn[:, 0, 1], turn[:, 1, 0] = -s, s
-    turn[:, 2, 2] = 1.0
-    return z, root @ turn / np.sqrt(variance)[:, None, None]
+    return z, root @ se2.rotation(z[:, 2]) / np.sqrt(variance)[:, None, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """Final relative poses of pairs."""
+
+    pose: Floats
+    """(e, 3) T_i_j."""
+    factors: PairFactors
+    """Of the last matches."""
+
+    @property
+    def share(self) -> Floats:
+        """(e,) share of the points looked up that match, 0..1."""
+        return self.factors.share
+
+    @property
+    def rms(self) -> Floats:
+        """(e,) root mean square distance of the matches, m."""
+        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, _TINY))
+
+
+def limited(step: Floats) -> Floats:
+    """Return steps (e, 3), m, m, rad, none of them longer than those of one iteration."""
+    distance, turn = PairPolicy.farthest
+    reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / distance, np.abs(step[:, 2]) / turn)
+    return np.asarray(step / np.maximum(reach, 1.0)[:, None])
+
+
+def align_pairs(
+    raster: CloudRasters, pairs: CloudPairs, guess: Floats, first_gate: float, last_gate: float,
+    iterations: int = PairPolicy.iterations,
+) -> Aligned:
+    """Align many pairs of clouds at once, each on its own: point-to-line ICP with a gate that shrinks with its steps.
+
+    A pair that no longer moves at the last gate is finished.
+
+    Parameters
+    ----------
+    guess : (e, 3) start poses of the source clouds. first_gate, last_gate : farthest match in the first and last iteration, m.
+    """
+    c, pose, gate, moving = PairPolicy, guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
+    finished: list[tuple[Ints, PairFactors]] = []
+    for _ in range(iterations):
+        factors = match(raster, pairs.rows(moving), pose[moving], gate, gate / 2.0)
+        step = nondegenerate_step(factors)[0]
+        length = np.abs(step).max(axis=1)
+        pose[moving] += limited(step)
+        left = (length >= c.converged) | (gate > last_gate)
+        if not left.all():
+            finished.append((moving[~left], _after(factors.rows(~left), step[~left])))
+        gate = np.maximum(np.minimum(c.shrink * gate, c.gate_per_step * length), last_gate)[left]
+        moving = moving[left]
+        if not len(moving):
+            break
+    if len(moving) or not finished:
+        finished.append((moving, match(raster, pairs.rows(moving), pose[moving], last_gate, last_gate / 2.0)))
+    pose[:, 2] = se2.wrap_angle(pose[:, 2])
+    order = np.argsort(np.concatenate([which for which, _ in finished]))
+    return Aligned(pose, concatenated([factors for _, factors in finished]).rows(order))
+
+
+def _after(factors: PairFactors, step: Floats) -> PairFactors:
+    """Return the factors after steps (e, 3) so short that every point keeps its match."""
+    change = np.einsum("eij,ej->ei", factors.hessian, step)
+    squared = factors.squared + np.einsum("ei,ei->e", 2.0 * factors.gradient + change, step)
+    return replace(factors, gradient=factors.gradient + change, squared=squared)

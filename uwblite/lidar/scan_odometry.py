@@ -4,43 +4,32 @@ Scans a moment apart are aligned point to line from a guess; where few points th
 finds the place.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, renumbered
+from ..arrays import Bools, Floats, Ints, renumbered
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
-from . import cloud_rasters, clouds, scan_matching
-from .cloud_rasters import CloudRasters
+from . import clouds, scan_matching
+from .cloud_rasters import CloudRasters, rasterize
 from .clouds import CloudConfig, Clouds, make_cloud
-from .correlative_matching import CorrelativeConfig, search
+from .correlative_matching import search
 from .overlap import directional_overlap
-from .pair_alignment import align_pairs
-from .scan_matching import PairPoints
-from .visibility import nearest_by_bearing, pair_violations
+from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
+from .visibility import free_around, violates_free_space
 
 
 @dataclass(frozen=True, slots=True)
 class ScanStepPolicy:
     """Matching of single scans a moment apart."""
 
-    first_gate: ClassVar[float] = 0.4
-    """Farthest match in the first iteration, m."""
-    last_gate: ClassVar[float] = 0.12
-    """The same in the last, m."""
-    points: ClassVar[int] = 200
-    """Points looked up per pair."""
-    good_share: ClassVar[float] = 0.75
-    """Pairs that share at least this part of their points need no search."""
-    gain: ClassVar[float] = 0.05
-    """A search must raise the share by this to count."""
+    reach: ClassVar[float] = 0.4
+    """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
     search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
     """Half-widths of the search, m, m, rad."""
-    least_points: ClassVar[int] = 25
-    """Clouds with fewer points measure nothing."""
     at_once: ClassVar[int] = 128
     """Pairs of scans whose rasters are in memory at once."""
     well_seen: ClassVar[float] = 0.9
@@ -58,7 +47,6 @@ def scan_steps(
 
     Parameters
     ----------
-    scans : with the mounting of their laser.
     first, second : (e,) scan numbers, so near in time that the two see the same. guess : (e, 3).
     searches : at most so many of the pairs that match worst are searched for around the guess, which takes long.
 
@@ -69,9 +57,17 @@ def scan_steps(
     steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
     for low in range(0, len(first), ScanStepPolicy.at_once):
         rows = slice(low, low + ScanStepPolicy.at_once)
+        raster, pairs = _pairs(scans, mounting, first[rows], second[rows])
+        aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, PairPolicy.gate)
+        enough = aligned.factors.asked >= PairPolicy.fewest
+        pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
+        poor = np.flatnonzero((share < PairPolicy.good_share) & enough)
         allowed = -(-searches * ScanStepPolicy.at_once // len(first))
-        step, share = _block(scans, mounting, first[rows], second[rows], guess[rows], allowed)
-        steps.append(step)
+        for row in poor[np.argsort(share[poor], kind="stable")][:allowed].tolist():
+            found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[low + row])
+            if found[1] > share[row]:
+                pose[row], share[row] = found
+        steps.append(pose)
         shares.append(share)
     return np.concatenate(steps), np.concatenate(shares)
 
@@ -79,91 +75,60 @@ def scan_steps(
 def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the mean square distance (e,), m^2, at which pairs of scans match at given motions T_first_second (e, 3).
 
-    Points without a match count as one at the gate, unless the first scan could not see there: along a bare corridor, where
-    readings end at the lidar's reach, those of two scans would otherwise match best if the robot stood.
+    Points without a match count as one at the gate, unless the first scan could not see there, as along a bare corridor.
     """
-    built, raster, i, _, points = _pairs(scans, mounting, first, second)
-    points = _in_sight(built, i, motion, points, scans, mounting)
-    found = scan_matching.match(built, raster, i, motion, points, ScanStepPolicy.first_gate, ScanStepPolicy.first_gate)
-    return (found.squared + ScanStepPolicy.first_gate**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+    raster, pairs = _pairs(scans, mounting, first, second)
+    pairs = _in_sight(raster.clouds, pairs, motion, scans, mounting)
+    gate = ScanStepPolicy.reach
+    found = scan_matching.match(raster, pairs, motion, gate, gate)
+    return (found.squared + gate**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
 
 
-def _in_sight(
-    built: Clouds, i: Ints, motion: Floats, points: PairPoints, scans: LaserScans, mounting: SensorMounting
-) -> PairPoints:
-    """Return the points of pairs that the first scan looks at, and not from much farther than it sees; all where few are left.
-
-    Parameters
-    ----------
-    i : (e,) clouds of the first scans. motion : (e, 3) T_first_second.
-    """
-    in_laser = se2.transform(se2.inverse(mounting.T_base_laser), built.points.astype(np.float64))
-    away = np.hypot(in_laser[:, 0], in_laser[:, 1])
-    ends = zip(built.offsets[:-1].tolist(), built.offsets[1:].tolist(), strict=True)
-    reach = np.array([np.quantile(away[a:b], ScanStepPolicy.well_seen) if b > a else 0.0 for a, b in ends])
-    T_laser_first = se2.compose(se2.inverse(mounting.T_base_laser), motion)[:, None]
-    at = se2.transform(T_laser_first, built.points.astype(np.float64).take(points.row, axis=0))
-    bearing = np.arctan2(at[..., 1], at[..., 0]) * (-1.0 if mounting.laser_flipped else 1.0)
+def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScans, mounting: SensorMounting) -> CloudPairs:
+    """Return pairs with the points that the first scan looks at, not from much farther than it sees; all where few are left."""
+    points, T_laser_base = built.points.astype(np.float64), se2.inverse(mounting.T_base_laser)
+    away = np.split(np.hypot(*se2.transform(T_laser_base, points).T), built.offsets[1:-1])
+    reach = np.array([np.quantile(own, ScanStepPolicy.well_seen) if len(own) else 0.0 for own in away])
+    at = se2.transform(se2.compose(T_laser_base, motion)[:, None], points.take(pairs.points, axis=0))
+    bearing = se2.bearing(at) * (-1.0 if mounting.laser_flipped else 1.0)
     middle, half = 0.5 * (scans.angles[0] + scans.angles[-1]), 0.5 * abs(scans.angles[-1] - scans.angles[0])
-    seen = (np.abs(se2.wrap_angle(bearing - middle)) <= half) & (np.hypot(at[..., 0], at[..., 1]) <= reach[i, None])
-    seen &= points.row >= 0
-    few = seen.sum(axis=1) < ScanStepPolicy.least_in_sight * (points.row >= 0).sum(axis=1)
-    return PairPoints(np.where(seen | few[:, None], points.row, -1).astype(np.int32))
+    asked: Bools = pairs.points >= 0
+    seen = (np.abs(se2.wrap_angle(bearing - middle)) <= half) & (np.hypot(at[..., 0], at[..., 1]) <= reach[pairs.i, None])
+    few = (seen & asked).sum(axis=1) < ScanStepPolicy.least_in_sight * asked.sum(axis=1)
+    return replace(pairs, points=np.where(seen | few[:, None], pairs.points, -1))
 
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
-    """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1.
-
-    Along a corridor most rays of a scan match the next one best at zero motion: only the few surfaces that face
-    along the corridor show the motion.
-    """
-    built, raster, i, j, _ = _pairs(scans, mounting, first, second)
-    return directional_overlap(built, raster, i, j, motion, ScanStepPolicy.points, ScanStepPolicy.last_gate)
+    """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1."""
+    raster, pairs = _pairs(scans, mounting, first, second)
+    return directional_overlap(raster, pairs.i, pairs.j, motion, PairPolicy.gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of either of two scans that stands in the free space of the other, for motions (e, 3), 0..1."""
-    built, _, i, j, _ = _pairs(scans, mounting, first, second)
-    nearest, pairs = nearest_by_bearing(built), zip(i.tolist(), j.tolist(), motion, strict=True)
-    return np.array([pair_violations(built, nearest, a, b, step[None])[0] for a, b, step in pairs])
+    raster, pairs = _pairs(scans, mounting, first, second)
+    free, seen = free_around(raster.clouds), [raster.clouds.cloud(k)[0] for k in range(len(raster.clouds))]
+    steps = zip(pairs.i.tolist(), pairs.j.tolist(), motion, strict=True)
+    return np.array([violates_free_space(free[a], seen[a], free[b], seen[b], step) for a, b, step in steps])
 
 
-def _pairs(
-    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints
-) -> tuple[Clouds, CloudRasters, Ints, Ints, PairPoints]:
-    """Return the clouds of pairs of scans, their rasters, the two clouds of each pair (e,), and the points to be matched."""
+def _pairs(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints) -> tuple[CloudRasters, CloudPairs]:
+    """Return the rasters of the clouds of pairs of scans, and the pairs of clouds (e)."""
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = cloud_rasters.rasterize(built, config.raster, ScanStepPolicy.first_gate)
-    points = scan_matching.pair_points(built, j, ScanStepPolicy.points)
-    return built, raster, i, j, points
+    raster = rasterize(built, config.raster, ScanStepPolicy.reach)
+    return raster, pairs_of(built, i, j)
 
 
-def _block(
-    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
-) -> tuple[Floats, Floats]:
-    built, raster, i, j, points = _pairs(scans, mounting, first, second)
-    aligned = align_pairs(built, raster, i, guess, points, ScanStepPolicy.first_gate, ScanStepPolicy.last_gate)
-    enough = aligned.factors.asked >= ScanStepPolicy.least_points
-    pose, share = aligned.pose.copy(), np.where(enough, aligned.share, 0.0)
-    poor = np.flatnonzero((share < ScanStepPolicy.good_share) & enough)
-    for row in poor[np.argsort(share[poor], kind="stable")][:searches].tolist():
-        found = _searched(built, raster, int(i[row]), int(j[row]), guess[row])
-        if found is not None and found[1] > share[row] + ScanStepPolicy.gain:
-            pose[row], share[row] = found
-    return pose, share
-
-
-def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats) -> tuple[Floats, float] | None:
-    """Return the best pose of cloud j in cloud i and the share of points that match there."""
-    target, source = (make_cloud(p, p + n) for p, n in (built.cloud(i), built.cloud(j)))
-    places = search(target, source, guess, ScanStepPolicy.search, CorrelativeConfig())
-    if not len(places.poses):
-        return None
-    one = np.ones(len(places.poses), dtype=np.intp)
-    points = scan_matching.pair_points(built, one * j, ScanStepPolicy.points)
-    aligned = align_pairs(built, raster, one * i, places.poses, points, 0.3, ScanStepPolicy.last_gate)
+def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
+    """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
+    target, source = (make_cloud(p, p + n) for p, n in (raster.clouds.cloud(int(k)) for k in (pair.i[0], pair.j[0])))
+    places = search(target, source, guess, ScanStepPolicy.search).poses
+    if not len(places):
+        return guess, 0.0
+    pairs = pair.rows(np.zeros(len(places), dtype=np.intp))
+    aligned = align_pairs(raster, pairs, places, ScanStepPolicy.reach, PairPolicy.gate)
     best = int(np.argmax(aligned.share))
     return aligned.pose[best], float(aligned.share[best])
 

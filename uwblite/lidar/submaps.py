@@ -4,12 +4,10 @@
 """
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints, rms_length
@@ -19,6 +17,7 @@ from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statis
 
 _AT_ONCE = 32
 """Sub-maps merged at once; a bound on the memory."""
+_FACINGS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,72 +64,54 @@ class Submaps:
 
 
 def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
-    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording.
-
-    Returns
-    -------
-    first (s,) and one past the last keyframe (s,) of each piece.
-    """
-    piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.intp) if epsilon > 0 else np.arange(len(path))
+    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording, and
+    return the first (s,) and one past the last keyframe (s,) of each."""
+    piece = np.floor((path - path[0]) / epsilon).astype(np.intp) if epsilon > 0 else np.arange(len(path))
     change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(recording) != 0)])
     first = np.flatnonzero(change)
     return first, np.append(first[1:], len(path))
 
 
 def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig) -> Submaps:
-    """Merge the clouds of each piece of the trajectory and filter them: voxel, statistical, radius.
-
-    Parameters
-    ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. recording : (k,).
-    """
+    """Merge the clouds of each piece of the trajectory, with poses (k, 3) T_map_base, and filter them; see cut."""
     first, last = cut(path, recording, config.epsilon)
-    return of_pieces(clouds, poses, first, last, _middle(first, last), config)
+    return of_pieces(clouds, poses, first, last, references(path, recording, config.epsilon), config)
 
 
 def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
-    """Return the reference keyframes (s,) of the sub-maps that are built of such pieces."""
-    return _middle(*cut(path, recording, epsilon))
-
-
-def _middle(first: Ints, last: Ints) -> Ints:
+    """Return the reference keyframes (s,) of the sub-maps that are built of such pieces: those in the middle."""
+    first, last = cut(path, recording, epsilon)
     return (first + last - 1) // 2
 
 
 def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:
-    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,), and filter them.
-
-    Parameters
-    ----------
-    reference : (s,) keyframes in whose frames the points stand.
-    """
-    parts = []
-    for rows in _together(first, last):
-        parts.append(_built(clouds, poses, first[rows], last[rows], reference[rows], config))
+    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,) in the frames of reference
+    keyframes (s,), and filter them: voxel, statistical, radius."""
+    parts = [
+        _built(clouds, poses, first[some], last[some], reference[some], config)
+        for some in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE))
+    ]
     return Submaps(first, last, reference, replace(joined(parts), work=clouds.work), config.voxel)
 
 
-def _together(first: Ints, last: Ints) -> Iterator[slice]:
-    """Yield the pieces that are merged at once: each begins where the one before ends."""
-    gap = np.append(np.flatnonzero(first[1:] != last[:-1]) + 1, len(first))
-    start = 0
-    while start < len(first):
-        end = min(int(gap[np.searchsorted(gap, start, "right")]), start + _AT_ONCE)
-        yield slice(start, end)
-        start = end
-
-
 def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Clouds:
-    """Return the clouds of neighbouring sub-maps, which begin with the keyframes first (s,) and end before last (s,)."""
-    keyframes = slice(int(first[0]), int(last[-1]))
-    rows = slice(int(clouds.offsets[keyframes.start]), int(clouds.offsets[keyframes.stop]))
+    """Return the clouds of some sub-maps."""
+    keyframes = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
     piece = np.repeat(np.arange(len(first)), last - first)
-    owner = clouds.owner[rows] - keyframes.start
+    own = clouds.chosen(keyframes)
     relative = se2.between(poses[reference[piece]], poses[keyframes])
-    points = se2.transform_each(relative, owner, clouds.points[rows])
-    normals = se2.rotate_each(relative[:, 2], owner, clouds.normals[rows])
-    scatter = clouds.normal_variance[rows]
-    number, points, normals, scatter = _merge(piece[owner], points, normals, scatter, config.voxel)
+    points = se2.transform_each(relative, own.owner, own.points)
+    normals = se2.rotate_each(relative[:, 2], own.owner, own.normals)
+    # The two sides of a wall stay apart by facing: one of four, not two, because for no direction of the wall may noise turn a
+    # normal from one side's facing into the other's.
+    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.intp) % _FACINGS
+    key = cell_number(piece[own.owner], points, config.voxel) * _FACINGS + facing
+    one, mean = mean_by_key(key, np.column_stack([points, normals, own.normal_variance]))
+    points, normals, scatter = mean[:, :2], mean[:, 2:-1], mean[:, -1]
+    length = np.hypot(*normals.T)
+    clear = length > 0.5
+    normals = np.where(clear[:, None], normals / np.where(clear, length, 1.0)[:, None], 0.0)
+    number = piece[own.owner[one]]
     kept = np.ones(len(number), dtype=bool)
     offsets = np.searchsorted(number, np.arange(len(first) + 1)).astype(np.intp)
     for a, b in itertools.pairwise(offsets):
@@ -139,17 +120,3 @@ def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: In
             inner = np.flatnonzero(kept[a:b]) + a
             kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
     return Clouds(offsets, points, normals, number, scatter, clouds.work).only(kept)
-
-
-def _merge(
-    owner: Ints, points: Floats, normals: Floats, scatter: NDArray[np.floating], size: float
-) -> tuple[Ints, Floats, Floats, Floats]:
-    """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
-    # Four facings, not two: for no direction of the wall may noise turn a normal from one side's facing into the other's.
-    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.intp) % 4
-    key = cell_number(owner, points, size) * 4 + facing
-    one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))
-    length = np.hypot(mean[:, 2], mean[:, 3])
-    clear = length > 0.5
-    normal = np.where(clear[:, None], mean[:, 2:4] / np.where(clear, length, 1.0)[:, None], 0.0)
-    return owner[one], mean[:, :2], normal, mean[:, 4]

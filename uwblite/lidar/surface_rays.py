@@ -1,30 +1,59 @@
-"""Single rays that end on known surfaces, straight walls and round columns, as measurements of poses and surfaces.
+"""Single rays that end on known surfaces, straight walls and round columns, and their noise.
 
     wall      residual n . (p - c r) - n . m          m a point of the wall, n its normal
     column    residual |p - c r - m| - radius         along the ray, times the cosine of incidence
 
 p is the end of the ray, r its direction, both in the map, and c the range offset of the surface: the lidar error that depends
-on colour and material. Derivatives are taken where the ray should have ended: noise along an oblique ray is both in
-its residual and in its lever arm, and the product of both would turn every scan, along a wall always to the same side.
+on colour and material.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, unique_rows
+from ..arrays import WIDE, Bools, Floats, Ints, Table, dots
 from ..odometry.attached import ScanPoints
-from .clouds import Clouds
-from .columns import ColumnConfig, Surroundings, refined_columns, surroundings, to_circle
-from .ray_noise import RayNoise, range_sigma
 
-ROUGHNESS = 0.004
-"""Roughness of surfaces, m: a grazing ray does not measure better."""
-_COLUMNS = ColumnConfig()
+
+@dataclass(frozen=True, slots=True)
+class ShapePolicy:
+    """Rays, and what a surface is."""
+
+    noise: ClassVar[tuple[float, float]] = (0.01, 0.01)
+    """Standard deviation of a range by data sheets, m and as a share of it: 10 mm up to 1 m, and 1 % beyond (URG-04LX; other
+    scanners are better)."""
+    roughness: ClassVar[float] = 0.004
+    """Roughness of surfaces, m: a grazing ray does not measure better."""
+    bundle: ClassVar[int] = 4
+    """Neighbouring rays that count as one."""
+    missing: ClassVar[int] = 2
+    """Rays without a reading that do not end a run of neighbours."""
+    bend: ClassVar[float] = 20.0
+    """Chi2 by which the richer of two shapes fits rays better."""
+    scatter: ClassVar[float] = 1.35
+    """Largest rms distance of rays from their surface, relative to their noise."""
+    on: ClassVar[float] = 0.06
+    """Distance from a surface up to which a place is on it, m."""
+    uneven: ClassVar[float] = 0.02
+    """Standard deviation of surfaces beside the noise of rays, m and rad: by the poses, and because walls are not straight."""
+    quietest: ClassVar[float] = 0.1
+    """Least noise of rays, as a share of that by data sheets."""
+    around: ClassVar[float] = 0.3
+    """Distance from a column's rim up to which rays are its surroundings, m."""
+    alike: ClassVar[float] = 4.0
+    """Design effect of rays until one is learnt (as of matches of clouds: RefinementConfig.correlation)."""
+
+
+_TINY = 1e-9
+"""Least length of a ray, m."""
+_MOST_RAYS = 1 << 14
+"""Most rays of a scan."""
+_RAYS_AT_ONCE = 1 << 14
+"""Rays that are processed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,11 +85,10 @@ class Surfaces(Table):
     def moved(self, step: Floats) -> "Surfaces":
         """Return the surfaces after a step (s, 4): a wall's turn and shift along its normal, or a column's shift; the
         offset; the radius."""
-        shift = np.where(self.round[:, None], step[:, :2], self.normal * step[:, 1:2])
-        facing = self.facing + np.where(self.round, 0.0, step[:, 0])
-        return replace(
-            self, place=self.place + shift, facing=facing, offset=self.offset + step[:, 2], radius=self.radius + step[:, 3]
-        )
+        one, other, offset, radius = step.T
+        shift = np.where(self.round[:, None], step[:, :2], self.normal * other[:, None])
+        facing = self.facing + np.where(self.round, 0.0, one)
+        return Surfaces(self.round, self.place + shift, facing, self.offset + offset, self.radius + radius)
 
     def seen_from(self, pose: Floats) -> "Surfaces":
         """Return the surfaces in the frame of a pose (3,)."""
@@ -91,6 +119,13 @@ class SurfaceRays(Table):
     """(m,) m, along the ray, by data sheets."""
     bundle: NDArray[np.signedinteger]
     """(m,) number of the group of neighbouring rays of one scan that count as one where they end on one surface."""
+
+    def in_map(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Return where rays end (m, 2) and their directions (m, 2) in the map, from poses (k, 3)."""
+        return (
+            se2.transform_each(poses, self.keyframe, self.points),
+            se2.rotate_each(poses[:, 2], self.keyframe, self.directions),
+        )
 
     def by_keyframe(self, surfaces: Surfaces) -> "SurfaceRays":
         """Return the rays in order: those on walls before those on columns, by keyframe, and by surface."""
@@ -128,12 +163,53 @@ class SurfaceRays(Table):
         return replace(self.rows(first), points=points, directions=directions, sigma=sigma)
 
 
-_BUNDLE = 4
-"""Neighbouring rays that count as one."""
-_MOST_RAYS = 1 << 14
-"""Most rays of a scan."""
-_RAYS_AT_ONCE, _POINTS_AT_ONCE = 1 << 14, 1 << 16
-"""Rays, and points of clouds, that are processed together."""
+def as_rays(rays: ScanPoints) -> SurfaceRays:
+    """Return rays of which it is not known yet on which surface they end."""
+    way = rays.points - rays.origins
+    reach = np.maximum(np.hypot(*way.T), _TINY)
+    bundle = (rays.scan * _MOST_RAYS + rays.ray) // ShapePolicy.bundle
+    return SurfaceRays(rays.keyframe, np.full(len(reach), -1), rays.points, way / reach[:, None], range_sigma(reach), bundle)
+
+
+def range_sigma(reach: Floats) -> Floats:
+    """Return the standard deviation, m, of ranges (n,), m, by data sheets."""
+    near, share = ShapePolicy.noise
+    return np.maximum(near, share * reach)
+
+
+def begins_run(rays: ScanPoints, apart: Bools) -> Bools:
+    """Return which rays (m,) begin another run of neighbours; apart (m - 1,) are those that do not belong to the one before."""
+    begins = np.ones(len(rays.ray), dtype=bool)
+    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > ShapePolicy.missing) | apart
+    return begins
+
+
+def to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return how far (m,) points (m, 2) are from a circle about 0 along their rays, the normals (m, 2) there, and the cosine
+    of incidence, 0 where a ray misses."""
+    along = dots(points, direction)
+    inside = radius**2 - dots(points, points) + along**2
+    shift = -along - np.sqrt(np.maximum(inside, 0.0))
+    normal = (points + shift[:, None] * direction) / radius[:, None]
+    return shift, normal, np.where(inside > 0.0, dots(normal, direction), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayNoise:
+    """Noise of rays as learnt from their residuals."""
+
+    ratio: float
+    """Of the noise to that of data sheets."""
+    alike: Floats
+    """(2,) design effect of rays on walls and on columns, 1 or more."""
+
+    def weights(self, curved: bool, kernel: float) -> tuple[float, float]:
+        """Return the information of a ray on a wall or a column relative to that by data sheets, and the inverse square of the
+        width of a robust kernel, of so many standard deviations, on residuals by data sheets."""
+        return 1.0 / (self.ratio**2 * float(self.alike[int(curved)])), 1.0 / (kernel * self.ratio) ** 2
+
+
+UNLEARNT = RayNoise(1.0, np.full(2, ShapePolicy.alike))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,75 +219,3 @@ class MeasuredSurfaces:
     surfaces: Surfaces
     rays: SurfaceRays
     noise: RayNoise
-
-
-def as_rays(rays: ScanPoints) -> SurfaceRays:
-    """Return rays of which it is not known yet on which surface they end."""
-    way = rays.points - rays.origins
-    reach = np.maximum(np.hypot(*way.T), 1e-9)
-    none = np.full(len(reach), -1)
-    bundle = (rays.scan * _MOST_RAYS + rays.ray) // _BUNDLE
-    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach), bundle)
-
-
-def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int, config: ColumnConfig = _COLUMNS) -> SurfaceRays:
-    """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
-    if not len(columns):
-        return rays.rows(np.zeros(0, dtype=np.intp))
-    at, direction = in_map(rays, poses)
-    nearest = cKDTree(columns[:, :2]).query(at)[1]
-    shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
-    good = (incidence < -config.incidence) & (np.abs(shift) < config.gate * rays.sigma + config.slack)
-    return replace(rays, surface=nearest + first).rows(good)
-
-
-NEAR = 0.3
-"""Distance from a column's rim up to which rays are kept until it is fitted, m."""
-
-
-def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> SurfaceRays:
-    """Return the rays from poses (k, 3) that end near columns."""
-    rows, which, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
-    return rays.rows(rows[away < columns.columns[which, 2] + NEAR])
-
-
-def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArray[np.int8]:
-    """Return the kind of each of the clouds' points (p,), whose frames are (k, 3) in the map: 0 on a wall where rays showed
-    it, 1 on a column, -1 on neither."""
-    surfaces, kind = found.surfaces, np.full(len(clouds.points), -1, dtype=np.int8)
-    shown = _shown_walls(found, sensors)
-    columns = surfaces.rows(surfaces.round)
-    near = surroundings(np.column_stack([columns.place, columns.radius]), _ON)
-    for first in range(0, len(kind), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
-        at = se2.transform_each(sensors, clouds.owner[part], clouds.points[part].astype(np.float64))
-        kind[part][np.isfinite(shown.query(at, distance_upper_bound=_ON)[0])] = 0
-        kind[part][near.on_rim(at, _ON)] = 1
-    return kind
-
-
-_ON = 0.06
-"""Distance from a surface up to which a point of a cloud is on it, m."""
-
-
-def _shown_walls(found: MeasuredSurfaces, sensors: Floats) -> cKDTree:
-    """Return the middles of the cells of walls in which rays end."""
-    surfaces, rays = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface])
-    way, wall = surfaces.tangent, rays.surface.astype(np.intp)
-    ended = se2.transform_each(sensors, rays.keyframe, rays.points)
-    along = dots(ended - surfaces.place.take(wall, axis=0), way.take(wall, axis=0))
-    wall, cell = unique_rows(np.column_stack([wall, np.floor(along / _ON).astype(np.intp)]))[0].T
-    return cKDTree(surfaces.place[wall] + ((cell + 0.5) * _ON)[:, None] * way[wall])
-
-
-def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
-    """Return those of the columns (c, 3) that are round, fitted to rays around them."""
-    return refined_columns(columns, *in_map(rays, poses), rays.sigma.astype(np.float64))
-
-
-def in_map(rays: SurfaceRays, poses: Floats) -> tuple[Floats, Floats]:
-    """Return where rays end (m, 2) and their directions (m, 2) in the map."""
-    return (
-        se2.transform_each(poses, rays.keyframe, rays.points),
-        se2.rotate_each(poses[:, 2], rays.keyframe, rays.directions),
-    )

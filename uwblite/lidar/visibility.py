@@ -1,7 +1,8 @@
 """Visibility between clouds: free space of one, and surfaces of others that stand in it.
 
-If the relative pose of two clouds is right, hardly any surface of the one stands in the other's free space;
-people, glass and doors cause a few per cent. If it is wrong, half of the surfaces do.
+Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud well in front
+of it contradicts their relative pose; one behind it was hidden. If the pose is right, people, glass and doors cause a few per
+cent of such points; if it is wrong, half of the surfaces do.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,6 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .clouds import Clouds
-from .free_space import FreeSpace, contradiction, free_space, seen_beyond
 from .submaps import Submaps
 
 
@@ -38,39 +38,91 @@ class VisibilityPolicy:
     """Points of the other that a visit must be able to see to be compared."""
     neighbours: ClassVar[int] = 64
     """Keyframes around one among which another visit is sought."""
+    usual: ClassVar[float] = 0.9
+    """Share of the pairs of sub-maps of which no more stands in the next one's free space than is said of all."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeSpace:
+    """Extent of the free space around v places, by bearing."""
+
+    poses: Floats
+    """(v, 3) of the places in the cloud's frame; m, m, rad."""
+    ranges: Floats
+    """(v, b) m, distance up to which each of b equal parts of the circle was free, from -pi on; 0 where nothing is known."""
+
+
+def free_ranges(nearest: Floats) -> Floats:
+    """Return the ranges of FreeSpace (v, b) by those to the nearest surface, see free_space."""
+    reach = np.where(np.isfinite(nearest), nearest, 0.0)
+    free = reach.copy()
+    free[:, 1:] = np.minimum(free[:, 1:], reach[:, :-1])
+    free[:, :-1] = np.minimum(free[:, :-1], reach[:, 1:])
+    return free
+
+
+def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
+    """Make the free space of v places; a bearing is free only as far as its neighbours, because rays graze walls and edges.
+
+    Parameters
+    ----------
+    poses : (v, 3) T_cloud_base of each; m, m, rad.
+    nearest : (v, b) m, distance of the nearest surface in each part of the circle, from -pi on; inf = nothing is known.
+    """
+    return FreeSpace(poses, free_ranges(nearest))
 
 
 def nearest_by_bearing(clouds: Clouds) -> Floats:
     """Return how far (k, bearings), m, the nearest point of each cloud is in every direction; inf where there is none."""
-    distance, bearing = np.hypot(clouds.points[:, 0], clouds.points[:, 1]), se2.bearing(clouds.points)
-    many = VisibilityPolicy.bearings
-    bins = np.clip(((bearing + np.pi) * (many / (2.0 * np.pi))).astype(np.intp), 0, many - 1)
+    many, (x, y) = VisibilityPolicy.bearings, np.ascontiguousarray(clouds.points.T)
+    bins = _bins(x.astype(np.float64), y.astype(np.float64), many)
     nearest = np.full(len(clouds) * many, np.inf)
-    np.minimum.at(nearest, clouds.owner.astype(np.intp) * many + bins, distance)
+    np.minimum.at(nearest, clouds.owner.astype(np.intp) * many + bins, np.hypot(x, y))
     return nearest.reshape(-1, many)
 
 
-def in_free_space(free: Floats, i: Ints, x: Floats, y: Floats) -> tuple[Bools, Bools]:
-    """Return which points x, y (e, n), m, stand in the space that was free around clouds i (e,), and which were in view.
+def free_around(clouds: Clouds) -> list[FreeSpace]:
+    """Return the free space around the base of each cloud, as this cloud shows it."""
+    return [free_space(np.zeros((1, 3)), nearest[None]) for nearest in nearest_by_bearing(clouds)]
 
-    Parameters
-    ----------
-    free : (k, bearings) m, see FreeSpace.ranges; of all clouds.
-    """
-    distance = np.sqrt(x * x + y * y)
-    bins = ((np.arctan2(y, x) + np.pi) * (VisibilityPolicy.bearings / (2.0 * np.pi))).astype(np.intp)
-    bins *= bins < VisibilityPolicy.bearings
-    until = free[i[:, None], bins]
-    return distance < until - VisibilityPolicy.margin, (until > 0.0) & (distance < until + VisibilityPolicy.margin)
+
+def _bins(x: Floats, y: Floats, many: int) -> Ints:
+    """Return in which of many parts of the circle, from -pi on, points lie."""
+    bins = ((np.arctan2(y, x) + np.pi) * (many / (2.0 * np.pi))).astype(np.intp)
+    bins *= bins < many  # Straight behind is one direction; a remainder takes longer.
+    return bins
+
+
+def in_free_space(
+    free: Floats, which: Ints, x: Floats, y: Floats, margin: float = VisibilityPolicy.margin
+) -> tuple[Bools, Bools]:
+    """Return which points x, y (e, n), m, stand by more than a margin, m, in the free space of a row (e,) of ranges (k, b), see
+    FreeSpace, and which were in view: in it, or up to the margin behind it."""
+    distance, parts = np.sqrt(x * x + y * y), free.shape[1]
+    until = free.take(_bins(x, y, parts) + parts * which[:, None])
+    return distance < until - margin, (until > 0.0) & (distance < until + margin)
+
+
+def seen_beyond(free: FreeSpace, points: Floats, margin: float = VisibilityPolicy.margin) -> tuple[Ints, Ints]:
+    """Return for each point (m, 2) the number (m,) of places that saw beyond it, and of those from which it was in view."""
+    back = se2.inverse(free.poses)[:, :, None]
+    (c, s), (px, py) = se2.cos_sin(back[:, 2]), np.ascontiguousarray(points.T)
+    x, y = c * px - s * py + back[:, 0], s * px + c * py + back[:, 1]
+    through, in_view = in_free_space(free.ranges, np.arange(len(free.poses)), x, y, margin)
+    return through.sum(axis=0), in_view.sum(axis=0)
+
+
+def contradiction(free: FreeSpace, points: Floats, margin: float = VisibilityPolicy.margin) -> tuple[float, float]:
+    """Return the share of points (m, 2) in view that lie in observed free space, and the share that was in view, 0..1."""
+    if len(points) == 0 or len(free.poses) == 0:
+        return 0.0, 0.0
+    through, in_view = seen_beyond(free, points, margin)
+    seen = in_view > 0
+    return float(np.sum((through > 0) & seen) / max(int(seen.sum()), 1)), float(seen.mean())
 
 
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
-    """Return the observed free space of each sub-map, from some of its keyframes.
-
-    Parameters
-    ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base of the keyframes.
-    """
+    """Return the observed free space of each sub-map, from some of its keyframes with clouds and poses (k, 3) T_map_base."""
     nearest = nearest_by_bearing(clouds)
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
@@ -80,53 +132,28 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
 
 
 def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
-    """Return sub-maps without dynamic points: those in the free space of most of their own keyframes with a view of them.
-
-    People who walk beside the robot leave trails in a sub-map that no other sub-map shows.
-    """
-    kept = np.ones(len(submaps.clouds.points), dtype=bool)
-    for k, own in enumerate(free):
-        rows = slice(submaps.clouds.offsets[k], submaps.clouds.offsets[k + 1])
-        through, in_view = seen_beyond(own, submaps.clouds.cloud(k)[0], VisibilityPolicy.margin)
-        kept[rows] = 2 * through <= in_view
-    return replace(submaps, clouds=submaps.clouds.only(kept))
+    """Return sub-maps without dynamic points: those in the free space of most of their own keyframes with a view of them."""
+    counts = [seen_beyond(own, submaps.clouds.cloud(k)[0]) for k, own in enumerate(free)]
+    kept = [2 * through <= in_view for through, in_view in counts]
+    return replace(submaps, clouds=submaps.clouds.only(np.concatenate([np.zeros(0, dtype=bool), *kept])))
 
 
 def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
-    """Return the larger share of either sub-map's points that would stand in observed free space of the other, 0..1.
-
-    Parameters
-    ----------
-    free_a, free_b : see observed_free_space. points_a (n, 2), points_b (m, 2), m : each in its own frame.
-    T_a_b : (3,) pose of b in a.
-    """
-    one, _ = contradiction(free_a, se2.transform(T_a_b, points_b), VisibilityPolicy.margin)
-    other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a), VisibilityPolicy.margin)
+    """Return the larger share of points (n, 2), (m, 2), m, of either cloud, each in its own frame, that would stand in observed
+    free space of the other, 0..1."""
+    one, _ = contradiction(free_a, se2.transform(T_a_b, points_b))
+    other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a))
     return max(one, other)
-
-
-def pair_violations(clouds: Clouds, nearest: Floats, i: int, j: int, poses: Floats) -> Floats:
-    """Return the larger share (c,) of either of two clouds that would stand in free space for poses (c, 3) of j in i, 0..1.
-
-    Parameters
-    ----------
-    nearest : see nearest_by_bearing; of all clouds.
-    """
-    here, there = (free_space(np.zeros((1, 3)), nearest[k : k + 1]) for k in (i, j))
-    own, other = (clouds.cloud(k)[0] for k in (i, j))
-    return np.array([violates_free_space(here, own, there, other, pose) for pose in poses])
 
 
 def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
     """Return the share of a sub-map in the next one's free space, which only people, glass and drift can cause.
 
+    One pair in ten of sub-maps driven one after the other exceeds it, 0..1; 0 where there is no such pair.
+
     Parameters
     ----------
     free : see observed_free_space. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
-
-    Returns
-    -------
-    The share that one pair in ten of sub-maps driven one after the other exceeds, 0..1; 0 where there is no such pair.
     """
     reference = submaps.reference
     pairs = np.flatnonzero(np.diff(recording[reference]) == 0)
@@ -136,28 +163,23 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
         violates_free_space(free[k], points[k], free[k + 1], points[k + 1], step)
         for k, step in zip(pairs.tolist(), steps, strict=True)
     ]
-    return float(np.quantile(shares, 0.9)) if shares else 0.0
+    return float(np.quantile(shares, VisibilityPolicy.usual)) if shares else 0.0
 
 
 def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
-    """Return the share of points of one visit that stand in the free space of another visit to the same place.
+    """Return the share, 0..1, of points of one visit that stand in the free space of another visit to the same place, of those
+    that it could see, and the number of different keyframes on the smaller side of the comparisons, earlier or later.
 
     Parameters
     ----------
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. recording : (k,) recording.
-
-    Returns
-    -------
-    share : of the points that the other visit could see, 0..1.
-    visits : different keyframes on the smaller side of the comparisons, earlier or later. One keyframe that is compared with
-        many contributes one person in its view to all comparisons.
     """
     i, j = _revisits(poses, path, recording)
-    nearest = nearest_by_bearing(clouds)
+    free = free_around(clouds)
     through, seen, compared = 0.0, 0.0, []
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
         points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(free_space(np.zeros((1, 3)), nearest[a : a + 1]), points, VisibilityPolicy.margin)
+        share, visible = contradiction(free[a], points)
         if visible * len(points) >= VisibilityPolicy.common:
             through += share * visible * len(points)
             seen += visible * len(points)
@@ -168,12 +190,12 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
 
 def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]:
     """Return pairs (p,), (p,) of keyframes that lie together but were not driven one after the other."""
-    many, c = min(VisibilityPolicy.neighbours, len(poses)), VisibilityPolicy
-    distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=many, distance_upper_bound=c.revisit)
-    distance, other = distance.reshape(len(poses), -1), other.reshape(len(poses), -1)
+    c = VisibilityPolicy
+    nearest = range(1, min(c.neighbours, len(poses)) + 1)
+    distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=nearest, distance_upper_bound=c.revisit)
     other = np.minimum(other, len(poses) - 1)
-    again = (np.abs(path[other] - path[:, None]) > VisibilityPolicy.apart) | (recording[other] != recording[:, None])
+    again = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
     again &= np.isfinite(distance)
     i = np.flatnonzero(again.any(axis=1))
-    i = i[np.unique(np.linspace(0, len(i) - 1, min(VisibilityPolicy.revisits, len(i))).round().astype(np.intp))]
+    i = i[np.unique(np.linspace(0, len(i) - 1, min(c.revisits, len(i))).round().astype(np.intp))]
     return i, other[i, np.argmax(again[i], axis=1)].astype(np.intp)

@@ -7,40 +7,54 @@ doors, of a few rays each, are found by one rule, which asks nothing but what th
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, Bools, Floats, Ints, Table, connected, dots, unique_rows
+from ..arrays import Bools, Floats, Ints, Table, connected, dots, spread, unique_rows
 from ..odometry.attached import ScanPoints
-from .ray_noise import range_sigma
-from .surface_rays import ROUGHNESS, SurfaceRays, as_rays
+from .clouds import Clouds
+from .columns import surroundings
+from .surface_rays import MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, begins_run
 
 
 @dataclass(frozen=True, slots=True)
-class PieceConfig:
-    """What a straight piece is."""
+class WallPolicy:
+    """What a straight piece is, and which pieces are of one wall, by what maps err by and objects stand off walls."""
 
-    gap: float = 0.35
-    """m between the ends of neighbouring rays that cuts."""
-    missing: int = 2
-    """Rays without a reading that do not cut."""
-    fewest: int = 6
+    fewest: ClassVar[int] = 6
     """Least number of rays."""
-    splits: int = 7
-    """Most rounds in which bent pieces are split."""
-    scatter: float = 1.35
-    """Scatter across the line, relative to the noise of the rays, beyond which a piece is bent."""
-    bend: float = 20.0
-    """Chi2 by which two lines fit a bent piece better than one."""
-    incidence: float = 0.15
+    splits: ClassVar[int] = 7
+    """Most rounds in which bent pieces are split, and most times that a bent wall is halved."""
+    incidence: ClassVar[float] = 0.15
     """Least cosine of incidence: readings at a grazing angle are unreliable."""
-    vague: float = 0.2
+    vague: ClassVar[float] = 0.2
     """Largest standard deviation of the direction, rad."""
+    every: ClassVar[float] = 0.5
+    """m between the places at which pieces are compared."""
+    reach: ClassVar[float] = 0.4
+    """m, largest distance of places, and of the ends of neighbouring rays."""
+    lean: ClassVar[float] = 0.1
+    """rad, largest difference of directions, beside two standard deviations of it."""
+    turned: ClassVar[float] = 2.0
+    """Largest rms difference of directions from the wall's, in their standard deviations: what looks flat from every side, as a
+    stem or a corner does, turns with the view."""
+    views: ClassVar[int] = 4
+    """Least number of keyframes that see a wall."""
 
 
-_PIECE = PieceConfig()
+_TINY = 1e-9
+_AT_ONCE = 1 << 13
+"""Places of a strip; bounds the memory."""
+_PAIRS_AT_ONCE = 1 << 15
+"""Pairs that are processed together, so that they fit into the processor's cache."""
+_SOME = 16
+"""One in so many pairs is tested first."""
+_POINTS_AT_ONCE = 1 << 16
+"""Points of clouds that are processed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,75 +92,67 @@ class _Moments:
         _, _, a, b, c = self._central(first, last)
         return np.asarray((last - first) * np.maximum(0.5 * (a + c - np.hypot(a - c, 2.0 * b)), 0.0))
 
-    def lines(self, first: Ints, last: Ints) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return centre (k, 2), normal (k, 2), length (k,) as of evenly spread points, and rms noise across it (k,), m."""
+    def lines(self, first: Ints, last: Ints) -> tuple[Floats, Floats, Floats]:
+        """Return centre (k, 2), normal (k, 2), and rms noise across it (k,), m."""
         x, y, a, b, c = self._central(first, last)
         angle = 0.5 * np.arctan2(2.0 * b, a - c)
-        length = np.sqrt(6.0 * (a + c + np.hypot(a - c, 2.0 * b)))
         nx, ny = -np.sin(angle), np.cos(angle)
         uu, uv, vv = (self._noise.take(last, axis=1) - self._noise.take(first, axis=1)) / np.maximum(last - first, 1)
         noise = np.sqrt(np.maximum(nx * nx * uu + 2.0 * nx * ny * uv + ny * ny * vv, 0.0))
-        return np.stack([x, y], axis=1), np.stack([nx, ny], axis=1), length, noise
+        return np.stack([x, y], axis=1), np.stack([nx, ny], axis=1), noise
 
 
-def straight_pieces(rays: ScanPoints, config: PieceConfig = _PIECE) -> tuple[Pieces, SurfaceRays]:
+def straight_pieces(rays: ScanPoints) -> tuple[Pieces, SurfaceRays]:
     """Return the straight pieces that rays (p,) show, and the rays on them with pieces as surfaces."""
-    way = rays.points - rays.origins
-    reach = np.maximum(np.hypot(*way.T), 1e-9)
-    ahead, sigma = way / reach[:, None], range_sigma(reach)
-    begins = _begins(rays, config)
-    moments = _Moments(rays.points, ahead, sigma * _noise(reach, sigma, begins))
-    first, last = _straight(moments, begins, config)
-    centre, normal, length, noise = moments.lines(first, last)
+    c, single = WallPolicy, as_rays(rays)
+    ahead, sigma = single.directions, single.sigma.astype(np.float64)
+    begins = begins_run(rays, np.hypot(*np.diff(rays.points, axis=0).T) > c.reach)
+    noise = _noise(dots(rays.points - rays.origins, ahead), sigma, begins)
+    moments = _Moments(rays.points, ahead.astype(np.float64), sigma * noise)
+    first, last = _straight(moments, begins)
+    centre, normal, across = moments.lines(first, last)
     incidence = dots(normal, ahead[(first + last) // 2])
     normal = normal * np.where(incidence > 0.0, -1.0, 1.0)[:, None]
-    deviation = noise * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, 1e-9)
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     begin, end = (dots(rays.points[rows] - centre, tangent) for rows in (first, last - 1))
     middle, length = centre + 0.5 * (begin + end)[:, None] * tangent, np.abs(end - begin)
-    good = (np.abs(incidence) > config.incidence) & (deviation < config.vague)
+    # Of a line through evenly spread points.
+    deviation = across * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, _TINY)
+    good = (np.abs(incidence) > c.incidence) & (deviation < c.vague)
     first, last = first[good], last[good]
     found = Pieces(rays.keyframe[first], middle[good], normal[good], length[good], deviation[good])
     # The outermost rays may hit two surfaces.
     inner = last - first - 2
     piece = np.repeat(np.arange(len(first)), inner)
     on = np.arange(len(piece)) + (first + 1 - np.cumsum(inner) + inner)[piece]
-    oblique = -dots(ahead[on], found.normal[piece]) > config.incidence
-    return found, replace(as_rays(rays.rows(on)), surface=piece).rows(oblique).bundled()
-
-
-def _begins(rays: ScanPoints, config: PieceConfig) -> Bools:
-    """Return which rays (m,) begin another run of neighbours."""
-    begins = np.ones(len(rays.ray), dtype=bool)
-    begins[1:] = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > config.missing)
-    begins[1:] |= np.hypot(*np.diff(rays.points, axis=0).T) > config.gap
-    return begins
+    oblique = -dots(ahead[on], found.normal[piece]) > c.incidence
+    return found, replace(single.rows(on), surface=piece).rows(oblique).bundled()
 
 
 def _noise(reach: Floats, sigma: Floats, begins: Bools) -> float:
     """Return the noise of rays relative to that by data sheets, by second differences of the lengths of neighbours."""
-    bend = np.diff(reach, 2) / (np.sqrt(6.0) * sigma[1:-1]) if len(reach) > 2 else np.zeros(0)
-    bend = bend[~begins[1:-1] & ~begins[2:]] if len(bend) else bend
-    return float(np.clip(MAD_TO_SIGMA * np.median(np.abs(bend)), _LEAST_NOISE, 1.0)) if len(bend) else 1.0
+    inside = ~begins[1:-1] & ~begins[2:]
+    if not inside.any():
+        return 1.0
+    # Those of white noise have six times its variance.
+    bend = np.diff(reach, 2)[inside] / (np.sqrt(6.0) * sigma[1:-1][inside])
+    return float(np.clip(spread(bend), ShapePolicy.quietest, 1.0))
 
 
-_LEAST_NOISE = 0.1
-"""Least noise of rays, as a share of that by data sheets."""
-
-
-def _straight(moments: _Moments, begins: Bools, config: PieceConfig) -> tuple[Ints, Ints]:
+def _straight(moments: _Moments, begins: Bools) -> tuple[Ints, Ints]:
     """Split runs until they are straight; return the first ray of each and the one after the last, ascending."""
     first = np.flatnonzero(begins)
     last = np.append(first[1:], len(begins))
     found = [np.zeros((2, 0), dtype=np.intp)]
-    for _ in range(config.splits):
-        many = last - first >= config.fewest
+    for _ in range(WallPolicy.splits):
+        many = last - first >= WallPolicy.fewest
         first, last = first[many], last[many]
         if not len(first):
             break
-        variance, squares = moments.lines(first, last)[3] ** 2 + ROUGHNESS**2, moments.squares(first, last)
-        middle, of_two = _best_split(moments, first, last, config.fewest // 2)
-        good = (squares < config.scatter**2 * variance * (last - first - 2)) & (squares - of_two < config.bend * variance)
+        variance = moments.lines(first, last)[-1] ** 2 + ShapePolicy.roughness**2
+        squares, (middle, of_two) = moments.squares(first, last), _best_split(moments, first, last, WallPolicy.fewest // 2)
+        good = squares < ShapePolicy.scatter**2 * variance * (last - first - 2)
+        good &= squares - of_two < ShapePolicy.bend * variance
         found.append(np.stack([first[good], last[good]]))
         first, middle, last = first[~good], middle[~good], last[~good]
         first, last = np.concatenate([first, middle]), np.concatenate([middle, last])
@@ -166,32 +172,6 @@ def _best_split(moments: _Moments, first: Ints, last: Ints, half: int) -> tuple[
     return at[best[np.searchsorted(best, begin)]], least
 
 
-@dataclass(frozen=True, slots=True)
-class WallConfig:
-    """Which pieces are of one wall, by what maps err by after the joint refinement, and objects stand off walls."""
-
-    every: float = 0.5
-    """m between the places at which pieces are compared."""
-    reach: float = 0.4
-    """m, largest distance of places."""
-    off: float = 0.06
-    """m, largest distance of a place from the other's line."""
-    lean: float = np.deg2rad(6.0)
-    """rad, largest difference of directions, beside two standard deviations of it."""
-    scatter: float = 0.05
-    """m, rms scatter of places about a straight wall."""
-    turned: float = 2.0
-    """Largest rms difference of directions from the wall's, in their standard deviations: what looks flat from every side, as a
-    stem or a corner does, turns with the view."""
-    keyframes: int = 4
-    """Least number that see it."""
-    halvings: int = 6
-    """Most times that a bent wall is halved."""
-
-
-_WALL = WallConfig()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class StraightWalls:
     """Straight walls (w) of a map."""
@@ -204,65 +184,108 @@ class StraightWalls:
     """(w, 2) unit, towards the robot."""
 
 
-def find_walls(pieces: Pieces, poses: Floats, some: Bools, config: WallConfig = _WALL) -> StraightWalls:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places(Table):
+    """Places (m) on pieces, two on each at least, evenly spread."""
+
+    piece: Ints
+    keyframe: Ints
+    at: Floats
+    """(m, 2) m, map frame."""
+    normal: Floats
+    """(m, 2) unit."""
+    deviation: Floats
+    """(m,) rad."""
+
+    @classmethod
+    def on(cls, pieces: Pieces, poses: Floats) -> "_Places":
+        many = np.maximum(np.ceil(pieces.length / WallPolicy.every).astype(np.intp), 2)
+        piece = np.repeat(np.arange(len(many)), many)
+        rank = np.arange(len(piece)) - (np.cumsum(many) - many)[piece]
+        along = ((rank + 0.5) / many[piece] - 0.5) * pieces.length[piece]
+        normal, keyframe = pieces.normal[piece], pieces.keyframe[piece]
+        at = pieces.centre[piece] + along[:, None] * np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+        at, normal = se2.transform_each(poses, keyframe, at), se2.rotate_each(poses[:, 2], keyframe, normal)
+        return cls(piece, keyframe, at, normal, pieces.deviation[piece])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Lines that fit sets (w) of places (m)."""
+
+    number: Ints
+    """(m,) set of each place."""
+    centre: Floats
+    """(w, 2) m."""
+    facing: Floats
+    """(w, 2) unit, normals."""
+    scatter: Floats
+    """(w,) m, rms distance of the places."""
+
+    @classmethod
+    def fitted(cls, number: Ints, at: Floats, normal: Floats, deviation: Floats) -> "_Lines":
+        """Return those that fit best where places are and, by their deviations, how they are turned."""
+        many, off = int(number.max(initial=-1)) + 1, ShapePolicy.uneven
+        weight = 1.0 / (deviation**2 + off**2)
+
+        def mean(values: Floats, weight: Floats) -> Floats:
+            return np.stack([np.bincount(number, weight * v, many) for v in values.T], axis=1) / total(weight)[:, None]
+
+        def total(values: Floats) -> Floats:
+            return np.asarray(np.bincount(number, values, many))
+
+        centre, facing = mean(at, np.ones(len(at))), mean(normal, weight)
+        facing /= np.maximum(np.hypot(*facing.T), _TINY)[:, None]
+        away, own = at - centre[number], facing[number]
+        across, along = dots(away, own), _across(away, own)
+        known = total((along / off) ** 2 + weight)
+        facing = se2.rotate(total(_across(normal, own) * weight - along * across / off**2) / known, facing)
+        return cls(number, centre, facing, _rms(number, dots(away, facing[number]), many))
+
+    def along(self, at: Floats) -> Floats:
+        """Return where (m,) places (m, 2) are along the lines of their sets, from the middle, m."""
+        return _across(at - self.centre[self.number], self.facing[self.number])
+
+
+def find_walls(pieces: Pieces, poses: Floats, some: Bools) -> StraightWalls:
     """Join those of some pieces (s,) that lie on each other, at poses (k, 3) of the keyframes, to walls."""
-    piece, at, normal = _places(pieces, poses, config.every)
-    kept = np.flatnonzero(some[piece])
-    piece, at, normal = piece[kept], at[kept], normal[kept]
-    deviation, keyframe = pieces.deviation[piece], pieces.keyframe[piece]
-    number = _joined(piece, at, normal, deviation, len(some), config)[piece]
-    number = _halved(number, at, normal, deviation, keyframe, config)
-    centre, facing = _lines(number, at, normal, deviation)
-    seen = np.bincount(unique_rows(np.stack([number, keyframe], axis=1))[0][:, 0], minlength=len(centre))
-    good = (seen >= config.keyframes) & (_scatter(number, at, centre, facing) < config.scatter)
-    good &= _rms(number, _across(normal, facing[number]) / np.hypot(deviation, _TURNED), len(centre)) < config.turned
+    places = _Places.on(pieces, poses)
+    places = places.rows(np.flatnonzero(some[places.piece]))
+    lines = _halved(np.unique(_joined(places, len(some)), return_inverse=True)[1], places)
+    number, many = lines.number, len(lines.centre)
+    seen = np.bincount(unique_rows(np.stack([number, places.keyframe], axis=1))[0][:, 0], minlength=many)
+    turned = _across(places.normal, lines.facing[number]) / np.hypot(places.deviation, ShapePolicy.uneven)
+    good = (seen >= WallPolicy.views) & (lines.scatter < ShapePolicy.on)
+    good &= _rms(number, turned, many) < WallPolicy.turned
     of_piece = np.full(len(some), -1)
-    of_piece[piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
-    return StraightWalls(of_piece, centre[good], facing[good])
+    of_piece[places.piece] = np.where(good, np.cumsum(good) - 1, -1)[number]
+    return StraightWalls(of_piece, lines.centre[good], lines.facing[good])
 
 
-def _places(pieces: Pieces, poses: Floats, every: float) -> tuple[Ints, Floats, Floats]:
-    """Return places on pieces, two on each at least, evenly spread: the piece (m,), where it is in the map, and its normal."""
-    many = np.maximum(np.ceil(pieces.length / every).astype(np.intp), 2)
-    piece = np.repeat(np.arange(len(many)), many)
-    rank = np.arange(len(piece)) - (np.cumsum(many) - many)[piece]
-    along = ((rank + 0.5) / many[piece] - 0.5) * pieces.length[piece]
-    normal = pieces.normal[piece]
-    at = pieces.centre[piece] + along[:, None] * np.stack([normal[:, 1], -normal[:, 0]], axis=1)
-    keyframe = pieces.keyframe[piece]
-    return piece, se2.transform_each(poses, keyframe, at), se2.rotate_each(poses[:, 2], keyframe, normal)
-
-
-def _joined(piece: Ints, at: Floats, normal: Floats, deviation: Floats, many: int, config: WallConfig) -> Ints:
-    """Return the number (s,) of the set of each of many pieces: those are one whose places (m, 2), with normals (m, 2), lie on
-    one line and face the same way."""
+def _joined(places: _Places, many: int) -> Ints:
+    """Return the number (m,) of the set of each place: pieces are of one whose places lie on one line and face the same way."""
     one, other = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-    for rows in _strips(at, config.reach):
+    for rows in _strips(places.at):
         # Linking each place with its first neighbour joins the same sets as all of its links, of which there may be thousands.
-        one.append(piece[rows])
-        other.append(piece[rows][_together(at[rows], normal[rows], deviation[rows], config)])
-    return connected(np.concatenate(one), np.concatenate(other), many)
+        one.append(places.piece[rows])
+        other.append(places.piece[rows][_together(places.rows(rows))])
+    return connected(np.concatenate(one), np.concatenate(other), many)[places.piece]
 
 
-def _strips(at: Floats, reach: float) -> Iterator[Ints]:
+def _strips(at: Floats) -> Iterator[Ints]:
     """Yield rows of places (m, 2), a bounded number at a time: strips of the map that overlap by the reach."""
     order = np.argsort(at[:, 0], kind="stable")
     x = at[order, 0]
     for first in range(0, len(x), _AT_ONCE):
         last = min(first + _AT_ONCE, len(x))
-        yield order[first : np.searchsorted(x, x[last - 1] + reach, "right")]
+        yield order[first : np.searchsorted(x, x[last - 1] + WallPolicy.reach, "right")]
 
 
-_AT_ONCE = 1 << 13
-"""Places of a strip; bounds the memory."""
-
-
-def _together(at: Floats, normal: Floats, deviation: Floats, config: WallConfig) -> Ints:
-    """Return for each place (m, 2) with a normal (m, 2) the first one of its set; places that lie on one line and face the same
-    way are of one set."""
-    pairs = cKDTree(at).query_pairs(config.reach, output_type="ndarray")
-    places = np.stack([*at.T, *normal.T, deviation])
-    first = each = np.arange(len(at))
+def _together(places: _Places) -> Ints:
+    """Return for each place (m,) the first one of its set; places that lie on one line and face the same way are of one set."""
+    pairs = cKDTree(places.at).query_pairs(WallPolicy.reach, output_type="ndarray")
+    columns = np.stack([*places.at.T, *places.normal.T, places.deviation])
+    first = each = np.arange(len(places.at))
     # Some of the pairs link most of the places, and few others remain to be tested.
     for tested in (pairs[::_SOME], pairs):
         links = [np.stack([each, first])]
@@ -270,74 +293,50 @@ def _together(at: Floats, normal: Floats, deviation: Floats, config: WallConfig)
             one, other = tested[begin : begin + _PAIRS_AT_ONCE].T
             apart = np.flatnonzero(first.take(one) != first.take(other))
             one, other = one[apart], other[apart]
-            links.append(np.stack([one, other])[:, _on_one_line(config, one, other, places)])
+            links.append(np.stack([one, other])[:, _on_one_line(one, other, columns)])
         one, other = np.concatenate(links, axis=1)
-        own = connected(one, other, len(at))
+        own = connected(one, other, len(first))
         first = np.unique(own, return_index=True)[1][own]
     return first
 
 
-_SOME = 16
-"""One in so many pairs is tested first."""
-_PAIRS_AT_ONCE = 1 << 15
-"""Pairs that are processed together, so that they fit into the processor's cache."""
-
-
-def _on_one_line(config: WallConfig, one: Ints, other: Ints, places: Floats) -> Bools:
+def _on_one_line(one: Ints, other: Ints, places: Floats) -> Bools:
     """Return which pairs (e,) of places do, given coordinates, normals and the deviations of these, (5, m)."""
     x, y, ahead, left, deviation = places
     across, along = x.take(other) - x.take(one), y.take(other) - y.take(one)
     (ax, ay), (bx, by) = ((ahead.take(side), left.take(side)) for side in (one, other))
-    lean = config.lean + 2.0 * np.hypot(deviation.take(one), deviation.take(other))
+    lean = WallPolicy.lean + 2.0 * np.hypot(deviation.take(one), deviation.take(other))
     good = ax * bx + ay * by > np.cos(lean)
     for nx, ny in ((ax, ay), (bx, by)):
-        good &= np.abs(nx * across + ny * along) < config.off
+        good &= np.abs(nx * across + ny * along) < ShapePolicy.on
     return np.asarray(good)
 
 
-def _halved(number: Ints, at: Floats, normal: Floats, deviation: Floats, keyframe: Ints, config: WallConfig) -> Ints:
-    """Return the number (m,) of the set of each place, with bent sets halved along their length.
+def _halved(number: Ints, places: _Places) -> _Lines:
+    """Return the lines of sets of places, numbered (m,), with bent sets halved along their length.
 
     Heading errors of some mrad over a long distance bend a long wall in the map, which looks straight from each pose. Its parts
     are straight. Sets bent in one scan stay whole, and short ones: what bends within a metre is no bend of the poses.
     """
-    number = np.unique(number, return_inverse=True)[1]
-    centre, facing = _lines(number, at, normal, deviation)
-    bent = _scatter(number, at, centre, facing) > config.scatter
-    bent &= ~_curved(number, at, keyframe, facing, config)
-    bent &= _rms(number, _across(at - centre[number], facing[number]), len(centre)) > config.reach
-    for _ in range(config.halvings):
+    c, shape = WallPolicy, (places.at, places.normal, places.deviation)
+    lines = _Lines.fitted(number, *shape)
+    bent = (lines.scatter > ShapePolicy.on) & (_rms(number, lines.along(places.at), len(lines.centre)) > c.reach)
+    bent &= ~_curved(lines, places)
+    for _ in range(c.splits):
         if not bent.any():
             break
-        beyond = bent[number] & (_across(at - centre[number], facing[number]) < 0.0)
-        halves, number = np.unique(2 * number + beyond, return_inverse=True)
-        centre, facing = _lines(number, at, normal, deviation)
-        bent = bent[halves // 2] & (_scatter(number, at, centre, facing) > config.scatter)
-    return number
+        beyond = bent[lines.number] & (lines.along(places.at) < 0.0)
+        halves, number = np.unique(2 * lines.number + beyond, return_inverse=True)
+        lines = _Lines.fitted(number, *shape)
+        bent = bent[halves // 2] & (lines.scatter > ShapePolicy.on)
+    return lines
 
 
-def _lines(number: Ints, at: Floats, normal: Floats, deviation: Floats) -> tuple[Floats, Floats]:
-    """Return centre and normal (w, 2) of the line that fits each set of places (m, 2), numbered (m,): to where they are and, by
-    their deviations, to how they are turned."""
-    many = int(number.max(initial=-1)) + 1
-    weight = 1.0 / (deviation**2 + _TURNED**2)
-    centre, facing = _mean(number, at, np.ones(len(at)), many), _mean(number, normal, weight, many)
-    facing /= np.maximum(np.hypot(*facing.T), 1e-9)[:, None]
-    off, own = at - centre[number], facing[number]
-    across, along = dots(off, own), _across(off, own)
-    known = np.bincount(number, (along / _OFF) ** 2 + weight, many)
-    turn = np.bincount(number, _across(normal, own) * weight - along * across / _OFF**2, many) / known
-    return centre, se2.rotate(turn, facing)
-
-
-_TURNED, _OFF = 0.02, 0.02
-"""Standard deviations of pieces about the wall beside the noise of rays: by the poses, and because walls are not straight, rad
-and m."""
-
-
-def _scatter(number: Ints, at: Floats, centre: Floats, facing: Floats) -> Floats:
-    """Return the rms distance (w,) of places (m, 2) from the lines of their sets, m."""
-    return _rms(number, dots(at - centre[number], facing[number]), len(centre))
+def _curved(lines: _Lines, places: _Places) -> Bools:
+    """Return which sets of places (m,) are not straight in most of the keyframes that see them."""
+    seen, own = unique_rows(np.stack([lines.number, places.keyframe], axis=1))
+    alone = _Lines.fitted(own, places.at, lines.facing[lines.number], np.ones(len(own)))
+    return np.asarray(np.bincount(seen[:, 0], np.where(alone.scatter > ShapePolicy.on, 1.0, -1.0)) > 0.0)
 
 
 def _rms(number: Ints, values: Floats, many: int) -> Floats:
@@ -350,16 +349,25 @@ def _across(vectors: Floats, unit: Floats) -> Floats:
     return np.asarray(unit[:, 0] * vectors[:, 1] - unit[:, 1] * vectors[:, 0])
 
 
-def _curved(number: Ints, at: Floats, keyframe: Ints, facing: Floats, config: WallConfig) -> Bools:
-    """Return which sets of places (m, 2), numbered (m,), are not straight in most of the keyframes (m,) that see them."""
-    seen, own = unique_rows(np.stack([number, keyframe], axis=1))
-    ones = np.ones(len(at))
-    centre, facing = _lines(own, at, facing[number], ones)
-    off = _scatter(own, at, centre, facing) > config.scatter
-    return np.asarray(np.bincount(seen[:, 0], np.where(off, 1.0, -1.0)) > 0.0)
+def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArray[np.int8]:
+    """Return the kind of each of the clouds' points (p,), whose frames are (k, 3) in the map: 0 on a wall where rays showed
+    it, 1 on a column, -1 on neither."""
+    surfaces, kind = found.surfaces, np.full(len(clouds.points), -1, dtype=np.int8)
+    shown, on = _shown_walls(found, sensors), ShapePolicy.on
+    columns = surfaces.rows(surfaces.round)
+    near = surroundings(np.column_stack([columns.place, columns.radius]), on)
+    for first in range(0, len(kind), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        at = se2.transform_each(sensors, clouds.owner[part], clouds.points[part].astype(np.float64))
+        kind[part][np.isfinite(shown.query(at, distance_upper_bound=on)[0])] = 0
+        kind[part][near.on_rim(at, on)] = 1
+    return kind
 
 
-def _mean(number: Ints, values: Floats, weight: Floats, many: int) -> Floats:
-    """Return the weighted mean (m, 2) of values (s, 2) by their numbers (s,)."""
-    total = np.bincount(number, weight, many)
-    return np.stack([np.bincount(number, weight * v, many) / total for v in values.T], axis=1)
+def _shown_walls(found: MeasuredSurfaces, sensors: Floats) -> cKDTree:
+    """Return the middles of the cells of walls in which rays end."""
+    surfaces, rays, size = found.surfaces, found.rays.rows(~found.surfaces.round[found.rays.surface]), ShapePolicy.on
+    way, wall = surfaces.tangent, rays.surface.astype(np.intp)
+    along = dots(rays.in_map(sensors)[0] - surfaces.place.take(wall, axis=0), way.take(wall, axis=0))
+    wall, cell = unique_rows(np.column_stack([wall, np.floor(along / size).astype(np.intp)]))[0].T
+    return cKDTree(surfaces.place[wall] + ((cell + 0.5) * size)[:, None] * way[wall])

@@ -79,22 +79,16 @@ class PlaceSearch:
         return self._steps is None
 
     def begin(self, window: Window, odom: Floats, way: float) -> None:
-        """Begin to search the whole map with the measurements of a window.
-
-        Parameters
-        ----------
-        odom : (3,) present pose in the odometry frame. way : the odometer now, m.
-        """
+        """Begin to search the whole map with the measurements of a window, at a pose (3,) and way, m, of the odometry."""
         self._odom = odom.copy()
-        self._steps = self._compared(window.ranges_since(odom, way), *window.seen(odom, way, LOOK_BACK))
+        self._steps = self._compared(window.ranges_since(self._anchors, odom, way), *window.seen(odom, way, LOOK_BACK))
 
     def drop(self) -> None:
         """Cancel a running search."""
         self._steps = None
 
     def advance(self, bank: Hypotheses, odom: Floats) -> tuple[Comparison | None, int]:
-        """Do some units of work; return how well each place explains the window's measurements, if that was the last unit, and
-        the operations that were done.
+        """Do some units of work; return the comparison, if that was the last unit, and the operations that were done.
 
         Parameters
         ----------
@@ -114,15 +108,9 @@ class PlaceSearch:
         return None, done
 
     def _compared(self, ranges: Ranges, rays: Rays, ago: Floats) -> Generator[int, None, Comparison]:
-        """Search for places and weight them, and the present hypotheses, as of the search's beginning.
+        """Search for places and weight them, and the present hypotheses, by rays (p,) of so many metres ago.
 
-        Parameters
-        ----------
-        rays : of the last metres. ago : (p,) m driven since each.
-
-        Returns
-        -------
-        The comparison, in whose bank are the new places alone.
+        In the bank of the comparison are the new places alone.
         """
         recent = rays.rows(ago <= _SEARCH_LOOKS)
         found = yield from search.places(self._field, recent, ranges, self._bounds)
@@ -173,8 +161,7 @@ class PlaceSearch:
 def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
     """Return which poses (h, 3) stay: the first ones, and those of the others that are no earlier one's place.
 
-    One near an earlier one stays if it is far better: the tracked pose has slid along a wall, or the robot was carried a
-    little.
+    One near an earlier one stays if it is far better: the tracked pose has slid along a wall.
     """
     better = weight[before:] > weight[:before, None] + verdict.CERTAIN
     new = (hypotheses.apart(poses[:before, None], poses[before:]) | better).all(axis=0)

@@ -13,23 +13,16 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
-from ..lidar.degeneracy import measured_part
+from ..lidar.scan_matching import measured_part
 from ..odometry.wheels import OdometryNoiseConfig
 from ..radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
-from .range_model import ANYWHERE, POOR, RangeFacts, Ranges, mixture, range_factors
+from .range_model import ANYWHERE, POOR, SLOW_SIGMA, KnownAnchors, Ranges, mixture, range_factors
 from .walls import REACH, Rays, Walls
 
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 LASER_SIGMA = 0.02
 """rad, of the laser's heading: screws some centimetres apart, each within a millimetre. A map may be another robot's."""
-SLOW_SIGMA = 0.12
-"""m; common error of ranges to one anchor: multipath, antennas, the anchor's place."""
-SLOW_LEFT = 0.08
-"""m; the same where the map contains the range error at a place: the error that remains after correction by a few ranges
-nearby."""
-BIAS_SIGMA = 0.1
-"""m; error of all ranges to one anchor that stays, as CalibrationConfig.range_bias_sound: another tag has another delay."""
 SLOW_LENGTH = 5.0
 """m; correlation length of the slow error: fields of a room's size last longer than the 1.5 m of single reflections."""
 _WHEELS = OdometryNoiseConfig(heading_per_metre=0.02)
@@ -46,6 +39,8 @@ WIDTHS = np.geomspace(0.3, 0.1, MATCHES)
 """m; kernel width of each."""
 SAME = (0.5, 0.3)
 """m and rad; hypotheses that are closer are one."""
+PER_MOVE, PER_UPDATE = 4, 8
+"""Operations on elements of a covariance in a step of the odometry, for each unknown, and in a correction by a range."""
 _UNUSED = 1e-3
 """Weight up to which a range moves nothing."""
 
@@ -87,8 +82,14 @@ class Hypotheses(Table):
         return self.covariance[:, POSE, POSE]
 
 
+def none(anchors: int) -> Hypotheses:
+    """Return no hypothesis."""
+    n = FIRST_ANCHOR + 2 * anchors
+    return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
+
+
 def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA) -> Hypotheses:
-    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and prior values of the other unknowns.
+    """Return hypotheses at poses (h, 3) with covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
@@ -106,9 +107,7 @@ def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SL
 def placed(bank: Hypotheses, which: Ints, poses: Floats, covariances: Floats, effect: Floats) -> Hypotheses:
     """Return the hypotheses with the poses (w, 3) and covariances (w, 3, 3) that ranges give to some of them (w,).
 
-    Parameters
-    ----------
-    effect : (w, 3, a) by how much the poses move with the error that the ranges to an anchor have in common.
+    Poses move by effect (w, 3, a) with the error that the ranges to an anchor have in common.
     """
     mean, whole = bank.mean.copy(), bank.covariance.copy()
     mean[which, POSE] = poses
@@ -121,14 +120,10 @@ def placed(bank: Hypotheses, which: Ints, poses: Floats, covariances: Floats, ef
 
 
 def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float = SLOW_SIGMA) -> Hypotheses:
-    """Drive every hypothesis by one step of the odometry.
+    """Drive every hypothesis by one step (3,) of the odometry.
 
-    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance.
-
-    Parameters
-    ----------
-    step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
-        motion that the wheels did not measure. slow_sigma : standard deviation of the common error of ranges to one anchor, m.
+    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance, with a
+    standard deviation of slow_sigma, m. Slack, m and rad, is that of motion that the wheels did not measure.
     """
     d, turn = step[:2], float(step[2])
     way = float(np.hypot(*d))
@@ -161,8 +156,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
 def scan_factors(walls: Walls, poses: Floats, rays: Rays, width: float) -> tuple[Floats, Floats]:
     """Return the information (h, 3, 3) and gradient (h, 3) of a scan at poses (h, 3), of what it measures alone.
 
-    Along an aisle H comes from the scatter of the walls' normals: it is left out (lidar.degeneracy), or a hundred scans would
-    seem to measure a direction that none has measured.
+    Along an aisle H is the scatter of the walls' normals, which is left out (lidar.degeneracy).
     """
     hessian, spurious, gradient, weight = walls.factors(poses, rays, width)
     hessian, gradient = measured_part(hessian, spurious, gradient)
@@ -173,7 +167,7 @@ def scan_factors(walls: Walls, poses: Floats, rays: Rays, width: float) -> tuple
 def refined(poses: Floats, ranges: Ranges, walls: Walls | None = None, rays: Rays | None = None) -> Floats:
     """Return poses (c, 3) moved to where ranges, and scans where there are walls, together agree best nearby.
 
-    Along a wall scans measure nothing, and the ranges alone say where the robot is: all poses along it become one place.
+    Along a wall the ranges alone say where the robot is: all poses along it become one place.
     """
     poses = poses.copy()
     for width in WIDTHS:
@@ -188,15 +182,11 @@ def refined(poses: Floats, ranges: Ranges, walls: Walls | None = None, rays: Ray
 
 
 def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypotheses:
-    """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
+    """Correct every hypothesis by a scan, in the present frame of the base: an iterated Kalman update with robust weights.
 
     The scan measures the pose, turned by the error of the laser's mounting, so that the update is made for that, with prior
-    information I and the scan's H and gradient, and transferred to the state by its covariance with it.
-
-    Parameters
-    ----------
-    rays : in the present frame of the base. fresh : 0..1, how far the scan's error is independent of the one before: walls
-        are seen with the same cells' rounding until the robot has moved.
+    information I and the scan's H and gradient, and transferred to the state by its covariance with it. Fresh, 0..1, is how far
+    its error is independent of the one before: walls are seen with the same cells' rounding until the robot has moved.
     """
     if not len(bank):
         return bank
@@ -219,10 +209,10 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
-def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) -> tuple[Hypotheses, Floats, Floats, Floats]:
-    """Correct every hypothesis by one range, with its errors by anchor (slow), by place in the map and by direction.
-
-    How the pattern and the place's error change with the pose is left out of the Jacobian: 0.1 m per radian, 0.05 m per metre.
+def ranged(
+    bank: Hypotheses, anchors: KnownAnchors, k: int, metres: float, tag: Floats, share: float = 1.0
+) -> tuple[Hypotheses, Floats, Floats, Floats]:
+    """Correct every hypothesis by a range to anchor k, m, with its errors by anchor (slow), by place and by direction.
 
     Parameters
     ----------
@@ -234,28 +224,28 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats, share: float = 1.0) 
     The hypotheses, and for each the weight (h,), 0..1, that the range got, its log-likelihood (h,), 0 = the likeliest, and
     that of a range from anywhere (h,).
     """
-    theta = bank.mean[:, 2]
+    theta, place, noise = bank.mean[:, 2], anchors.positions[k], float(anchors.sigma[k])
     lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
-    offset = bank.mean[:, :2] + lever - fact.place
-    distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, WALL_SIGMA**2))
-    columns = fact.anchor + np.array([FIRST_ANCHOR, (FIRST_ANCHOR + bank.mean.shape[1]) // 2])
+    offset = bank.mean[:, :2] + lever - place
+    distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + anchors.rise[k], WALL_SIGMA**2))
+    columns = k + np.array([FIRST_ANCHOR, (FIRST_ANCHOR + bank.mean.shape[1]) // 2])
     waves = pattern_waves(np.arctan2(-offset[:, 1], -offset[:, 0]) - theta)
-    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, columns].sum(axis=1)
-    if fact.errors is not None:
-        shift += fact.errors.at(offset + fact.place)
-    error = fact.range - (1.0 + fact.scale) * distance - shift
+    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, columns].sum(axis=1) + anchors.bias[k]
+    if anchors.errors:
+        shift += anchors.errors[k].at(offset + place)
+    error = metres - (1.0 + anchors.scale) * distance - shift
     jacobian = np.zeros(bank.mean.shape)
     jacobian[:, PATTERN] = waves
-    unit = (1.0 + fact.scale) * offset / distance[:, None]
+    unit = (1.0 + anchors.scale) * offset / distance[:, None]
     jacobian[:, :2] = unit
     jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]
     jacobian[:, columns] = 1.0
     spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
     own = np.einsum("hi,hi->h", jacobian, spread)
-    sigma = np.sqrt(own + fact.sigma**2)
+    sigma = np.sqrt(own + noise**2)
     core, density = mixture(error, sigma)
     weight = core / density
-    gain = spread / (own + fact.sigma**2 / (share * np.maximum(weight, _UNUSED)))[:, None]
+    gain = spread / (own + noise**2 / (share * np.maximum(weight, _UNUSED)))[:, None]
     gain *= (weight > _UNUSED)[:, None]
     mean = bank.mean + gain * error[:, None]
     mean[:, 2] = se2.wrap_angle(mean[:, 2])

@@ -1,6 +1,5 @@
 """Input of a live localisation: anchors with their calibration, walls, and the mounting of the laser on the robot."""
 
-from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,50 +9,20 @@ from ..arrays import Floats
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult
-from ..radio.range_errors import RangeErrors, range_errors
+from ..radio.range_errors import range_errors
 from ..sensor_log.sensors import last_places
-from .hypotheses import BIAS_SIGMA, SLOW_LEFT, SLOW_SIGMA
-from .walls import Walls, walls_of
+from .range_model import BIAS_SIGMA, KnownAnchors
+from .walls import UNIFORM_VARIANCE, Walls, walls_of
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownAnchors:
-    """Anchors of the map; the expected range is ``(1 + scale) sqrt(D^2 + height^2 + rise) + bias``, see graph.range_edges."""
-
-    ids: tuple[str, ...]
-    positions: Floats
-    """(a, 2) m, map frame."""
-    bias: Floats
-    """(a,) m."""
-    rise: Floats
-    """(a,) m^2, squared height above the tag that the map's recording showed; 0 where a height was given."""
-    sigma: Floats
-    """(a,) m, spread of the map's range residuals."""
-    bias_sigma: Floats
-    """(a,) m, of the error that all ranges to it have in common: another tag than the map's, and the anchor's place."""
-    scale: float = 0.0
-    """Relative error of all ranges, 1."""
-    errors: tuple[RangeErrors, ...] = ()
-    """(a,) what remains, by the tag's place; empty where the map does not say it."""
-
-    @property
-    def slow_sigma(self) -> float:
-        """Standard deviation of further common error of ranges to one anchor, m."""
-        return SLOW_LEFT if self.errors else SLOW_SIGMA
-
-    def only(self, names: Container[str]) -> "KnownAnchors":
-        """Return the anchors that have one of these names."""
-        rows = [k for k, name in enumerate(self.ids) if name in names]
-        return replace(
-            self,
-            ids=tuple(self.ids[k] for k in rows),
-            positions=self.positions[rows],
-            bias=self.bias[rows],
-            rise=self.rise[rows],
-            sigma=self.sigma[rows],
-            bias_sigma=self.bias_sigma[rows],
-            errors=tuple(self.errors[k] for k in rows if self.errors),
-        )
+_DRAWN = np.diag(np.square((0.014, 0.014, 0.003)))
+"""m^2, rad^2; variance of a wall, and of a robot's laser upon it, in cells of 0.05 m: lidars measure a surface by its colour to
+0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
+_UNSTATED = np.diag(np.square((0.015, 0.015, 0.004)))
+"""m^2, rad^2; shape of a map of a room or two that does not say how far it is bent."""
+_UNBENT = np.zeros((0, 2)), np.zeros((0, *_DRAWN.shape))
+"""Shape of a map that does not say it."""
+_SIGMA, _LEAST_SIGMA = 0.1, 0.05
+"""m; spread of ranges to an anchor for which the map does not contain it, and the least one in another recording."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,30 +36,18 @@ class KnownMap:
     """(3,) pose by which the laser's place on the base differs from what recordings say; m, m, rad."""
     laser_delay: float = 0.0
     """s; a scan stamped t was taken at t + laser_delay by the odometry's clock."""
-
-    shape: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 3, 3)))
+    shape: tuple[Floats, Floats] = _UNBENT
     """Places (p, 2), m, and by how much the map is bent there, covariances (p, 3, 3), m and rad."""
 
     def covariance_at(self, places: Floats) -> Floats:
         """Return the covariances (..., 3, 3) of the map's own errors at places (..., 2): no filter averages these."""
-        cells = 0.0 if self.walls is None else self.walls.rounding / np.sqrt(12.0)
-        drawn = np.diag(np.square(_DRAWN) + np.square((cells, cells, 0.0)))
+        cells = 0.0 if self.walls is None else self.walls.rounding**2 * UNIFORM_VARIANCE
+        drawn = _DRAWN + np.diag((cells, cells, 0.0))
         where, bent = self.shape
         if not len(where):
-            return np.broadcast_to(drawn + _UNSTATED, (*places.shape[:-1], 3, 3))
+            return np.broadcast_to(drawn + _UNSTATED, (*places.shape[:-1], *drawn.shape))
         away = np.square(places[..., None, :] - where).sum(axis=-1)
         return np.asarray(drawn + bent[np.argmin(away, axis=-1)])
-
-
-_DRAWN = (0.014, 0.014, 0.003)
-"""m, m, rad; standard deviation of a wall, and of a robot's laser upon it, in cells of 0.05 m: lidars measure a surface by its
-colour to 0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
-_UNSTATED = np.diag(np.square((0.015, 0.015, 0.004)))
-"""m^2, rad^2; shape of a map of a room or two that does not say how far it is bent."""
-_SIGMA = 0.1
-"""m; spread of ranges to an anchor for which the map does not contain it."""
-_LEAST_SIGMA = 0.05
-"""m; largest standard deviation of such radios in another recording."""
 
 
 def from_result(result: StoredResult) -> KnownMap:
@@ -100,18 +57,21 @@ def from_result(result: StoredResult) -> KnownMap:
     ------
     DataError : it contains neither an anchor with a place nor a grid.
     """
-    calibration = _calibration(result.report)
+    report = result.report
+    entries = {str(e.get("name")): e.get("value") for e in report.get("calibration") or () if isinstance(e, dict)}
+    calibration = {name: number for name, value in entries.items() if np.isfinite(number := _number(value))}
     anchors = _with_errors(known_anchors(result.anchors, calibration), result)
     if not anchors.ids and result.grid is None:
         raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: no robot can be localized in it")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
-    walls = None if result.grid is None else walls_of(replace(result.grid, missing_share=_missing_share(result.report)))
-    return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0), _shape(result.report))
+    missing = _number(stated.get("missing_share")) if isinstance(stated := report.get("map"), dict) else np.nan
+    walls = None if result.grid is None else walls_of(replace(result.grid, missing_share=missing))
+    return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0), _shape(report))
 
 
 def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
     """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
-    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
+    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(len(_DRAWN)))
 
 
 def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:
@@ -120,21 +80,17 @@ def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float
     places = {radio: by_name[name] for radio, name in last_places(by_name).items()}
     last = {radio: a for radio, a in places.items() if a.status == "ok" and np.isfinite(a.position).all()}
     sigma = np.array([a.residual_rms if np.isfinite(a.residual_rms) else _SIGMA for a in last.values()])
+    # Of an anchor's place along a range from anywhere; nan where the map does not say it.
+    variance = np.nan_to_num(np.array([0.5 * float(np.trace(a.covariance)) for a in last.values()]), posinf=0.0)
     return KnownAnchors(
         tuple(last),
         np.array([a.position for a in last.values()]).reshape(-1, 2),
         np.array([a.bias if np.isfinite(a.bias) else 0.0 for a in last.values()]),
         np.array([max(calibration.get(f"height2:{a.id}", 0.0), 0.0) for a in last.values()]),
         np.maximum(sigma, _LEAST_SIGMA),
-        np.array([np.sqrt(BIAS_SIGMA**2 + _place_variance(a)) for a in last.values()]),
+        np.sqrt(BIAS_SIGMA**2 + variance),
         calibration.get("range_scale", 0.0),
     )
-
-
-def _place_variance(anchor: StoredAnchor) -> float:
-    """Return the variance of an anchor's place along a range from anywhere, m^2; 0 where the map does not say it."""
-    variance = 0.5 * float(np.trace(anchor.covariance))
-    return variance if np.isfinite(variance) else 0.0
 
 
 def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
@@ -151,29 +107,16 @@ def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
     return replace(anchors, errors=range_errors(anchor, tags, bearings, stored.errors[own], len(anchors.ids)))
 
 
-def _missing_share(report: dict[str, Any]) -> float:
-    """Return the share of beams towards walls without a reading that a report states; nan = it does not."""
-    stated = report.get("map")
-    share = stated.get("missing_share") if isinstance(stated, dict) else None
-    return float(share) if isinstance(share, int | float) else float("nan")
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
 
 
 def _shape(report: dict[str, Any]) -> tuple[Floats, Floats]:
     """Return places (p, 2) and covariances (p, 3, 3) of a report's entry `shape`; none where it has none that is sound."""
-    stated = report.get("shape")
-    if not isinstance(stated, dict):
-        return np.zeros((0, 2)), np.zeros((0, 3, 3))
     try:
-        poses, covariances = (np.array(stated[name], dtype=np.float64) for name in ("poses", "covariances"))
-        places, covariances = poses.reshape(-1, 3)[:, :2], covariances.reshape(len(poses), 3, 3)
+        poses, covariances = (np.array(report["shape"][name], dtype=np.float64) for name in ("poses", "covariances"))
+        places, covariances = poses.reshape(len(poses), -1)[:, :2], covariances.reshape(len(poses), *_DRAWN.shape)
     except (KeyError, TypeError, ValueError):
-        return np.zeros((0, 2)), np.zeros((0, 3, 3))
+        return _UNBENT
     sound = np.isfinite(places).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     return places[sound], covariances[sound]
-
-
-def _calibration(report: dict[str, Any]) -> dict[str, float]:
-    """Return the calibration values of a report by name."""
-    entries = [e for e in report.get("calibration") or () if isinstance(e, dict)]
-    found = {str(e.get("name")): e.get("value") for e in entries}
-    return {name: float(value) for name, value in found.items() if isinstance(value, int | float) and np.isfinite(value)}

@@ -22,6 +22,14 @@ CONSEQUENCES = {
     "gyro": "directions are the wheels' own",
 }
 """The consequence of each silent sensor; a gyro is reported only where one sent before."""
+_PERIODS = 3.0
+"""Missed periods of a sensor that show silence."""
+_FIRST_PERIOD = 2.0
+"""s, as long as a sensor's own is not known: that of a radio that measures at rest."""
+_FORGETTING = 0.05
+"""Share of the longest period that every message forgets."""
+_NAMED = 10
+"""Most unknown anchors that are named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,28 +40,6 @@ class Patience:
     """s, and three periods, after which a sensor, or the whole log, is said to be silent."""
     lost: float = 10.0
     """s without any data after which the pose counts as lost."""
-
-
-_PERIODS = 3.0
-"""Missed periods of a sensor that show silence."""
-_FIRST_PERIOD = 2.0
-"""s, as long as a sensor's own is not known: that of a radio that measures at rest."""
-_FORGETTING = 0.05
-"""Share of the longest period that every message forgets."""
-
-
-@dataclass(slots=True)
-class Sensor:
-    """What was heard from one sensor."""
-
-    last: float
-    """s, time of its last message."""
-    longest: float = _FIRST_PERIOD
-    """s, its longest period of late."""
-
-    def limit(self, late: float) -> float:
-        """Return the silence, s, from which on it is late, where `late` is the least one for any sensor."""
-        return max(late, _PERIODS * self.longest)
 
 
 @dataclass(slots=True)
@@ -67,28 +53,34 @@ class Silence:
     """s of silence, and _PERIODS periods of the sensor, from which on it is late."""
     expected: tuple[str, ...] = ()
     """Sensors that should be there."""
-    sensors: dict[str, Sensor] = field(default_factory=dict)
+    last: dict[str, float] = field(default_factory=dict)
+    """s, time of each sensor's last message."""
+    longest: dict[str, float] = field(default_factory=dict)
+    """s, its longest period of late."""
     now: float = -float("inf")
     """s, time of the last message of all."""
 
     def hear(self, name: str, stamp: float) -> None:
         """Take the time, s, of a message; one that is late or broken does not set time back."""
-        if not self.sensors:
-            self.sensors = {each: Sensor(stamp) for each in self.expected}
-        sensor = self.sensors.setdefault(name, Sensor(stamp))
+        if not self.last:
+            self.last = dict.fromkeys(self.expected, stamp)
+        last = self.last.setdefault(name, stamp)
         # A silence is no period: it counts as far as the next one is to be noticed soon.
-        period = min(stamp - sensor.last, _PERIODS * self.late)
-        sensor.longest = max(period, (1.0 - _FORGETTING) * sensor.longest)
-        sensor.last, self.now = max(sensor.last, stamp), max(self.now, stamp)
+        period = min(stamp - last, _PERIODS * self.late)
+        self.longest[name] = max(period, (1.0 - _FORGETTING) * self.longest.get(name, _FIRST_PERIOD))
+        self.last[name], self.now = max(last, stamp), max(self.now, stamp)
 
     def silent(self, quiet: float = 0.0) -> dict[str, float]:
         """Return the sensors that are late, with their silence in s, where nothing at all came for `quiet` s."""
-        ages = {name: self.now - sensor.last + quiet for name, sensor in self.sensors.items()}
-        return {name: age for name, age in ages.items() if age > self.sensors[name].limit(self.late)}
+        ages = {name: self.now - last + quiet for name, last in self.last.items()}
+        return {name: age for name, age in ages.items() if age > self._limit(name)}
 
     def all_late(self, quiet: float) -> bool:
         """Return whether all sensors should have sent something within `quiet` s."""
-        return quiet > min((s.limit(self.late) for s in self.sensors.values()), default=self.late)
+        return quiet > min(map(self._limit, self.last), default=self.late)
+
+    def _limit(self, name: str) -> float:
+        return max(self.late, _PERIODS * self.longest.get(name, _FIRST_PERIOD))
 
 
 class LiveFeed:
@@ -145,8 +137,8 @@ class LiveFeed:
         if self._reader.broken:
             self._note(f"{self._reader.broken} broken lines were left out")
         if self._localizer is not None and (names := self._localizer.strangers):
-            some = ", ".join(f"{name} ({count})" for name, count in sorted(names.items())[:10])
-            more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+            some = ", ".join(f"{name} ({count})" for name, count in sorted(names.items())[:_NAMED])
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
             self._note(f"ranges to anchors that are not in the map: {some}{more}")
         if self._localizer is not None and self._localizer.refused:
             self._note(f"{self._localizer.refused} measurements were left out, stamped seconds ahead of all others")
@@ -178,9 +170,8 @@ class LiveFeed:
                 # It comes late: only now the log has said where the laser sits.
                 self._localizer = localizer = Localizer(self._known, self._mounting(self._reader.mounting))
             self._sees = True
-            s = measured.value
-            scanner = Scanner(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
-            yield self._aged(localizer.add_scan(measured.stamp, s.ranges[0], scanner))
+            scans = measured.value
+            yield self._aged(localizer.add_scan(measured.stamp, scans.ranges[0], Scanner.of(scans)))
 
     def _watch(self, measured: Measured) -> None:
         """Report once when a sensor that was there, or should be, becomes silent, and when it is back."""
@@ -201,8 +192,7 @@ class LiveFeed:
         silent = self.silence.silent(quiet)
         if not quiet:
             return replace(state, silent=silent) if silent else state
-        away = UNSEEN_SPEED * quiet
-        drift = np.diag(np.square([away, away, min(away, np.pi)]))
+        drift = np.diag(np.square(np.minimum(UNSEEN_SPEED * quiet, (np.inf, np.inf, np.pi))))
         state = replace(state, age=quiet, silent=silent, covariance=state.covariance + drift)
         if quiet <= self._patience.lost:
             return state

@@ -31,9 +31,11 @@ _SPACING = (0.1, 0.1, 1.0)
 """m, rad and s between poses, and between the scans that are used: nearer ones are redundant."""
 _CONTRADICTION = 1e-5
 """Probability of two passes that agree to be as far apart."""
+_DIGITS = 4
+"""Of shares in findings."""
 _REPORTED = 1000
 """Events between two reports of progress."""
-_RANGE, _ODOMETRY, _SCAN = range(3)
+_RANGE, _ODOMETRY, _SCAN = 0, 1, 2
 """Kinds of events; of a range and an odometry at the same time the range comes first, and waits."""
 
 Progress = Callable[[str, int, int], object]
@@ -123,10 +125,10 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
         reason = passes[0].reason or passes[1].reason or "measurements and map fell apart meanwhile"
         text = f"{1.0 - localized:.0%} of the recording is not localized and left out: {reason}"
         say = doubt if localized < LEAST_LOCALIZED else warning
-        findings.append(say("not-localized", text, localized=round(localized, 4)))
+        findings.append(say("not-localized", text, localized=round(localized, _DIGITS)))
     if (agreed := 1.0 - float(contradicting[there].mean())) < LEAST_LOCALIZED:
         text = f"forwards and backwards the recording is found at different places for {1.0 - agreed:.0%} of its poses"
-        findings.append(doubt("ambiguous-place", text, agreed=round(agreed, 4)))
+        findings.append(doubt("ambiguous-place", text, agreed=round(agreed, _DIGITS)))
     return Localization(
         log.odometry.stamps[rows][there], poses[there], covariances[there], localized, overlap,
         of_severity(findings, WARNING), of_severity(findings, DOUBT),
@@ -180,11 +182,10 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
     report : called with the events that are done and their number.
     """
     sign, s = -1.0 if backwards else 1.0, log.scans
-    scanner = None
-    if s is not None:
-        scanner = Scanner(s.angle_min, s.angle_increment, sign * s.time_increment, s.range_min, s.range_max)
+    scanner = None if s is None else Scanner.of(s, sign)
     localizer = Localizer(replace(known, laser_delay=sign * known.laser_delay), log.mounting, scanner)
-    poses, covariances = np.full((len(log.odometry.stamps), 3), np.nan), np.full((len(log.odometry.stamps), 3, 3), np.nan)
+    poses = np.full(log.odometry.poses.shape, np.nan)
+    covariances = np.full((*poses.shape, *poses.shape[1:]), np.nan)
     times, kinds, numbers = _events(log, known, sign)
     wanted, reason = set(rows.tolist()), ""
     for done, (at, kind, k) in enumerate(zip(times.tolist(), kinds.tolist(), numbers.tolist(), strict=True)):

@@ -20,17 +20,12 @@ from ..odometry.odometer import Odometer
 from ..sensor_log import SensorMounting, plausible
 from .known_map import KnownMap
 from .pose_estimator import LocalizerState, PoseEstimator
-from .range_model import RangeFacts
-from .sensing import LEAD, Range, Scan, Scanner, Waiting, scan_rays
+from .sensing import CONFIRMED, LEAD, Range, Scan, Scanner, Waiting, scan_rays
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""
 UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
-_SET_BACK, _IN_A_ROW = 0.5, 4
-"""s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
-
-
 _WORK = 4_000_000
 """Operations of a step from which on it uses no further measurement: after a silence many are due at once, and where the pose
 is not known each is compared with many places."""
@@ -52,24 +47,24 @@ class Localizer:
     """
 
     def __init__(self, known: KnownMap, mounting: SensorMounting | None = None, scanner: Scanner | None = None) -> None:
-        self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
+        self.mounting, self.scanner = mounting or SensorMounting(), scanner
+        heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
+        self.known = known = replace(known, anchors=replace(known.anchors, rise=known.anchors.rise + np.square(heights)))
         self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
         self._odometer, self._turns, self._waiting = Odometer(), GyroTurns(), Waiting()
-        self._wheels, self._measured = np.full(3, np.nan), -np.inf
+        self._estimator = PoseEstimator(known, self._odometer)
+        self._wheels, self._measured = np.full_like(known.laser_correction, np.nan), -np.inf
         self._patience = _PATIENCE
-        self._leap: tuple[float, Floats] | None = None
-        self._leaps = 0
-        self._behind: list[tuple[float, Floats]] = []
+        self._astray: list[tuple[float, Floats]] = []
+        """Poses whose stamps do not continue the others: as long as it is not clear whether the clock was set."""
+        self._refused = 0
         self._range_clock: SensorClock[tuple[int, float, int]] = SensorClock(self.on_time)
         self._scan_clock: SensorClock[tuple[Floats, Scanner]] = SensorClock(self.on_time)
         self._step, self._silences = 0.0, 0
         """Last step of the odometry's stamps, s, and how many were far longer than the one before."""
         self._clock_shift = 0.0
         """s, added to the odometry's stamps so that time goes on where its clock was set back."""
-        self._estimator = PoseEstimator(known, self._odometer)
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
-        heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
-        self._square = np.square(heights) + known.anchors.rise
         self._rays = 0
         """Of a scan; 0 = none has come."""
         self.strangers: dict[str, int] = {}
@@ -77,8 +72,8 @@ class Localizer:
 
     @property
     def refused(self) -> int:
-        """Measurements that were left out, of whatever kind: stamped seconds ahead of all others."""
-        return self._waiting.refused + self._leaps
+        """Measurements that were left out, of whatever kind: stamped seconds apart from all others."""
+        return self._waiting.refused + self._refused
 
     @property
     def work(self) -> int:
@@ -102,24 +97,16 @@ class Localizer:
         self._estimator.work = 0
         wheels[~(np.abs(wheels) < _BEYOND)] = np.nan
         stamp += self._clock_shift
-        if stamp < self._measured - _SET_BACK:
-            self._set_back(stamp, wheels)
+        ahead = len(self._odometer) > 0 and self._odometer.stamp + LEAD < stamp < np.inf
+        if ahead or stamp < self._measured - JUMP:
+            self._set_aside(stamp, wheels, ahead)
             return self.state()
-        self._behind = []
+        self._refused, self._astray = self._refused + len(self._astray), []
         if self._measured < min(stamp, self._odometer.stamp) and stamp <= self._measured + LEAD:
             # It was not silent but late, or rare: the bridged motion is measured now, and the next time the localiser waits
             # longer.
             self._patience = min(2.0 * self._patience, LEAD)
             self._odometer.forget_from(np.nextafter(self._measured, np.inf))
-        leap, self._leap = self._leap, None
-        if leap is not None and stamp > leap[0]:
-            self._move(*leap)
-        elif leap is not None:
-            self._leaps += 1
-        if len(self._odometer) and np.isfinite(stamp) and stamp > self._odometer.stamp + LEAD:
-            # After a silence or by a fault: the next one decides.
-            self._leap = (stamp, wheels)
-            return self.state()
         self._move(stamp, wheels)
         self._waiting.refuse(self._odometer.stamp)
         self._work_off()
@@ -196,20 +183,25 @@ class Localizer:
         """Return a sensor's stamp on a clock that was never set back, s: the sensor's was, if that brings it nearer."""
         return min(stamp + self._clock_shift, stamp, key=lambda t: abs(t - self._odometer.stamp))
 
-    def _set_back(self, stamp: float, wheels: Floats) -> None:
-        """Take a pose (3,) of the wheels that is behind the last one; the clock was set back when several come in order."""
-        if self._behind and stamp <= self._behind[-1][0]:
-            self._behind = []
-        self._behind.append((stamp, wheels))
-        if len(self._behind) < _IN_A_ROW:
+    def _set_aside(self, stamp: float, wheels: Floats, ahead: bool) -> None:
+        """Take a pose (3,) of the wheels whose stamp does not continue the others.
+
+        After a silence, or because the clock was set, several come in order; one alone is a fault.
+        """
+        if self._astray and not 0.0 < stamp - self._astray[-1][0] <= LEAD:
+            self._refused, self._astray = self._refused + len(self._astray), []
+        self._astray.append((stamp, wheels))
+        if len(self._astray) < (2 if ahead else CONFIRMED):
             return
-        behind, self._behind = self._behind, []
-        # The first of them was one period after the last one by the old clock.
-        shift = self._measured + (behind[1][0] - behind[0][0]) - behind[0][0]
-        self._clock_shift += shift
-        self._odometer.forget_from(behind[0][0] + shift)
-        for earlier, pose in behind:
-            self._move(earlier + shift, pose)
+        astray, self._astray = self._astray, []
+        if not ahead:
+            # The first of them was one period after the last one by the old clock.
+            shift = self._measured + (astray[1][0] - astray[0][0]) - astray[0][0]
+            self._clock_shift += shift
+            astray = [(earlier + shift, pose) for earlier, pose in astray]
+            self._odometer.forget_from(astray[0][0])
+        for at, pose in astray:
+            self._move(at, pose)
         self._work_off()
 
     def _move(self, stamp: float, wheels: Floats) -> None:
@@ -237,7 +229,8 @@ class Localizer:
             if isinstance(entry, Scan):
                 self._estimator.use_scan(scan_rays(self._odometer, self._laser, entry))
             else:
-                self._use_range(entry, until, poses[until])
+                tag = self.mounting.tags[entry.tag, :2]
+                self._estimator.use_range(entry.anchor, entry.metres, tag, until, poses[until])
         self._estimator.search_or_check(free=free)
 
     def _bridge_silence(self) -> None:
@@ -245,21 +238,8 @@ class Localizer:
         latest = self._waiting.latest(self._odometer.stamp)
         gap = latest - self._odometer.stamp
         if gap > self._patience:
-            self._odometer.add(latest - 0.1, self._odometer.pose.copy())
-            self._estimator.wander(UNSEEN_SPEED * min(gap, 3.0))
-
-    def _use_range(self, entry: Range, stamp: float, then: Floats) -> None:
-        anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor
-        fact = RangeFacts(
-            anchor,
-            anchors.positions[anchor],
-            entry.metres - float(anchors.bias[anchor]),
-            float(self._square[anchor]),
-            float(anchors.sigma[anchor]),
-            anchors.scale,
-            anchors.errors[anchor] if anchors.errors else None,
-        )
-        self._estimator.use_range(fact, tags[min(max(entry.tag, 0), len(tags) - 1), :2], stamp, then)
+            self._odometer.add(latest, self._odometer.pose.copy())
+            self._estimator.wander(UNSEEN_SPEED * min(gap, LEAD))
 
 
 def _numbers(**values: float) -> list[float]:

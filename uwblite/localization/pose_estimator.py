@@ -19,29 +19,29 @@ from . import hypotheses, verdict
 from .comparison import LOOK_BACK, Comparison, PlaceSearch
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
-from .range_model import MOMENTS, RangeFacts, bias_effect, range_moments, repeated
+from .range_model import MOMENTS, bias_effect, range_moments, repeated
 from .running_fit import FIT_LOST, FIT_SOUND, SUPPORT, full_agreement
 from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
-_FRESH_WAY = 0.1
-"""m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion."""
+_FRESH_WAY = _UNFELT = 0.1
+"""m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion. And m and rad,
+motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _STILL = 1e-3
 """m; a robot that has driven less stands."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
-_UNFELT = 0.1
-"""m and rad; motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _UNIT_WAY = 1.0
 """m driven between two comparisons of the map's unit with the sensors'."""
 _PROVEN = 3
 """Comparisons of the unit that a tracked pose must have passed, two metres of driving, for the map to count as right."""
-_MOST, _FORGET = 40, -14.0
+_MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
 """Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
 """Most parts of the window: a quarter of ten metres is enough for a start."""
+_STANDS = np.zeros(3)
 _SCANS_DIFFER = "the scans do not fit the walls any more"
 
 
@@ -64,7 +64,7 @@ class LocalizerState:
     """The pose is not known, or not to half a metre; `pose` is the best guess."""
     reason: str = ""
     """Why it is not known, for people."""
-    alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    alternatives: Floats = field(default_factory=lambda: hypotheses.none(0).poses)
     """(k, 3) other poses that are possible, the likeliest first."""
     moved_anchors: tuple[str, ...] = ()
     """Anchors whose ranges have disagreed for long with a pose on which all other measurements agree."""
@@ -75,11 +75,9 @@ class LocalizerState:
 
 
 class PoseEstimator:
-    """Find and track a robot.
+    """Find and track a robot in a known map.
 
-    Parameters
-    ----------
-    known : the map. odometer : the odometry of the last seconds, which the caller updates: its last pose is the present one.
+    The caller updates the odometer, the odometry of the last seconds: its last pose is the present one.
     """
 
     def __init__(self, known: KnownMap, odometer: Odometer) -> None:
@@ -92,7 +90,7 @@ class PoseEstimator:
         self.tracks = False
         """Whether one place is tracked, however vague the pose has become."""
         self._odometer = odometer
-        self._bank = hypotheses.started(np.zeros((0, 3)), np.zeros((0, 3, 3)), anchors.bias_sigma)
+        self._bank = hypotheses.none(len(anchors.ids))
         self._places = PlaceSearch(known)
         self._searched = Window()
         """Measurements of the running search."""
@@ -102,6 +100,7 @@ class PoseEstimator:
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
+        self._noise = anchors.noise
         self._range_way = np.full(len(anchors.ids), -np.inf)
         """(a,) m, odometer at the last range to each anchor."""
         self._search_stamp = -np.inf
@@ -115,39 +114,39 @@ class PoseEstimator:
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
         self._bank = self._moved(step, 0.0)
-        self.work += 4 * self._bank.covariance.size * self._bank.mean.shape[1]
+        self.work += hypotheses.PER_MOVE * self._bank.covariance.size * self._bank.mean.shape[1]
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
-        """Increase the uncertainty of the pose by a standard deviation, m and rad, of unmeasured motion.
-
-        Measurements before and after it cannot be combined.
-        """
-        self._bank = self._moved(np.zeros(3), sigma)
+        """Add unmeasured motion, a standard deviation in m and rad; measurements before and after it cannot be combined."""
+        self._bank = self._moved(_STANDS, sigma)
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
-    def use_range(self, fact: RangeFacts, tag: Floats, stamp: float, then: Floats) -> None:
+    def use_range(self, anchor: int, metres: float, tag: Floats, stamp: float, then: Floats) -> None:
         """Take a range of the tag at a place (2,) of the base, m, at a time, s, at which the odometry had a pose (3,)."""
-        self._window.add_range(WindowRange(fact, then, tag, self._way, stamp))
+        self._window.add_range(WindowRange(anchor, metres, then, tag, self._way, stamp))
         if not len(self._bank):
             return
+        anchors, (white, length) = self.known.anchors, self._noise[anchor]
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
-        driven = self._way - self._range_way[fact.anchor]
-        share = 1.0 / float(repeated((fact.white / fact.sigma) ** 2, fact.length, driven))
-        self._range_way[fact.anchor] = self._way
-        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm, share)
-        self.work += 8 * bank.covariance.size
+        driven = self._way - self._range_way[anchor]
+        share = 1.0 / float(repeated((white / anchors.sigma[anchor]) ** 2, length, driven))
+        self._range_way[anchor] = self._way
+        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, anchors, anchor, metres, arm, share)
+        self.work += hypotheses.PER_UPDATE * bank.covariance.size
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
-        self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
+        self._running.add_range(anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
 
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
-        odometer, walls, turned = self._odometer, self.known.walls, rays.moved(self._laser_turn())
+        odometer, walls = self._odometer, self.known.walls
         if walls is None or not len(rays.hit):
             return
-        some = turned.spread(RAYS)
+        # As the laser is mounted, by the best hypothesis.
+        turn = self._bank.mean[np.argmax(self._bank.log_weight), hypotheses.LASER] if len(self._bank) else 0.0
+        some = rays.moved(np.array([0.0, 0.0, turn])).spread(RAYS)
         doubted_since = self._running.matched if self.tracks and self._running.in_doubt() else -np.inf
         if self._window.wants_look(self._way, odometer.stamp, doubted_since):
             self._window.add_look(WindowLook(some, odometer.pose.copy(), self._way, odometer.stamp))
@@ -158,7 +157,7 @@ class PoseEstimator:
         self._bank, found = self._matched(before, walls, rays, some, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
-            pushed, there = self._matched(self._moved(np.zeros(3), _UNFELT), walls, rays, some, 1.0)
+            pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)
             if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
@@ -173,17 +172,15 @@ class PoseEstimator:
         self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), odometer.stamp)
 
     def search_or_check(self, *, free: bool) -> None:
-        """Look whether the pose still holds; do some units of a search that is under way, or begin one where it is time for it.
+        """Look whether the pose still holds; do some units of a search, or begin one where it is time for it.
 
-        Parameters
-        ----------
-        free : no scan was used in this step: there is time to search, and to compare units. Every scan brings a free step.
+        Free: no scan was used in this step, and there is time to search and to compare units. Every scan brings a free step.
         """
         if self.tracks and (why := self._doubted(free)):
             self._lose(why, self._running.agreed())
         elif not self.tracks and self._running.jumped():
             self._lose("the ranges do not fit what was measured before; was the robot carried?", self._running.agreed())
-        odom = self._odometer.pose
+        odom, now = self._odometer.pose, self._odometer.stamp
         if not self.tracks and len(self._window.ranges) > 2 * self._searched_ranges:
             # The new ones leave far fewer places to compare: sooner done than what is under way.
             self._places.drop()
@@ -197,7 +194,10 @@ class PoseEstimator:
                 self._decide_by(compared)
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
-        elif free and (not self.tracks or self._running.in_doubt()) and self._due():
+            return
+        due = self._way - self._search_way >= _SEARCH_WAY or now - self._search_stamp >= _SEARCH_TIME
+        if free and due and (not self.tracks or self._running.in_doubt()):
+            self._search_way, self._search_stamp = self._way, now
             # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
             # wrong place by chance.
             self._searched = self._window.since(self._running.matched) if self.tracks else self._window.newest(self._parts)
@@ -216,7 +216,7 @@ class PoseEstimator:
         order = np.argsort(-bank.log_weight, kind="stable")
         best = int(order[0])
         share, covariance = hypotheses.mixed(bank, best)
-        fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / SUPPORT
+        fit = np.exp(running.fit - FIT_SOUND) if self._window.looks else running.ranges / SUPPORT
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self.tracks else 0.5)
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         reason = verdict.vague(covariance) if self.tracks else self._reason
@@ -231,38 +231,20 @@ class PoseEstimator:
         self.work += len(bank) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
         return bank, walls.agreement(bank.poses, some)
 
-    def _laser_turn(self) -> Floats:
-        """Return the pose (3,) of the base as the laser's stated mounting shows it, in its own frame; m, m, rad."""
-        mean = self._bank.mean
-        turn = float(mean[np.argmax(self._bank.log_weight), hypotheses.LASER]) if len(mean) else 0.0
-        return np.array([0.0, 0.0, turn])
-
-    def _sees(self) -> bool:
-        return bool(self._window.looks)
-
-    def _due(self) -> bool:
-        """Return whether it is time for another search, and record it."""
-        now = self._odometer.stamp
-        if self._way - self._search_way < _SEARCH_WAY and now - self._search_stamp < _SEARCH_TIME:
-            return False
-        self._search_way, self._search_stamp = self._way, now
-        return True
-
     def _doubted(self, free: bool) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
-        A pose that ranges support is rejected only where another place explains the later measurements better. Where there is
-        time, free, the map's unit is compared with that of the sensors by the last metres.
+        A pose that ranges support is rejected only where another place explains the later measurements better.
         """
         odom, way = self._odometer.pose, self._way
         if free and way - self._unit_way >= _UNIT_WAY:
             self._unit_way, self._compared = way, self._compared + 1
             rays, ago = self._window.seen(odom, way, LOOK_BACK)
-            ranges, looks = self._window.ranges_since(odom, way), len(np.unique(ago))
+            ranges, looks = self._window.ranges_since(self.known.anchors, odom, way), len(np.unique(ago))
             if why := verdict.other_unit(self.known.walls, self._bank.poses[0], rays, looks, ranges, False):
                 self._compared = 0
                 return why
-        if self._sees() and self._running.scans_contradict():
+        if self._window.looks and self._running.scans_contradict():
             return "" if self._running.ranges_vouch(self._odometer.stamp) else _SCANS_DIFFER
         return "the ranges do not fit the anchors any more" if self._running.ranges_contradict() else ""
 
@@ -316,7 +298,7 @@ class PoseEstimator:
         if not self._reason:
             self.tracks = True
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
-            self._running.restart(self._sees())
+            self._running.restart(bool(self._window.looks))
 
     def _agreed(self, pose: Floats | None) -> float:
         """Return over how many metres driven searches found the same place alone, that of a pose (3,) now; None = none."""

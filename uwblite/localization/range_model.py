@@ -1,6 +1,7 @@
 """Ranges at poses of the map: their errors, the likelihood of a window of them, and the pose that they determine."""
 
-from dataclasses import dataclass
+from collections.abc import Container
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ DRIFT = 0.03
 """m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 ANYWHERE = 30.0
 """m over which ranges are distributed where the place is unknown: the reach of the radio indoors."""
+SLOW_SIGMA, SLOW_LEFT = 0.12, 0.08
+"""m; common error of ranges to one anchor that fades: multipath, antennas, the anchor's place; and what is left of it where the
+map contains the range error at a place."""
+BIAS_SIGMA = 0.1
+"""m; error of all ranges to one anchor that stays, as CalibrationConfig.range_bias_sound: another tag has another delay."""
 _WILD, _WIDTH = 0.05, 2.0 * ANYWHERE
 """Share of gross errors, and their width, m."""
 _SAME_PLACE = 0.01
@@ -45,7 +51,7 @@ VISITED = Detours(0.12, 0.4)
 def mixture(error: NDArray[Any], sigma: NDArray[Any], detours: Detours = NEW_PLACE) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the densities (...) of errors with standard deviations (...), m: those without a detour, and all of them.
 
-    The mixture of radio.nlos_mixture, a normal error of 0 having the density 1, for thousands of poses: the normal distribution
+    The mixture of radio.nlos_mixture for thousands of poses, a normal error of 0 having the density 1. The normal distribution
     is that of Page, Applied Statistics 1977 (off by 2e-4).
     """
     z, ratio = error / sigma, sigma / detours.mean
@@ -63,35 +69,43 @@ _LARGEST = 50.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeFacts:
-    """One range and its parameters."""
+class KnownAnchors(Table):
+    """Anchors of the map (a,); the expected range is ``(1 + scale) sqrt(D^2 + rise) + bias``, see graph.range_edges."""
 
-    anchor: int
-    """Number of the anchor in the map."""
-    place: Floats
-    """(2,) of the anchor, m."""
-    range: float
-    """m, as measured, less the anchor's bias."""
-    square: float
-    """m^2, squared height of the anchor above the tag."""
-    sigma: float
-    """m, white part of the noise."""
-    scale: float
-    """Relative error of all ranges."""
-    errors: RangeErrors | None = None
-    """By the tag's place, from the map."""
-
-    @property
-    def white(self) -> float:
-        """Standard deviation of the part of the noise that is new in every range, m."""
-        if self.errors is None:
-            return float(np.sqrt(1.0 - _NOISE.slow_share)) * self.sigma
-        return min(self.errors.noise.white, self.sigma)
+    ids: tuple[str, ...]
+    positions: Floats
+    """(a, 2) m, map frame."""
+    bias: Floats
+    """m."""
+    rise: Floats
+    """m^2, squared height above the tag, as far as it is known: by the map's recording, or stated for the robot."""
+    sigma: Floats
+    """m, spread of the map's range residuals."""
+    bias_sigma: Floats
+    """m, of the error that all ranges to it have in common: another tag than the map's, and the anchor's place."""
+    scale: float = 0.0
+    """Relative error of all ranges, 1."""
+    errors: tuple[RangeErrors, ...] = ()
+    """(a,) what remains, by the tag's place; empty where the map does not say it."""
 
     @property
-    def length(self) -> float:
-        """Correlation length of the rest, m."""
-        return _NOISE.correlation_length if self.errors is None else self.errors.noise.length
+    def slow_sigma(self) -> float:
+        """Standard deviation of further common error of ranges to one anchor, m."""
+        return SLOW_LEFT if self.errors else SLOW_SIGMA
+
+    @property
+    def noise(self) -> Floats:
+        """(a, 2) m, standard deviation of the noise that is new in every range, and correlation length of the rest."""
+        if self.errors:
+            return np.array([(min(e.noise.white, s), e.noise.length) for e, s in zip(self.errors, self.sigma, strict=True)])
+        white = np.sqrt(1.0 - _NOISE.slow_share) * self.sigma
+        return np.column_stack([white, np.full_like(white, _NOISE.correlation_length)])
+
+    def only(self, names: Container[str]) -> "KnownAnchors":
+        """Return the anchors that have one of these names."""
+        rows = [k for k, name in enumerate(self.ids) if name in names]
+        errors = tuple(self.errors[k] for k in rows if self.errors)
+        return replace(self.rows(np.array(rows, dtype=np.intp)), ids=tuple(self.ids[k] for k in rows), errors=errors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,15 +137,10 @@ class Ranges(Table):
 
 
 def repeated(white: Floats | float, length: Floats | float, driven: Floats | float) -> Floats:
-    """Return how many ranges (...) to one anchor have the information of one independent one.
+    """Return how many ranges (...) to one anchor have the information of an independent one, each driven m after the other.
 
     Multipath and shadows are the same until the tag has moved: the mean of errors with covariance ``exp(-d / length)`` every d
-    has the variance of independent ones every ``2 length``. The white part of the noise is new every time.
-
-    Parameters
-    ----------
-    white : (...) share of the variance that is new in every range, 0..1. length : (...) correlation length of the rest, m.
-    driven : (...) m since the last range to the anchor.
+    has the variance of independent ones every ``2 length``. The white share of the variance, 0..1, is new every time.
     """
     return np.asarray(white + (1.0 - white) * np.maximum(2.0 * length / np.maximum(driven, _SAME_PLACE), 1.0))
 
@@ -177,11 +186,8 @@ def expected_errors(poses: Floats, ranges: Ranges, errors: tuple[RangeErrors, ..
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; with NLOS and gross errors.
 
-    The error of ranges to one anchor stays what it was, with a probability that fades with the way, or is drawn anew.
-
-    Parameters
-    ----------
-    wider : added to every sigma, m: the poses are those of a grid. expected : (h, m) errors of the map's own ranges there, m.
+    The error of ranges to one anchor stays what it was, with a probability that fades with the way, or is drawn anew. Of poses
+    of a grid every sigma is wider, m; expected (h, m) are the errors of the map's own ranges there, m.
     """
     if not len(ranges):
         return np.zeros(len(poses))
@@ -262,8 +268,7 @@ MOMENTS = PER_RANGE * FEW * int(np.prod(_STEPS))
 def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
 
-    With NLOS the likelihood is flat where its curvature, without the late ranges, would give a sharp peak: so the
-    moments are summed over a lattice of poses.
+    With NLOS the likelihood is flat where its curvature would give a sharp peak: they are sums over a lattice of poses.
     """
     axes = [np.linspace(-reach, reach, count) for reach, count in zip(_REACH, _STEPS, strict=True)]
     off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, Ints
+from .sensing import LEAD
 from .verdict import CERTAIN, LIKELY, RAY_ELSEWHERE
 
 FIT_SOUND, FIT_LOST = RAY_ELSEWHERE, 2.0 * RAY_ELSEWHERE
@@ -15,10 +16,8 @@ SUPPORT, _CONTRADICTION = 0.5, 0.25
 it. The search for a lost robot begins with the measurements after the last one that supported the pose. A pose that ranges
 support and scans contradict is replaced only by a better one: rooms that are only partly in the map, and people around the
 robot, cause this."""
-_FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
-"""Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
-_RECENT = 5.0
-"""s since the last range, in which ranges still support a pose."""
+_FORGETTING = 0.1
+"""Share of a new scan in the mean of the last ones, a second of scans; of a new range it is twice that, two rounds of four."""
 _ENOUGH = 20
 """Ranges of an anchor after which it may count as moved."""
 
@@ -68,7 +67,7 @@ class RunningFit:
         if self.against.sum() >= 0.0:
             self.against[:], self.before, self.first = 0.0, self.ranges, np.inf
         self.trust[anchor] += (_FORGETTING * (weight - self.trust[anchor, 0]), 1.0)
-        self.ranges += _FORGETTING_RANGES * (weight - self.ranges)
+        self.ranges += 2.0 * _FORGETTING * (weight - self.ranges)
         self.ranged = max(self.ranged, stamp)
         if weight > SUPPORT:
             self.sound = max(self.sound, stamp)
@@ -103,7 +102,7 @@ class RunningFit:
 
     def ranges_vouch(self, now: float) -> bool:
         """Return whether recent ranges support the pose."""
-        return self.ranges > SUPPORT and now - self.ranged < _RECENT
+        return self.ranges > SUPPORT and now - self.ranged < LEAD
 
     def agreed(self) -> float:
         """Return until when, s, the measurements supported the pose: by chance some still do after a jump."""

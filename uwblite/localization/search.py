@@ -12,7 +12,7 @@ a caller that must keep pace with a lidar does a few units between two scans.
 """
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,8 @@ from ..arrays import Bools, Floats, Ints
 from ..grid.occupancy_grid import FREE
 from .hypotheses import MATCHES, SAME, apart, refined
 from .range_model import PER_RANGE, Ranges, range_likelihood
-from .verdict import CERTAIN, FEW_BESIDE, FEW_ENDS
-from .walls import INDEPENDENT_RAYS, STRANGE, Rays, Walls
+from .verdict import CERTAIN, FEW_BESIDE, FEW_ENDS, SURE
+from .walls import INDEPENDENT_RAYS, MOST_CELLS, STRANGE, Rays, Walls
 
 CELL = 0.1
 """m; cell of the likelihood field."""
@@ -34,26 +34,21 @@ _SPREAD = 0.15
 """m; of a point about its wall: the cell, and 0.05 rad at 3 m."""
 FARTHEST = 12.0
 """m; points farther away are not matched: 0.05 rad is there 0.6 m."""
-_MOST_FIELD = 3_000_000
-"""Cells of the field (one byte, four levels); a larger map gets coarser ones."""
 _HEADINGS = 126
 """Headings that are tried, 0.05 rad apart."""
 _POINTS = 72
-"""Points of the scans that are matched, no two in one cell and a half of the field."""
+"""Points of the scans that are matched, no two in one square of that spread."""
 _MOST_NODES = 60_000
-"""Most nodes of a level that are expanded; where more are equally good, the search is given up: too little was measured."""
-_DIVED = 64
-"""Best nodes of a level that are followed down for a lower bound of the best pose's score."""
+"""Most nodes of a level that are expanded, and most places that are tried by ranges; where more are equally good, the search is
+given up: too little was measured."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
 _MOST_RIVALS = 4096
 """Poses that may be as good before the search is not complete."""
 MOST_PLACES = 32
-"""Poses that are returned."""
-_TOLERANCE, _GROSS = 4.0, 0.1
-"""Standard deviations by which a range may be off, and m by which ranges may be off on average beyond the best place's."""
-_MOST_CELLS = 20_000
-"""Places that are tried by ranges alone; a larger map gets coarser ones."""
+"""Poses that are returned; twice as many nodes are followed down for a lower bound of the best pose's score."""
+_GROSS = 0.1
+"""m by which ranges may be off on average beyond the best place's."""
 UNIT = 1_000_000
 """Operations of a unit of work at most: 1 to 2 ms on one core."""
 _PER_POINT, _PER_PLACE, _PER_REFINED = 3, 10, 60 * MATCHES
@@ -86,7 +81,7 @@ def field_of(walls: Walls) -> Field:
     """Return the likelihood field of walls."""
     g, top = walls.geometry, 2**LEVELS
     size = np.array([g.cols, g.rows]) * g.resolution
-    cell = max(CELL, float(np.sqrt(np.prod(size + 2 * FARTHEST) / _MOST_FIELD)))
+    cell = max(CELL, float(np.sqrt(np.prod(size + 2 * FARTHEST) / MOST_CELLS)))
     margin = int(np.ceil(FARTHEST / cell)) + 2 * top
     wide, high = (np.ceil(size / cell).astype(int) + 2 * margin).tolist()
     origin = g.origin - margin * cell
@@ -128,20 +123,15 @@ def units(count: int, each: int) -> Iterator[slice]:
 
 
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
-    """Search the map.
+    """Search the map; return poses that explain the measurements about as well as the best one, the best first.
 
     Parameters
     ----------
     rays : of the last metres, in the present frame of the base. ranges : of the window.
     bounds : corners (2,) of the area in which the robot may be, m.
-
-    Returns
-    -------
-    Poses that explain the measurements about as well as the best one, at most MOST_PLACES, the best first; refined by ranges
-    where no scan measures more.
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
-    anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
+    anchors, found = len(np.unique(ranges.anchor)), replace(_UNDECIDED, complete=True)
     if field is not None and len(seen) >= (FEW_BESIDE if anchors > 2 else FEW_ENDS):
         found = yield from _by_scans(field, seen, float(rays.hit.mean()), ranges)
         if len(seen) >= FEW_ENDS and (len(found.poses) or not len(ranges)):
@@ -155,7 +145,7 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
 def _thinned(rays: Rays) -> Floats:
     """Return points (p, 2) on walls, at most _POINTS of them."""
     points = rays.ends[rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)]
-    _, first = np.unique(np.floor(points / (1.5 * CELL)).astype(np.intp), axis=0, return_index=True)
+    _, first = np.unique(np.floor(points / _SPREAD).astype(np.intp), axis=0, return_index=True)
     chosen = np.sort(first)
     return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.intp))]] if len(chosen) else points[:0]
 
@@ -169,11 +159,12 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     headings = np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False)
     offsets = _offsets(field, points, headings)
     yield _PER_PLACE * offsets.size
-    every = np.empty((_HEADINGS, len(squares), 3), dtype=np.int32)
-    for part in units(_HEADINGS, every[0].size):
-        every[part, :, 0], every[part, :, 1:] = np.arange(_HEADINGS)[part, None], squares
-        yield every[part].size
-    nodes, complete, least = every.reshape(-1, 3), True, 0.0
+    turns, every = np.arange(_HEADINGS), []
+    for part in units(_HEADINGS, squares.size):
+        few = np.repeat(turns[part], len(squares))
+        every.append(np.column_stack([few, np.tile(squares, (len(turns[part]), 1))]).astype(np.int32))
+        yield every[-1].size
+    nodes, complete, least = np.concatenate(every), True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
     for level in range(LEVELS, 0, -1):
         best, found = yield from _dive(field, level, offsets, nodes, scores)
@@ -197,7 +188,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
 
 
 def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
-    """Return the best of poses (n, 3) by their scores (n,), in whose order they are, and by the ranges together.
+    """Return the best of poses (n, 3) by scores (n,), in whose order they are, and by the ranges together.
 
     Ranges distinguish places along a wall, which scans do not.
     """
@@ -253,28 +244,28 @@ def _dive(
 
 def _highest(scores: Floats) -> Ints:
     """Return the indices of the highest scores, the first of equal ones, best first; without sorting them all."""
-    least = np.partition(scores, -_DIVED)[-_DIVED] if len(scores) > _DIVED else -np.inf
+    many = 2 * MOST_PLACES
+    least = np.partition(scores, -many)[-many] if len(scores) > many else -np.inf
     some = np.flatnonzero(scores >= least)
-    return some[np.argsort(-scores[some], kind="stable")[:_DIVED]]
+    return some[np.argsort(-scores[some], kind="stable")[:many]]
 
 
 def _children(nodes: NDArray[np.int32], level: int) -> NDArray[np.int32]:
     """Return the four quarters, of a level, of each node."""
     quarters = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]], dtype=np.int32)
-    return (nodes[:, None] + quarters * 2**level).reshape(-1, 3)
+    return np.asarray((nodes[:, None] + quarters * 2**level).reshape(-1, quarters.shape[1]))
 
 
 def _allowed(centres: Floats, size: float, ranges: Ranges) -> Generator[int, None, Bools]:
     """Return in which squares (n,) of a size, m, the robot may be by its ranges alone, for any heading.
 
     The tag was within |t| of its present place: a range disagrees if it is off by more than that, half the diagonal and four
-    sigmas. NLOS makes ranges long: a place too near an anchor counts as half a disagreement. The best places and those with
-    little more are kept.
+    sigmas. NLOS makes ranges long: a place too near an anchor counts as half a disagreement.
     """
     if not len(ranges) or not len(centres):
         return np.ones(len(centres), bool)
     cost = np.zeros(len(centres))
-    slack = np.hypot(*ranges.tags.T) + np.sqrt(0.5) * size + _TOLERANCE * ranges.sigma
+    slack = np.hypot(*ranges.tags.T) + np.sqrt(0.5) * size + SURE * ranges.sigma
     for part in units(len(ranges), _PER_PLACE * len(centres)):
         for place, value, most in zip(ranges.places[part], ranges.values[part], slack[part], strict=True):
             off = value - np.hypot(*(centres - place).T)
@@ -286,11 +277,11 @@ def _allowed(centres: Floats, size: float, ranges: Ranges) -> Generator[int, Non
 
 def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Try places and headings by the ranges alone."""
-    step = max(SAME[0], float(np.sqrt(np.prod(bounds[1] - bounds[0]) / _MOST_CELLS)))
+    headings = np.arange(0.0, 2.0 * np.pi, SAME[1])
+    step = max(SAME[0], float(np.sqrt(np.prod(bounds[1] - bounds[0]) / _MOST_NODES)))
     axes = [np.arange(low, high + step, step) for low, high in zip(*bounds, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     cells = cells[(yield from _allowed(cells, step, ranges))]
-    headings = np.arange(0.0, 2.0 * np.pi, SAME[1])
     if len(cells) * len(headings) > _MOST_NODES:
         return _UNDECIDED
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
@@ -306,7 +297,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
 
 def _distinct(poses: Floats, complete: bool) -> Steps:
     """Return the first of poses (n, 3), best first, that are not near an earlier one."""
-    kept, left = np.zeros((0, 3)), poses
+    kept, left = poses[:0], poses
     while len(left) and len(kept) < MOST_PLACES:
         kept = np.concatenate([kept, left[:1]])
         yield _PER_PLACE * len(left)

@@ -7,22 +7,21 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..config import documented
+from ..grid.occupancy_grid import GridConfig
 from ..odometry.attached import beam_origins
 from ..odometry.odometer import Odometer
-from ..sensor_log import SensorMounting
+from ..sensor_log import LaserScans, SensorMounting
 from .walls import Rays
 
 _FARTHEST = 1000.0
 """m; a longer reading is invalid, whatever reach the device states."""
-_CLEAR = 3.0
-"""m; up to here a ray without a reading shows that there is no wall, as grid.max_clear_distance."""
 TRACK_RAYS = 180
 """Rays of a scan that are matched."""
 LEAD = 5.0
 """s; a stamp farther ahead of the odometry is not used before others confirm it: a single one is a fault of the clock.
 One as far behind is not explained by delay."""
-_CONFIRMED = 4
-"""Different stamps, all so far ahead, after which the odometry was silent for so long."""
+CONFIRMED = 4
+"""Different stamps, all so far ahead, after which the odometry was silent for so long, or its clock was set."""
 
 
 @documented
@@ -40,6 +39,12 @@ class Scanner:
     range_max: float = 30.0
     """m."""
 
+    @classmethod
+    def of(cls, scans: LaserScans, sign: float = 1.0) -> "Scanner":
+        """Return that of some scans, which are played backwards with a negative sign."""
+        sweep = sign * scans.time_increment
+        return cls(scans.angle_min, scans.angle_increment, sweep, scans.range_min, scans.range_max)
+
     @property
     def usable(self) -> bool:
         """Whether it gives the direction of each ray; a broken header does not."""
@@ -48,13 +53,11 @@ class Scanner:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A range, as it waits for the odometry."""
+    """A range, as it waits for the odometry: index of the anchor in the map, and of the robot's tag."""
 
     anchor: int
-    """Its index in the map."""
     metres: float
     tag: int
-    """Which of the robot's tags measured it, from 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +97,7 @@ class Waiting:
         """Return until when sensors have measured, s, where the odometry's last stamp is now; -inf = not beyond it."""
         ahead = {until for until, _ in self._entries if until > now}
         near = [until for until in ahead if until <= now + LEAD]
-        return max(near) if near else min(ahead) if len(ahead) >= _CONFIRMED else -np.inf
+        return max(near) if near else min(ahead) if len(ahead) >= CONFIRMED else -np.inf
 
     def refuse(self, now: float) -> None:
         """Leave out measurements that are too far ahead of an odometry that has just been measured."""
@@ -112,24 +115,18 @@ class Waiting:
 
 
 def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
-    """Return thinned rays in the present frame of the base, each moved by the odometry at its own time.
-
-    Parameters
-    ----------
-    mounting : of the laser, with the map's correction.
-    """
+    """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
     stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
-    count = len(readings)
+    last = max(len(readings) - 1, 0)
     hit = (readings >= scanner.range_min) & (readings <= min(scanner.range_max, _FARTHEST))
     empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
     ray = np.flatnonzero(hit | empty)
     ray = ray[:: max(1, -(-len(ray) // TRACK_RAYS))]
-    ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
-    first = se2.between(odometer.pose, ends[:1])
-    sweep = se2.between(ends[:1], ends[1:])
-    laser = beam_origins(first, sweep, np.zeros(len(ray), np.intp), ray / max(count - 1, 1), mounting)
+    ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * last]))
+    first, sweep = se2.between(odometer.pose, ends[:1]), se2.between(ends[:1], ends[1:])
+    laser = beam_origins(first, sweep, np.zeros(len(ray), np.intp), ray / max(last, 1), mounting)
     sign = -1.0 if mounting.laser_flipped else 1.0
     bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
-    reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))
-    ends_of = laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1)
-    return Rays(ends_of, laser[:, :2], hit[ray])
+    # A ray without a reading shows that there is no wall so far.
+    reach = np.where(hit[ray], readings[ray], min(GridConfig().max_clear_distance, scanner.range_max))
+    return Rays(laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1), laser[:, :2], hit[ray])

@@ -13,8 +13,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from . import hypotheses
-from .hypotheses import BIAS_SIGMA, INDEPENDENT, WALL_SIGMA, WIDTHS, Hypotheses
-from .range_model import Ranges, cauchy, range_errors, series, shared_likelihood
+from .hypotheses import INDEPENDENT, WALL_SIGMA, WIDTHS, Hypotheses
+from .range_model import BIAS_SIGMA, Ranges, cauchy, range_errors, series, shared_likelihood
 from .walls import Rays, Walls
 
 CERTAIN, _CERTAIN_AGAIN, LIKELY = (float(np.log(odds)) for odds in (400.0, 100.0, 20.0))
@@ -37,8 +37,8 @@ _AGREES = 3.0
 """Standard deviations up to which a range agrees."""
 _LIMITS = {"lidar": 0.03, "radio": 0.05}
 """Relative errors of distances: data sheets of lidars allow 1 to 3 %; for radios, the delay by walls is added."""
-_SURE = 4.0
-"""Standard deviations from which a scale error is certain."""
+SURE = 4.0
+"""Standard deviations from which an error is certain."""
 _KNOWN = 0.7
 """Standard deviation of the map's unit, as a share of that limit, from which another one would have been noticed; a start also
 needs the unit itself to be within the limit."""
@@ -50,12 +50,7 @@ _ITERATIONS = 6
 
 
 def undecided(bank: Hypotheses, best: int, complete: bool, certain: float) -> str:
-    """Return why another place than the best one may be right; "" = none may.
-
-    Parameters
-    ----------
-    complete : the search left no place out. certain : log-likelihood by which it must be better than any other.
-    """
+    """Return why another place than the best one may be right by a certain log-likelihood; "" = none may."""
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
     count = 1 + int((rivals > -certain).sum())
     if not complete:
@@ -137,12 +132,11 @@ class MapOdds:
 
 
 def map_odds(fit: float, ends: float, rays: float, fitting: RangeFit, agreed: float) -> MapOdds:
-    """Return the odds of a place.
+    """Return the odds of a place, where searches have agreed over so many m.
 
     Parameters
     ----------
     fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
-    fitting : how the ranges agree. agreed : m driven over which searches agree.
     """
     sees, ranged = ends >= FEW_ENDS, fitting.anchors >= 2
     scans = rays * (fit - (RAY_ELSEWHERE if ranged else _RAY_ALONE)) if sees else 0.0
@@ -152,8 +146,7 @@ def map_odds(fit: float, ends: float, rays: float, fitting: RangeFit, agreed: fl
 def nowhere(odds: MapOdds, fitting: RangeFit) -> str:
     """Return the reason why even the best place is likelier to be in another building; "" = it is not.
 
-    What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike, and a robot may be
-    where the walls are not mapped.
+    What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike.
     """
     enough = fitting.anchors >= 2 and fitting.share * fitting.count >= _ENOUGH_RANGES
     blind = odds.alone and enough and fitting.share < _ALONE
@@ -183,18 +176,14 @@ class Scale:
     @property
     def off(self) -> bool:
         """Whether map and sensor are in different units for certain."""
-        return abs(self.error) > max(self.limit, _SURE * self.sigma) and self.gain > 0.5 * _SURE**2
+        return abs(self.error) > max(self.limit, SURE * self.sigma) and self.gain > 0.5 * SURE**2
 
 
 def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges: Ranges, start: bool) -> str:
     """Return how the distances of the map differ from the sensors' about a pose (3,); "" = they do not.
 
-    The surer of lidar and radio decides: of four anchors two may have been moved.
-
-    Parameters
-    ----------
-    rays : of the last metres, in the present frame of the base. looks : scans that they are of.
-    start : the place is not known yet.
+    The surer of lidar, by the rays of so many looks in the present frame of the base, and radio decides: of four anchors two
+    may have been moved. At a start the place is not known yet.
     """
     scales = []
     if walls is not None and int(rays.hit.sum()) >= FEW_ENDS:
@@ -212,14 +201,10 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges
 
 
 def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
-    """Match the rays of several scans with pose, motion scale and distance scale free.
+    """Match the rays of several looks with pose (3,), motion scale and distance scale free.
 
-    Along a single wall every scale fits, with a pose that is moved accordingly; the match then ends at an arbitrary scale, and
-    its standard deviation does not show that. So a scale that is off is compared with a match in the map's own unit.
-
-    Parameters
-    ----------
-    pose : (3,) about which they match. rays : in the present frame of the base. looks : scans they are of.
+    Along a single wall every scale fits, with a pose that is moved accordingly, and the standard deviation does not show that.
+    So a scale that is off is compared with a match in the map's own unit.
     """
     error, sigma, whole = _matched(walls, pose, rays, looks, _PRIOR)
     found = Scale("lidar", error, sigma)
@@ -246,10 +231,9 @@ def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: Floats) 
 
 
 def range_scale(pose: Floats, ranges: Ranges) -> Scale:
-    """Fit pose, way, distances and one constant error per anchor to the ranges.
+    """Fit pose, way, distances and one constant error per anchor to the ranges: Gauss-Newton with Cauchy kernels.
 
-    Gauss-Newton with Cauchy kernels, on the ranges and on the anchors' errors: an anchor that was moved by metres explains its
-    own ranges, and does not look like another unit; errors that all anchors share do.
+    An anchor that was moved by metres explains its own ranges, and looks like no other unit; errors that all share do.
     """
     names, anchor = np.unique(ranges.anchor, return_inverse=True)
     own, first = np.eye(len(names))[anchor], len(_PRIOR)

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filt
 from .. import se2
 from ..arrays import Bools, Floats, Table
 from ..grid.geometry import GridGeometry
-from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid
 from ..lidar.point_cloud import Lines, estimate_normals, make_tree
 
 _Cell = TypeVar("_Cell", np.int8, np.signedinteger[Any])
@@ -35,9 +35,9 @@ _BEHIND = 0.013
 that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
 _SMOOTH, _ONE_SIDE = 1.5, 0.1
 """Cells, smoothing of free space, and its slope per cell from which on it lies to one side; at a thick wall it is 0.27."""
-_MOST_CELLS = 4_000_000
-"""Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
-_ON_WALL, _FINE = 0.1, 0.05
+MOST_CELLS = 4_000_000
+"""Cells of the table of nearest walls (4 bytes each), or of their likelihood; a larger map gets coarser ones."""
+_ON_WALL, _FINE = 0.1, GridConfig().resolution
 """m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
 STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
@@ -168,7 +168,7 @@ class Walls:
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
         a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
-        return there, to the power of a half: what is dark to one ray is dark to its neighbours.
+        return, to the power of a half: what is dark to one ray is dark to its neighbours.
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
         on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
@@ -217,7 +217,7 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     normals = lines.normals * np.where((lines.normals * sides).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     one_sided = np.hypot(*sides.T) > 0.5
     points = lines.centers - _BEHIND * normals * one_sided[:, None]
-    cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / _MOST_CELLS)))
+    cell = max(resolution, float(np.sqrt(np.prod(np.ptp(occupied, axis=0) + 2.0 * REACH) / MOST_CELLS)))
     origin, nearest = _nearest(points, cell)
     return Walls(grid.geometry, states, points, normals, one_sided, lines.normal_variance, cell, origin, missing, nearest)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, concatenated
-from .hypotheses import BIAS_SIGMA, WALL_SIGMA
-from .range_model import DRIFT, RangeFacts, Ranges
+from .hypotheses import WALL_SIGMA
+from .range_model import BIAS_SIGMA, DRIFT, KnownAnchors, Ranges
 from .walls import Rays
 
 LENGTH = 10.0
@@ -32,7 +32,9 @@ RAYS = 48
 class WindowRange:
     """A range within the window."""
 
-    fact: RangeFacts
+    anchor: int
+    """Its number in the map."""
+    metres: float
     odom: Floats
     """(3,) T_odom_base at its time."""
     tag: Floats
@@ -78,19 +80,14 @@ class Window:
 
     def add_range(self, entry: WindowRange) -> None:
         """Keep a range, unless the robot has hardly moved since the last few to the same anchor; forget what is too old."""
-        own = [r for r in self.ranges[-_LATEST:] if r.fact.anchor == entry.fact.anchor]
+        own = [r for r in self.ranges[-_LATEST:] if r.anchor == entry.anchor]
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
         self.ranges = [r for r in self.ranges if entry.way - r.way <= LENGTH]
         self.looks = [k for k in self.looks if entry.way - k.way <= LENGTH]
 
     def wants_look(self, way: float, stamp: float, after: float = -np.inf) -> bool:
-        """Return whether a scan is wanted, at the odometer's way, m, and a time, s.
-
-        Parameters
-        ----------
-        after : s; one that is newer than that is wanted.
-        """
+        """Return whether a scan is wanted, at a way, m, and a time, s; or the last one is not newer than `after`."""
         if not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after:
             return True
         return way - self.looks[-1].way < _STANDING and stamp - self.looks[-1].stamp >= _LOOK_AGAIN
@@ -111,18 +108,17 @@ class Window:
         ends, origins = (se2.transform_each(poses, of, p) for p in (rays.ends, rays.origins))
         return Rays(ends, origins, rays.hit), np.array([way - k.way for k in looks])[of]
 
-    def ranges_since(self, odom: Floats, way: float) -> Ranges:
+    def ranges_since(self, anchors: KnownAnchors, odom: Floats, way: float) -> Ranges:
         """Return the ranges, with the tag's places in the present frame of the base."""
         rows = self.ranges
-        facts = [(f.range / (1.0 + f.scale), f.square, f.sigma, f.white, f.length) for f in (r.fact for r in rows)]
-        measured, square, sigma, white, length = np.array(facts).reshape(-1, 5).T
-        anchor, ways = np.array([r.fact.anchor for r in rows], dtype=np.intp), np.array([r.way for r in rows])
-        places, tag = (np.array(v).reshape(-1, 2) for v in ([r.fact.place for r in rows], [r.tag for r in rows]))
-        then = np.array([r.odom for r in rows]).reshape(-1, len(odom))
+        k = np.array([r.anchor for r in rows], dtype=np.intp)
+        metres, ways = np.array([(r.metres, r.way) for r in rows]).reshape(-1, 2).T
+        then, tag = np.array([r.odom for r in rows]).reshape(-1, len(odom)), np.array([r.tag for r in rows]).reshape(-1, 2)
+        measured = (metres - anchors.bias[k]) / (1.0 + anchors.scale)
+        level = np.sqrt(np.maximum(measured**2 - anchors.rise[k], WALL_SIGMA**2))
+        sigma = np.sqrt(anchors.sigma[k] ** 2 + BIAS_SIGMA**2 + (DRIFT * (way - ways)) ** 2)
         tags = se2.transform(se2.between(odom, then), tag)
-        level = np.sqrt(np.maximum(measured**2 - square, WALL_SIGMA**2))
-        sigma = np.sqrt(sigma**2 + BIAS_SIGMA**2 + (DRIFT * (way - ways)) ** 2)
-        return Ranges(anchor, places, tags, level, sigma, ways, white, length)
+        return Ranges(k, anchors.positions[k], tags, level, sigma, ways, *anchors.noise[k].T)
 
 
 def way_of(step: Floats) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
-from ..graph.joint_covariance import JointCovariance
+from ..graph.marginals import JointCovariance
 from ..lidar import submaps
 from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps
@@ -31,7 +31,7 @@ class CandidatePolicy:
     """Which pairs are worth a match."""
 
     sigmas: ClassVar[float] = 3.0
-    """Standard deviations of a guess within which the true place is looked for."""
+    """Standard deviations within which the truth is looked for."""
     shared: ClassVar[float] = 0.25
     """Least share of its surface that the smaller of two sub-maps should have in common with the other."""
     cells: ClassVar[int] = 5
@@ -105,7 +105,7 @@ def propose(
     possible = np.where(doubtful, near & (worth > 0.0), expected > rules.shared)
     possible &= (np.minimum(size[a], size[b]) > rules.cells) & (spread > beyond) & (spread <= config.search_limit)
     possible &= ~_among(np.stack([a, b, doubtful]), tried)
-    kept = _best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
+    kept = best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
     return Candidates(a[kept], b[kept], guess[kept], covariance[kept], spread[kept], constrained)
 
 
@@ -140,7 +140,7 @@ def _spread(covariance: Floats) -> Floats:
     return CandidatePolicy.sigmas * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
 
 
-def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
+def best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
     """Return rows such that every sub-map keeps its `limit` best partners; rows with worth <= 0 never."""
     kept: set[int] = set()
     for one in (a, b):

@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..config import setting
 from ..graph.pose_edges import RelativePoseEdges
+from ..lidar.scan_to_scan import TrackingConfig
 from ..map_result import LoopClosure
 
 
@@ -56,7 +57,7 @@ class LoopClosureConfig:
     beyond its covariance, and matches need to agree with the second optimisation alone."""
     points: ClassVar[int] = 250
     """Points looked up per pair."""
-    match_sigma: ClassVar[float] = 0.03
+    match_sigma: ClassVar[float] = TrackingConfig.sigma
     """Standard deviation of a match, m."""
     correlation: float = setting(24.0, advanced=True)
     """Matches that together weigh as one: they share the bending of both sub-maps."""

@@ -6,6 +6,7 @@ Candidates are matched in batches, each with the sub-maps it needs: by one proce
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
@@ -16,12 +17,10 @@ from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.free_space import FreeSpace
 from ..lidar.overlap import net_overlap
-from ..lidar.pair_alignment import Aligned, align_pairs
-from ..lidar.scan_matching import match, pair_points
+from ..lidar.scan_matching import Aligned, align_pairs, match, pairs_of
 from ..lidar.submaps import Submaps
-from ..lidar.visibility import violates_free_space
+from ..lidar.visibility import FreeSpace, violates_free_space
 from .candidates import CandidatePolicy, Candidates
 from .closures import LoopClosureConfig
 from .parallel import batches, in_order
@@ -38,8 +37,6 @@ class MatchingPolicy:
     """Least half-width of a search, rad."""
     many_places: ClassVar[int] = 20
     """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
-    many_points: ClassVar[int] = 1000
-    """Points of each of two long stretches that are compared at every place."""
     same_place: ClassVar[float] = 0.3
     """Matches nearer to each other than this, m and rad, are one place."""
     finer: ClassVar[float] = 1.5
@@ -111,19 +108,18 @@ def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     raster = rasterize(clouds, rules.cell, rules.reach)
     row, guess = _guesses(batch)
     target, source = candidates.target[row], candidates.source[row]
-    points = pair_points(clouds, source, config.points)
-    tries = align_pairs(clouds, raster, target, guess, points, rules.reach, gate)
+    tries = align_pairs(raster, pairs_of(clouds, target, source, config.points), guess, rules.reach, gate)
     score = tries.share
     if candidates.long:
-        score = net_overlap(clouds, raster, batch.free, target, source, tries.pose, rules.many_points, gate, batch.spacing)
+        score = batch.spacing * net_overlap(raster, batch.free, target, source, tries.pose, gate)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
     net = np.full(len(place), np.inf)
     if candidates.long:
         net[found] = score[place[found]]
     pose[found] = tries.pose[place[found]]
-    points = pair_points(clouds, candidates.source, config.points)
-    factors = match(clouds, raster, candidates.target, pose, points, gate, gate / 2.0)
+    pairs = pairs_of(clouds, candidates.target, candidates.source, config.points)
+    factors = match(raster, pairs, pose, gate, gate / 2.0)
     best = Aligned(pose, factors)
     through = _free_space_violations(batch, best, _promising(best, net, config))
     return ClosureMatches(best, found, second, through, net), clouds.work
@@ -133,7 +129,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that are searched for."""
     candidates, config = batch.candidates, batch.config
     rows, guesses = [], []
-    prepared: dict[int, Clouds] = {}
+    prepared = cache(partial(_prepare, batch.clouds))
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
@@ -142,7 +138,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
                 search_config, places = _coarse(batch.search), MatchingPolicy.many_places
             turn = CandidatePolicy.sigmas * np.sqrt(candidates.covariance[k, 2, 2])
             turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
-            target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
+            target, source = (prepared(int(of[k])) for of in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
             poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
@@ -191,12 +187,10 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     return best, second
 
 
-def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
+def _prepare(clouds: Clouds, k: int) -> Clouds:
     """Return a sub-map's cloud ready for the search; its normals point to the side of the laser."""
-    if k not in prepared:
-        points, normals = clouds.cloud(k)
-        prepared[k] = make_cloud(points, points + normals, work=clouds.work)
-    return prepared[k]
+    points, normals = clouds.cloud(k)
+    return make_cloud(points, points + normals, work=clouds.work)
 
 
 def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:

@@ -6,7 +6,6 @@ of the source's points to the target, is below a threshold.
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,13 +17,15 @@ from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
+from .candidates import CandidatePolicy, best_per_submap
 from .closures import Closures, LoopClosureConfig, collected
 from .parallel import batches, in_order
 
 _CELL = 0.5
 """m, edge of squares; the overlap of two sub-maps is the share of the smaller one's squares in which both have points."""
-_LEAST_SHARED = 0.25
-"""Least such share of a candidate."""
+
+_Batch = tuple[Clouds, Ints, Ints, Floats, IcpConfig]
+"""Clouds of sub-maps, and numbers of targets and sources among them with the guessed poses of these pairs."""
 
 
 def find(
@@ -43,7 +44,7 @@ def find(
     guess = se2.between(graph.poses[i], graph.poses[j])
     results: list[Registration] = []
     tasks = (
-        _Batch(submaps.clouds.chosen(used), a, b, guess[rows], icp) for rows, used, a, b in batches(target, source)
+        (submaps.clouds.chosen(used), a, b, guess[rows], icp) for rows, used, a, b in batches(target, source)
     )
     for part in in_order(_align, tasks, executor):
         results += part
@@ -61,19 +62,10 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
     ----------
     poses, recording : of the keyframes. limit : most partners per sub-map, best overlap first.
     """
-    shared = _shared(poses[submaps.reference], submaps)
     a, b = np.triu_indices(len(submaps), 1)
     first = recording[submaps.reference]
-    worth = np.where((b - a > 1) | (first[a] != first[b]), shared[a, b], 0.0)
-    order = np.lexsort((b, a, -worth))
-    order = order[worth[order] >= _LEAST_SHARED]
-    # Best pairs first: a pair is kept while either of its sub-maps has fewer partners than the limit.
-    used, kept = np.zeros(len(submaps), dtype=np.intp), []
-    for row in order.tolist():
-        if min(used[a[row]], used[b[row]]) < limit:
-            used[[a[row], b[row]]] += 1
-            kept.append(row)
-    rows = np.array(sorted(kept), dtype=np.intp)
+    worth = np.where((b - a > 1) | (first[a] != first[b]), _shared(poses[submaps.reference], submaps)[a, b], 0.0)
+    rows = best_per_submap(a, b, np.where(worth >= CandidatePolicy.shared, worth, 0.0), limit)
     return a[rows], b[rows]
 
 
@@ -90,21 +82,12 @@ def _shared(poses: Floats, submaps: Submaps) -> Floats:
     return np.asarray(seen @ seen.T / np.minimum(size[:, None], size[None]), dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Batch:
-    clouds: Clouds
-    target: Ints
-    source: Ints
-    guess: Floats
-    icp: IcpConfig
-
-
 def _align(batch: _Batch) -> list[Registration]:
     """Align the pairs of a batch; runs in a worker."""
-    points = [batch.clouds.cloud(k)[0] for k in range(len(batch.clouds))]
+    clouds, target, source, guess, icp = batch
+    points = [clouds.cloud(k)[0] for k in range(len(clouds))]
     trees = [make_tree(p) for p in points]
-    pairs = zip(batch.target.tolist(), batch.source.tolist(), batch.guess, strict=True)
-    return [align(trees[a], points[b], guess, batch.icp) for a, b, guess in pairs]
+    return [align(trees[a], points[b], T, icp) for a, b, T in zip(target.tolist(), source.tolist(), guess, strict=True)]
 
 
 def _record(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:

@@ -19,9 +19,9 @@ from ..graph.graph import Graph
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
-from ..lidar.free_space import FreeSpace
 from ..lidar.scan_matching import measured
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import FreeSpace
 from ..map_result import LoopClosure
 from . import chain_breaks
 from .candidates import Candidates

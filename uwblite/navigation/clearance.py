@@ -32,12 +32,12 @@ UNKNOWN_PRICE = 5.0
 """Cost of a metre through unknown space, in metres of open space, where it is not refused."""
 _SPECK = 0.015
 """m^2; islands of unknown cells that are smaller are noise of the map and no obstacle."""
-_STRIP = 64
+STRIP = 64
 """Rows whose distances are found together, so that they stay in a processor's cache."""
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 """Relative; a robot may touch what it passes."""
-_AT_A_TIME = 1 << 20
-"""Squares looked at together."""
+AT_ONCE = 300_000
+"""Squares, samples or nodes looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ class ClearanceMap:
 
     @property
     def _unit(self) -> float:
-        return 0.25 * self.geometry.resolution**2
+        return (0.5 * self.geometry.resolution) ** 2
 
     @property
     def least(self) -> int:
@@ -72,8 +72,7 @@ class ClearanceMap:
     def passable(self, rows: slice = slice(None)) -> Bools:
         """Return in which cells' centres (rows, cols) the robot may stand.
 
-        Straight steps to a neighbour then keep the radius too: along an axis no square is nearer to a point between two
-        centres than to one of them. So do diagonal ones where all four cells around their middle are passable.
+        Straight steps to a neighbour then keep the radius too, and diagonal ones where all four cells around are passable.
         """
         return np.asarray(self.half[rows] >= self.least)
 
@@ -89,25 +88,19 @@ class ClearanceMap:
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the same bounds (n,), m^2, and the costs of a metre (n,), at points (n, 2), m."""
-        squared, between, nearest = self._interpolated(points)
+        squared, between = self._interpolated(points)
         costs = self._nearness(self._unit * between)
-        return squared, costs if self.refused else np.where(self.dear.ravel()[nearest], UNKNOWN_PRICE, 1.0) * costs
+        if not self.refused:
+            row, col = (np.clip(n, 0, most - 1) for n, most in zip(self.geometry.cell_of(points), self.dear.shape, strict=True))
+            costs *= np.where(self.dear[row, col], UNKNOWN_PRICE, 1.0)
+        return squared, costs
 
-    def _interpolated(self, points: Floats) -> tuple[Floats, Floats, Ints]:
-        """Return `bounds` (n,), `half` (n,) interpolated between the centres around, and the nearest cell (n,)."""
-        grid, flat = self.geometry, self.half.ravel()
-        place = (points.T - grid.origin[:, None]) / grid.resolution - 0.5
-        low = np.floor(place)
-        u, v = place - low
-        col, row = low.astype(np.intp)
-        inside = (row >= 0) & (row < grid.rows - 1) & (col >= 0) & (col < grid.cols - 1)
-        first = np.where(inside, row * grid.cols + col, 0)
-        above = first + np.where(inside, grid.cols, 0)
-        lower = (1.0 - u) * flat[first] + u * flat[first + inside]
-        upper = (1.0 - u) * flat[above] + u * flat[above + inside]
-        between = np.where(inside, (1.0 - v) * lower + v * upper, 0.0)
-        squared = self._unit * np.maximum(between - 4.0 * (u * (1.0 - u) + v * (1.0 - v)), 0.0)
-        return squared, between, np.where(v > 0.5, above, first) + (inside & (u > 0.5))
+    def _interpolated(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return `bounds` (n,) and `half` (n,) interpolated between the centres around, 0 outside of all."""
+        place = (points.T - self.geometry.origin[:, None]) / self.geometry.resolution - 0.5
+        between = ndimage.map_coordinates(self.half, place[::-1], np.float64, order=1)
+        u, v = place - np.floor(place)
+        return self._unit * np.maximum(between - 2.0 + (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2, 0.0), between
 
     def is_obstacle(self, points: Floats) -> Bools:
         """Return which points (n, 2), m, lie in an obstacle, or outside the map."""
@@ -116,15 +109,12 @@ class ClearanceMap:
         return ~inside | self.obstacles[np.where(inside, row, 0), np.where(inside, col, 0)]
 
     def keeps(self, points: Floats, bound: Floats, needed: Floats, owner: Ints) -> Bools:
-        """Return which owners' points all keep a squared distance.
+        """Return which owners' points (n, 2), m, all keep a squared distance (n,), m^2, of which `bound` is known.
 
-        Parameters
-        ----------
-        points : (n, 2) m. bound : (n,) `bounds` of them, m^2. needed : (n,) m^2.
-        owner : (n,) whose point each is, 0 ... in order; every owner has one.
+        The owners are numbered 0 ... in order; every one has a point.
         """
         grid, kept = self.geometry, np.ones(int(owner.max(initial=-1)) + 1, dtype=np.bool_)
-        needed = needed * (1.0 - _ROUNDING)
+        needed = needed * (1.0 - ROUNDING)
         open_ = np.flatnonzero(bound < needed)
         cell = (points[open_] - grid.origin) / grid.resolution
         col, row = np.floor(cell).astype(np.intp).T
@@ -138,10 +128,7 @@ class ClearanceMap:
         return kept
 
     def distances(self, points: Floats) -> Floats:
-        """Return the distances (n,) of points (n, 2) from the nearest obstacle, m, up to the radius; beyond, lower bounds.
-
-        Distances that cost nothing count as the radius and COMFORT.
-        """
+        """Return the distances (n,) of points (n, 2) from the nearest obstacle, m, up to the radius; beyond, lower bounds."""
         squared = self.bounds(points)
         near = np.flatnonzero(squared < self.radius**2)
         squared[near] = np.minimum(self._exact(points[near]), self.radius**2)
@@ -153,14 +140,14 @@ class ClearanceMap:
         reach = int(np.ceil(self.radius / grid.resolution)) + 1
         dy, dx = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
         found = [np.zeros(0)]
-        for part in np.split(points, range(step := max(_AT_A_TIME // len(dx), 1), len(points), step)):
+        for part in np.split(points, range(step := max(AT_ONCE // len(dx), 1), len(points), step)):
             cell = (part - grid.origin) / grid.resolution
             col, row = (n[:, None] + d for n, d in zip(np.floor(cell).astype(np.intp).T, (dx, dy), strict=True))
             solid = ~grid.inside(row, col)
             solid |= self.obstacles[np.clip(row, 0, grid.rows - 1), np.clip(col, 0, grid.cols - 1)]
             away = [np.maximum(np.abs(p[:, None] - n - 0.5) - 0.5, 0.0) for p, n in zip(cell.T, (col, row), strict=True)]
             found.append(np.where(solid, away[0] ** 2 + away[1] ** 2, np.inf).min(axis=1, initial=np.inf))
-        return 4.0 * self._unit * np.concatenate(found)
+        return grid.resolution**2 * np.concatenate(found)
 
     def _nearness(self, squared: Floats | NDArray[np.float32]) -> Floats:
         near = np.clip(1.0 - (np.sqrt(squared) - self.radius) / COMFORT, 0.0, 1.0)
@@ -168,11 +155,10 @@ class ClearanceMap:
 
 
 def clearance_map(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse") -> ClearanceMap:
-    """Measure a map for a round robot.
+    """Measure a map for a round robot with a radius, m.
 
     Parameters
     ----------
-    radius : of the robot, m.
     unknown : 'refuse' makes unknown cells obstacles, 'price' makes them dear.
     """
     states, geometry = grid.states(), grid.geometry
@@ -191,10 +177,10 @@ def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[
     least, near = _least(radius, geometry.resolution), int(np.ceil(radius / geometry.resolution)) + 1
     reach = min(int(np.ceil((radius + COMFORT) / geometry.resolution)) + 1, max(obstacles.shape) + 1)
     cut = (2 * reach) ** 2
-    half = np.empty(obstacles.shape, dtype=np.uint16 if 2 * cut < 1 << 16 else np.uint32)
+    half = np.empty(obstacles.shape, dtype=np.uint16 if 2 * cut <= np.iinfo(np.uint16).max else np.uint32)
     tight = []
-    for first in range(0, geometry.rows, _STRIP):
-        rows = slice(first, min(first + _STRIP, geometry.rows))
+    for first in range(0, geometry.rows, STRIP):
+        rows = slice(first, min(first + STRIP, geometry.rows))
         count = rows.stop - rows.start
         centres, edges = (squares.astype(half.dtype) for squares in _along_rows(_rows(obstacles, rows, reach), cut))
         stands = np.zeros((count + 1, geometry.cols + 1), dtype=np.bool_)
@@ -243,7 +229,7 @@ def _across_rows(
 
 def _least(radius: float, resolution: float) -> int:
     """Return the least square of a distance, in half cells: half a cell at least, which parts a free cell from an obstacle."""
-    return max(int(np.ceil((2.0 * radius / resolution) ** 2 * (1.0 - _ROUNDING))), 1)
+    return max(int(np.ceil((2.0 * radius / resolution) ** 2 * (1.0 - ROUNDING))), 1)
 
 
 def _specks(dark: Bools, resolution: float) -> Bools:
@@ -252,7 +238,7 @@ def _specks(dark: Bools, resolution: float) -> Bools:
         return dark
     labels, count = ndimage.label(dark)
     sizes = np.zeros(count + 1, dtype=np.intp)
-    for first in range(0, len(dark), _STRIP):
-        sizes += np.bincount(labels[first : first + _STRIP].ravel(), minlength=count + 1)
+    for first in range(0, len(dark), STRIP):
+        sizes += np.bincount(labels[first : first + STRIP].ravel(), minlength=count + 1)
     sizes[0] = 0
     return np.asarray((sizes * resolution**2 < _SPECK)[labels] & dark)

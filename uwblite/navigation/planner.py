@@ -14,13 +14,7 @@ from .steps import StepSearch, step_search
 
 
 class NoPathError(DataError):
-    """There is no way to a goal.
-
-    Parameters
-    ----------
-    text : what is in the way.
-    nearest : (2,) the reachable place nearest to the goal, m, map frame; None where the start itself is the trouble.
-    """
+    """There is no way to a goal; nearest is the reachable place (2,) nearest to it, m, None where the start is the trouble."""
 
     def __init__(self, text: str, nearest: Floats | None = None) -> None:
         super().__init__(text)
@@ -83,7 +77,10 @@ class Planner:
         way, first = self._entrance(start)
         nodes = self.steps.path(first, last) if (last := self._beside(goal)) >= 0 else None
         if nodes is None:
-            raise self._no_path(goal, first)
+            nearest = self.steps.places(np.array([self.steps.nearest(first, goal)]))[0]
+            size = f"a radius of {self.clearance.radius:g} m in cells of {self.clearance.geometry.resolution:g} m"
+            text = f"no path to {_place(goal)} with {size}; the nearest reachable point is {_place(nearest)}"
+            raise NoPathError(text, nearest)
         places = self.steps.places(nodes)
         line = smoothed(self.clearance, np.concatenate([way[-1:], places[len(way) > 1 :], goal[None]]))
         return np.concatenate([way, line[1:]])[1:]
@@ -92,8 +89,8 @@ class Planner:
         """Return the corners (k, 2) of the way from a place to the first node, which keeps no clearance, and that node.
 
         Where the way keeps it, only the place itself is returned. A robot that stands nearer to an obstacle than its radius,
-        by the map, may leave straight for the nearest place where it may stand, but not through an obstacle. One that stands
-        in unknown space, into which it drove by itself, leaves it by the cheapest way that keeps clear of known obstacles.
+        by the map, may leave straight for the nearest place where it may stand, but not through an obstacle; one in unknown
+        space by the cheapest way that keeps clear of known obstacles.
         """
         if (node := self._beside(start)) >= 0:
             return start[None], node
@@ -124,12 +121,6 @@ class Planner:
         nodes, places = self.steps.around(place, 1.5 * self.clearance.geometry.resolution)
         clear = along_lines(self.clearance, np.broadcast_to(place, places.shape), places).clear
         return int(nodes[clear][np.argmin(np.hypot(*(places[clear] - place).T))]) if clear.any() else -1
-
-    def _no_path(self, goal: Floats, first: int) -> NoPathError:
-        nearest = self.steps.nearest_reachable(first, goal)
-        size = f"a radius of {self.clearance.radius:g} m in cells of {self.clearance.geometry.resolution:g} m"
-        text = f"no path to {_place(goal)} with {size}; the nearest reachable point is {_place(nearest)}"
-        return NoPathError(text, nearest)
 
 
 def make_planner(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse") -> Planner:

@@ -14,17 +14,16 @@ from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .clearance import COMFORT, ClearanceMap
+from .clearance import AT_ONCE, COMFORT, ROUNDING, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
 """Where clearance and cost of a line are looked up."""
-_SAMPLES_AT_A_TIME = 200_000
 _STARTS_PER_SHORTCUT = 4
 """Shortcuts of the same reach that overlap."""
 _PLACES_PER_OCTAVE = 8
 """Places on a straight piece between one distance from its nearer end and twice that distance."""
-_SIEVE = (2, 4, 8, 16)
-"""Parts of a shortcut, at whose ends it is looked up first: most of the long ones lead through obstacles."""
+_SIEVES = 4
+"""How often a shortcut is halved, at whose parts' ends it is looked up first: most of the long ones lead through obstacles."""
 _CORNER_COST = 1e-3
 """m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
 _GAIN = 1e-3
@@ -46,12 +45,7 @@ class Lines(NamedTuple):
 
 
 def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
-    """Look up clearance and cost along straight lines.
-
-    Parameters
-    ----------
-    begin, end : (n, 2) m, map frame.
-    """
+    """Look up clearance and cost along straight lines between places (n, 2) and (n, 2), m, map frame."""
     lengths = np.hypot(*(end - begin).T)
     roomy = _roomy(clearance, begin, end, lengths)
     found = Lines(lengths.copy(), roomy.copy(), roomy, np.zeros(len(lengths), dtype=np.bool_))
@@ -72,7 +66,7 @@ def _roomy(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats)
         for which, count in _parts(~shown & (lengths > step), lengths, step):
             points, _, first = _samples(begin[which], end[which], count)
             away = np.minimum.reduceat(clearance.bounds(points), first)
-            shown[which] = away >= free**2 + 0.25 * (lengths[which] / count) ** 2
+            shown[which] = away >= free**2 + (0.5 * lengths[which] / count) ** 2
     return shown
 
 
@@ -80,7 +74,7 @@ def _parts(lines: Bools, lengths: Floats, step: float) -> Iterator[tuple[Ints, I
     """Yield some of the lines (n,) in parts (k,) of bounded work, and how many pieces (k,) each has of at most a step, m."""
     which = np.flatnonzero(lines)
     pieces = np.ceil(lengths[which] / step).astype(np.intp) + 1
-    ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // _SAMPLES_AT_A_TIME)) + 1
+    ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // AT_ONCE)) + 1
     if len(which):
         yield from zip(np.split(which, ends), np.split(pieces, ends), strict=True)
 
@@ -98,7 +92,7 @@ def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats,
     points, owner, first = _samples(begin, end, pieces)
     squared, cost = clearance.at(points)
     step = lengths / pieces
-    clear = clearance.keeps(points, squared, (clearance.radius**2 + 0.25 * step**2)[owner], owner)
+    clear = clearance.keeps(points, squared, (clearance.radius**2 + (0.5 * step) ** 2)[owner], owner)
     last = first + pieces
     costs = step * (np.add.reduceat(cost, first) - 0.5 * (cost[first] + cost[last]))
     open_ = clear & (np.maximum.reduceat(cost, first) <= 1.0)
@@ -106,12 +100,7 @@ def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats,
 
 
 def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
-    """Return the corners (k, 2) of a cheaper line with the same ends, m.
-
-    Parameters
-    ----------
-    line : (n, 2) corners, m, map frame; its pieces are clear.
-    """
+    """Return the corners (k, 2) of a cheaper line with the same ends as a line (n, 2) of clear pieces, m."""
     cost = np.inf
     for _ in range(_MOST_ROUNDS):
         line, now = _shortened(clearance, _straightened(line))
@@ -142,7 +131,7 @@ def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
 def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
     """Return which lines (m,) keep the clearance at a few places at least: at the middle, at quarters ..."""
     left = np.arange(len(begin))
-    for parts in _SIEVE:
+    for parts in 2 ** np.arange(1, _SIEVES + 1):
         for k in range(1, parts, 2):
             places = begin[left] + k / parts * (end - begin)[left]
             left = left[clearance.bounds(places) >= clearance.radius**2]
@@ -173,15 +162,9 @@ def walk_back(before: Ints, first: int, last: int) -> Ints:
     return np.array(chain[::-1])
 
 
-def _divided(line: Floats, step: float) -> Floats:
-    """Return the corners (n, 2) of a line whose pieces are cut into equal ones no longer than the step, m."""
-    piece, number, cuts = _cuts(line, step)
-    return _at(line, piece, number / cuts)
-
-
 def _cuts(line: Floats, step: float) -> tuple[Ints, Ints, Ints]:
     """Return, of all equal cuts (k,) of a line's pieces, the piece, the cut's number in it, and how many it is cut into."""
-    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - 1e-9), 1).astype(np.intp)
+    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - ROUNDING), 1).astype(np.intp)
     piece = np.repeat(np.arange(len(cuts)), cuts)
     return piece, np.arange(len(piece)) - (np.cumsum(cuts) - cuts)[piece], cuts[piece]
 
@@ -195,17 +178,14 @@ def _straightened(line: Floats) -> Floats:
     """Return a line (n, 2) without the corners at which it does not turn."""
     ways = np.diff(line, axis=0)
     before, after = ways[:-1], ways[1:]
-    turns = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > 1e-9
+    turns = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > ROUNDING
     return line[np.concatenate([[True], turns, [True]])]
 
 
 def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
     """Divide a line (n, 2) at about the step near its corners, and ever more coarsely between them.
 
-    Returns
-    -------
-    places : (k, 2) m.
-    piece : (k - 1,) number of the line's piece on which the way to the next place lies.
+    Return the places (k, 2), m, and the line's piece (k - 1,) on which the way to the next place lies.
     """
     piece, number, cuts = _cuts(line, step)
     away = np.minimum(number, cuts - number)
@@ -215,20 +195,17 @@ def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
 
 
 def sampled(line: Floats, step: float, heading: float | None = None) -> tuple[Floats, Floats]:
-    """Return poses along a line, and how far from its start they are.
+    """Return poses (k, 3) along a line, and how far (k,) from its start they are, m.
 
     Parameters
     ----------
-    line : (n, 2) corners, m.
-    step : largest distance between poses, m; all corners are among them.
-    heading : of the first pose, rad; None = along the line.
-
-    Returns
-    -------
-    poses : (k, 3) with the heading of the piece that begins there, at the end of the one that ends; m, m, rad.
-    distances : (k,) m.
+    line : (n, 2) corners, m; all are among the poses.
+    step : largest distance between poses, m.
+    heading : of the first pose, rad; None = along the line. Others are those of the piece that begins there, at the end of the
+        one that ends.
     """
-    points = _divided(line, step)
+    piece, number, cuts = _cuts(line, step)
+    points = _at(line, piece, number / cuts)
     ways = np.diff(points, axis=0)
     lengths = np.hypot(*ways.T)
     headings = np.arctan2(ways[:, 1], ways[:, 0])

@@ -11,25 +11,41 @@ A node is the flat index of a cell, or, from the number of all cells on, a tight
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ..arrays import Bools, Floats, Ints
-from .clearance import ClearanceMap
-from .regions import BLOCK, STRIP, Regions, numbers, regions_of
+from .clearance import AT_ONCE, STRIP, ClearanceMap
 from .smoothing import along_lines, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
-_AT_ONCE = 300_000
-"""Nodes of a search."""
 _STRETCH = 16
 """Regions; a straight way through open space that is as long needs no search: its ends lie half a block beside the cheapest
 path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is smoothed."""
 _NEAR_TIGHT = 1.3
 """Cells from a tight place to the nodes that it is joined to: the centre of the next cell but half a cell."""
+BLOCK = 16
+"""Cells along the edge of a block; STRIP is a multiple of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regions:
+    """Parts of blocks whose cells hang together."""
+
+    label: NDArray[np.int32]
+    """(rows, cols) number of a cell's region, from 1; 0 = the robot may not stand there."""
+    sizes: Ints
+    """(n,) cells of each; regions and then tight places, as in `graph`."""
+    centres: Floats
+    """(n, 2) m."""
+    graph: csr_matrix
+    """(n, n) about what it costs from one centre to the next; symmetric."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,11 +112,7 @@ class StepSearch:
             yield np.flatnonzero(np.append(False, reached[:count])[label]) + start * grid.cols
         yield np.flatnonzero(reached[count:]) + grid.cells
 
-    def nearest_reachable(self, first: int, goal: Floats) -> Floats:
-        """Return the place (2,) that can be reached and is nearest to a goal (2,), m."""
-        return np.asarray(self.places(np.array([self._nearest(first, goal)]))[0])
-
-    def _nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
+    def nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
         """Return the node that can be reached, is allowed (n,), and is nearest to a place (2,), m; -1 = there is none."""
         best, away = -1, np.inf
         for part in self.reachable(first):
@@ -116,7 +128,7 @@ class StepSearch:
         It ends where it comes to an allowed cell; None = there is none.
         """
         good = np.concatenate([allowed.ravel(), np.zeros(len(self.clearance.tight), dtype=np.bool_)])
-        last = self._nearest(first, self.places(np.array([first]))[0], good)
+        last = self.nearest(first, self.places(np.array([first]))[0], good)
         path = None if last < 0 else self.path(first, last)
         return None if path is None else path[: 1 + int(np.argmax(good[path]))]
 
@@ -179,15 +191,10 @@ class StepSearch:
         return numbers(self.clearance, self.regions.label, len(self.regions.sizes), nodes)
 
     def _pieces(self, chain: Ints, stops: Ints, open_: Bools) -> list[tuple[int, int]]:
-        """Part a chain (k,) at some of its stops (s,): beside open ways, and where a piece is too large to be searched at once.
-
-        Returns
-        -------
-        Pairs of stops, 0..s - 1; each piece begins where one ends.
-        """
+        """Part a chain (k,) at some of its stops (s,): beside open ways, and where a piece is too large."""
         assert self.regions is not None
         beside = np.add.reduceat(self.regions.sizes[(part := self.regions.graph[chain]).indices], part.indptr[:-1])
-        cut = open_[1:] | open_[:-1] | (np.diff(np.cumsum(beside)[stops[1:]] // _AT_ONCE) > 0)
+        cut = open_[1:] | open_[:-1] | (np.diff(np.cumsum(beside)[stops[1:]] // AT_ONCE) > 0)
         return list(pairwise([0, *(np.flatnonzero(cut) + 1).tolist(), len(open_)]))
 
     def _roomiest(self, region: int) -> int:
@@ -209,7 +216,7 @@ class StepSearch:
 def step_search(clearance: ClearanceMap) -> StepSearch:
     """Prepare searches over a map's cells."""
     joins = _joins(clearance)
-    large = int(np.count_nonzero(clearance.passable())) > _AT_ONCE
+    large = int(np.count_nonzero(clearance.passable())) > AT_ONCE
     return StepSearch(clearance, joins, regions_of(clearance, joins) if large else None)
 
 
@@ -223,8 +230,9 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
     names = at[:, 1] * (2 * grid.cols + 1) + at[:, 0]
     order = np.argsort(names)
     one, other, ends = [], [], []
-    for dy in range(-3, 4):
-        for dx in range(-3, 4):
+    steps = range(-ceil(2.0 * _NEAR_TIGHT), ceil(2.0 * _NEAR_TIGHT) + 1)
+    for dy in steps:
+        for dx in steps:
             if not 0.0 < 0.5 * np.hypot(dx, dy) <= _NEAR_TIGHT:
                 continue
             x, y = at[:, 0] + dx, at[:, 1] + dy
@@ -242,3 +250,68 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
     lines = along_lines(clearance, tight[start], np.concatenate(ends))
     kept = lines.clear
     return csr_matrix((lines.costs[kept], (start[kept], end[kept])), shape=shape)
+
+
+def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
+    """Return the regions of a map, with the costs of the steps from tight places to cells and tight places."""
+    grid = clearance.geometry
+    label, count = np.zeros((grid.rows, grid.cols), dtype=np.int32), 0
+    row, col = (n.ravel().astype(np.float64) for n in np.indices((STRIP, grid.cols)))
+    sums: list[Floats] = []
+    pairs: list[tuple[Ints, Ints]] = []
+    for start in range(0, grid.rows, STRIP):
+        rows = slice(start, min(start + STRIP, grid.rows))
+        part, more = _parted(clearance.passable(rows))
+        inner = part.ravel()
+        values = (None, col[: len(inner)], row[: len(inner)] + start, clearance.cell_cost(rows).ravel())
+        sums.append(np.stack([np.bincount(inner, v, more + 1)[1:] for v in values]))
+        label[rows] = np.where(part > 0, part + count, 0)
+        count += more
+        above = np.arange(max(start, BLOCK), rows.stop, BLOCK)
+        pairs += (
+            _touching(label[above - 1], label[above]),
+            _touching(label[rows].T[BLOCK - 1 : -1 : BLOCK], label[rows].T[BLOCK::BLOCK]),
+        )
+        corner = np.arange(BLOCK, grid.cols, BLOCK)
+        four = [[label[above + dr][:, corner + dc] for dc in (-1, 0)] for dr in (-1, 0)]
+        whole = np.all(four, axis=(0, 1))
+        pairs += [_touching(four[0][k] * whole, four[1][1 - k]) for k in (0, 1)]
+    size, across, along, cost = np.concatenate(sums, axis=1)
+    centres = np.concatenate([grid.centre_of(along / size, across / size), clearance.tight])
+    a, b = (end - 1 for end in np.divmod(np.unique(np.concatenate([p * (count + 1) + q for p, q in pairs])), count + 1))
+    costs = 0.5 * np.hypot(*(centres[a] - centres[b]).T) * (cost[a] / size[a] + cost[b] / size[b])
+    joined = joins.tocoo()
+    sizes = np.concatenate([size.astype(np.intp), np.ones(len(clearance.tight), dtype=np.intp)])
+    end = numbers(clearance, label, len(sizes), joined.col.astype(np.intp))
+    one, other = np.concatenate([a, joined.row + count]), np.concatenate([b, end])
+    # Of several steps between two of them the cheapest counts.
+    order = np.lexsort((weights := np.concatenate([costs, joined.data]), other, one))
+    first = np.append(True, np.any(np.diff(np.stack([one, other])[:, order]) != 0, axis=0))
+    chosen = order[first]
+    half = csr_matrix((weights[chosen], (one[chosen], other[chosen])), shape=(len(sizes), len(sizes)))
+    return Regions(label, sizes, centres, half.maximum(half.T))
+
+
+def numbers(clearance: ClearanceMap, label: NDArray[np.int32], count: int, nodes: Ints) -> Ints:
+    """Return the regions (k,) of nodes (k,), of so many regions and tight places, by the cells' numbers."""
+    cells, tight = clearance.geometry.cells, len(clearance.tight)
+    return np.where(nodes < cells, label.ravel()[np.minimum(nodes, cells - 1)] - 1, nodes - cells + count - tight)
+
+
+def _parted(passable: Bools) -> tuple[NDArray[np.int32], int]:
+    """Return numbers from 1 of what hangs together in each block of some rows (rows, cols), and how many there are."""
+    rows, cols = passable.shape
+    down, across = -(-rows // BLOCK), -(-cols // BLOCK)
+    apart = np.zeros((down, BLOCK + 1, across, BLOCK + 1), dtype=np.bool_)
+    whole = np.pad(passable, ((0, down * BLOCK - rows), (0, across * BLOCK - cols)))
+    apart[:, :-1, :, :-1] = whole.reshape(down, BLOCK, across, BLOCK)
+    label, count = ndimage.label(apart.reshape(down * (BLOCK + 1), -1))
+    label = label.reshape(apart.shape)[:, :-1, :, :-1].reshape(whole.shape)[:rows, :cols]
+    return np.ascontiguousarray(label, dtype=np.int32), int(count)
+
+
+def _touching(one: NDArray[np.int32], other: NDArray[np.int32]) -> tuple[Ints, Ints]:
+    """Return the regions (k,), (k,) on both sides of borders (borders, n), each pair about once."""
+    both = np.stack([one, other])[:, (one > 0) & (other > 0)].astype(np.intp)
+    first, second = both[:, np.append(True, np.any(np.diff(both, axis=1) != 0, axis=0))] if both.size else both
+    return first, second

@@ -124,23 +124,19 @@ def _changes(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> Iter
                 yield _Change(number, other, int(each.place[one[-1]]), frames)
 
 
-def _groups(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> list[list[_Change]]:
-    """Return changes within recordings, each group with all that may be at the time of its first one."""
-    groups, changes = list[list[_Change]](), list(_changes(radios, found))
-    for change in changes:
-        if not any(change.with_other(other) for group in groups for other in group):
-            groups.append([other for other in changes if change.with_other(other)])
-    return groups
-
-
 def without_moves_of_path(
     estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation]
 ) -> tuple[list[Explanation], list["BrokenStep"]]:
-    """Return the explanations without moves that a broken step of the path explains better, for all radios together; and the
-    broken steps."""
-    kept, broken = list(found), list[BrokenStep]()
-    for group in _groups(radios, found):
-        moves = [change for change in _changes(radios, kept) if group[0].with_other(change)]
+    """Return the explanations without moves that a broken step of the path explains better, and the broken steps.
+
+    Changes that may be at the same time are judged together, for all radios.
+    """
+    changes, judged, kept, broken = list(_changes(radios, found)), list[_Change](), list(found), list[BrokenStep]()
+    for change in changes:
+        if any(change.with_other(other) for other in judged):
+            continue
+        judged += [other for other in changes if change.with_other(other)]
+        moves = [other for other in _changes(radios, kept) if change.with_other(other)]
         if moves and (rival := BrokenStep(estimate, task, radios, kept, moves)).gain() + rival.log_prior() > 0.0:
             kept = rival.found
             broken.append(rival)

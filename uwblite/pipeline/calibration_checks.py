@@ -16,6 +16,7 @@ from ..errors import SolverError
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.solver import Optimizer, optimize
+from ..loop_closure.candidates import CandidatePolicy
 from ..odometry.wheels import turn_scales
 from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_odds_of_constant, prior_sigma, with_prior_sigma, without_prior
@@ -43,7 +44,7 @@ class TurningPolicy:
     """m; a mounting, or the origin of a base, is not known better than this."""
     by_tape: ClassVar[float] = 0.03
     """Standard deviation of a mounting that is given and right, m."""
-    significant: ClassVar[float] = 3.0
+    significant: ClassVar[float] = CandidatePolicy.sigmas
     """Standard deviations from which an offset of the lidar is significant."""
     wrong_frame: ClassVar[float] = 0.1
     """Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""

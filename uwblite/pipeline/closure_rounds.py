@@ -8,11 +8,11 @@ import numpy as np
 
 from ..arrays import Floats
 from ..graph.graph import Graph
-from ..graph.joint_covariance import JointCovariance
+from ..graph.marginals import JointCovariance
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
-from ..lidar.free_space import FreeSpace
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import FreeSpace
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, paper_method, verification
 from ..loop_closure.candidates import CandidatePolicy, Candidates, Tried

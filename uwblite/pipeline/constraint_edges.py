@@ -21,12 +21,13 @@ from ..arrays import Bools, Floats, Ints
 from ..constraints import Clock, Constraints, GivenAnchor, GivenLandmark
 from ..errors import ConfigError
 from ..graph.graph import Edges, Graph, PriorEdges
-from ..graph.point_edges import AnchorDistanceEdges, PointDistanceEdges
+from ..graph.point_edges import AnchorDistanceEdges, PointDistanceEdges, distances
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import optimize
 from ..grid.columns import find_column, fit_circle
 from ..lidar.clouds import Clouds
+from ..loop_closure.candidates import CandidatePolicy
 from ..problem.solution import rough
 from ..se2 import align
 from . import map_frame
@@ -38,7 +39,7 @@ from .lidar_stages import refine_jointly, solve_by_own_errors
 class GivenPolicy:
     """When places agree with what is given, and which clouds see a landmark."""
 
-    gate: ClassVar[float] = 3.0
+    gate: ClassVar[float] = CandidatePolicy.sigmas
     """Standard deviations within which a place or a distance agrees."""
     unsure: ClassVar[float] = 0.6
     """m, more of a first estimate, whose biases are not yet known well."""
@@ -162,13 +163,13 @@ def _edges(constraints: Constraints, index: dict[str, int], moved: dict[str, flo
         if anchors := [a for a in constraints.anchors if a.movable == movable and a.id not in moved]:
             place = np.array([index[a.id] for a in anchors], dtype=np.intp)
             root = np.array([np.eye(2) / a.sigma for a in anchors])
-            edges.append(PriorEdges("anchors", place, np.array([a.position for a in anchors]), root, kernel))
+            edges.append(PriorEdges("anchors", place, np.array([a.position for a in anchors]), root, kernel=kernel))
     if poses := constraints.poses:
         place = np.array([clock.nearest(p.stamp, p.recording) for p in poses], dtype=np.intp)
         edges.append(PriorEdges("poses", place, np.array([p.pose for p in poses]), _roots([p.sigma for p in poses])))
-    if distances := constraints.distances:
-        one, other = np.array([[index[name] for name in d.anchors] for d in distances], dtype=np.intp).T
-        edges.append(AnchorDistanceEdges(one, other, *np.array([[d.distance, d.sigma] for d in distances]).T))
+    if given := constraints.distances:
+        one, other = np.array([[index[name] for name in d.anchors] for d in given], dtype=np.intp).T
+        edges.append(AnchorDistanceEdges(one, other, *np.array([[d.distance, d.sigma] for d in given]).T))
     if closures := constraints.closures:
         ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in closures]
         i, j = np.array(ends, dtype=np.intp).T
@@ -282,7 +283,7 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
 
 def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
     """Return the distances in the map, and note those that differ from the measured ones."""
-    lengths = tied.edges.lengths(graph)
+    lengths = distances(tied.edges, graph)
     figures: list[dict[str, object]] = []
     for number, given in enumerate(task.constraints.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))

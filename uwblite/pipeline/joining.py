@@ -18,7 +18,7 @@ from ..arrays import Bools, Floats, Ints, rms_length
 from ..errors import DataError
 from ..graph import calibration
 from ..graph.graph import Calibration, Graph, PriorEdges
-from ..graph.joint_covariance import anchor_covariance
+from ..graph.marginals import anchor_covariance
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult

@@ -40,11 +40,6 @@ def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work
     return _with_raster(replace(built, work=work), config, delay, len(built.points))
 
 
-def only(scans: ScanClouds, kept: Bools, config: MappingConfig) -> ScanClouds:
-    """Return the clouds with some of their points (p,) alone."""
-    return scans if kept.all() else _with_raster(scans.clouds.only(kept), config, scans.delay, int(kept.sum()))
-
-
 def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
     """Return clouds with rasters, and count so many points of them as made."""
     built.work[POINTS] += new

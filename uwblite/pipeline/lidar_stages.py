@@ -19,7 +19,7 @@ from .radio_stages import evidence_against, with_range_noise
 
 _TO_COME = 1e-3
 """Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
-_STILL = 1e-3
+STILL = 1e-3
 """Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
 _VIOLATION = 0.05
 """Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
@@ -87,7 +87,7 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         estimate = _matched_once_more(estimate, shift, task)
         before = estimate
         estimate = with_range_noise(estimate, task.config).solved(quick, optimizer)[0]
-    if estimate.moved_since(before.graph.poses) >= _STILL:
+    if estimate.moved_since(before.graph.poses) >= STILL:
         estimate = with_range_noise(estimate, task.config)
     del optimizer  # The optimizer's analysis takes as much memory as the covariances.
     task.stages.report("joint refinement", 1, 1)

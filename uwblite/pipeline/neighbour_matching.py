@@ -101,10 +101,11 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     """Return the optimum of odometry, weakly weighted ranges and the steps that descent from the odometry measured."""
     scans, twist = estimate.lidar, task.recordings.twist
-    found = scan_to_scan.descended_edges(scans.clouds, scans.raster, steps)
+    found = scan_to_scan.descended_edges(scans.raster, steps)
     names = scan_indices(estimate.graph.calibration)
     i, j, kernel = found.i, found.j, estimate.odometry.kernel
-    edges = ScanEdges(i, j, found.T_i_j, found.sqrt_information, twist[i], twist[j], names, scans.delay, kernel)
+    root = found.sqrt_information
+    edges = ScanEdges(i, j, found.T_i_j, root, twist[i], twist[j], names, scans.delay, kernel=kernel)
     wheels = reestimate_wheel_noise(estimate.odometry, found, estimate.graph)
     return _with_inflated_ranges(replace(estimate, odometry=wheels, steps=edges)).solved(rough(task.config.solver))[0]
 
@@ -119,9 +120,7 @@ def _with_slips(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
-    # Points of objects that move leave the clouds.
-    still = keyframe_data.only(estimate.lidar, ~track.moving, task.config)
-    return _match_neighbours(replace(estimate, scans=still, odometry=track.slipped), track, task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:
@@ -160,13 +159,13 @@ def _steps(estimate: Estimate, task: Task) -> Steps:
     """Return the steps of the odometry as the clouds measure them from the estimate's poses."""
     scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i
     guess = se2.between(poses[i], poses[i + 1])
-    return scan_to_scan.match_plainly(scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate)
+    return scan_to_scan.match_plainly(scans.raster, i, guess, task.config.refinement.first_gate)
 
 
 def _followed(estimate: Estimate, steps: Steps) -> ScanOdometry:
     """Return the steps between neighbouring clouds, near the odometry's or elsewhere where it slipped."""
     scans = estimate.lidar
-    return scan_to_scan.follow(scans.clouds, scans.raster, estimate.odometry, estimate.graph, steps)
+    return scan_to_scan.follow(scans.raster, estimate.odometry, estimate.graph, steps)
 
 
 def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Estimate | None:
@@ -196,19 +195,10 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
     gate = float(np.clip(track.miss, rules.later_gate, rules.first_gate))
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     refined = refine(weak, graph, settings, task, "scan-to-scan matching")
-    scans, ends = estimate.lidar, np.concatenate([refined.i[refined.used], refined.j[refined.used]])
-    poses, laid = scan_to_scan.reattached(
-        scans.clouds, scans.raster, refined.graph.poses, task.recordings.stamps, np.isin(np.arange(len(scans.clouds)), ends),
-        rules.first_gate,
-    )
-    if placed_again := len(laid):
-        graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
-        refined = refine(weak, graph, replace(settings, first_gate=rules.later_gate), task, "scan-to-scan matching")
     task.stages.end(
         "scan-to-scan matching", pairs=len(refined.used), used=int(refined.used.sum()), gate=gate, sigma=refined.sigma,
         rounds=refined.rounds, searched=track.searched, rejected=int(track.rejected.sum()),
-        slipped=int(np.sum(track.slips > NeighbourPolicy.likely)), placed_again=placed_again,
-        moving=float(track.moving.mean()) if len(track.moving) else 0.0,
+        slipped=int(np.sum(track.slips > NeighbourPolicy.likely)),
     )
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
     return calibration_checks.with_constant_turn_scales(estimate, task)

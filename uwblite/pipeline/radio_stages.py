@@ -202,10 +202,10 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     The noise of the ranges was learnt under either, so that the ranges count with their normalised densities; both with the
     same number of independent ranges, for errors that last are counted once.
     """
-    values, shares = zip(*(_evidence_and_shares(estimate, config) for estimate in (one, other)), strict=True)
-    common = 0.5 * (shares[0] + shares[1]) * ((shares[0] > 0.0) & (shares[1] > 0.0))
-    gain = sum(sign * (rest + float(common @ density)) for sign, (rest, density) in zip((1.0, -1.0), values, strict=True))
-    return float(gain) + _for_tighter_wheels(one, other)
+    (rest, density, share), (rest_of_other, density_of_other, share_of_other) = (_evidence(e, config) for e in (one, other))
+    common = 0.5 * (share + share_of_other) * ((share > 0.0) & (share_of_other > 0.0))
+    ranges = float(common @ density) - float(common @ density_of_other)
+    return rest - rest_of_other + ranges + _for_tighter_wheels(one, other)
 
 
 def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
@@ -217,14 +217,14 @@ def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
     return float(np.mean(shown, axis=0) @ np.log(tighter).mean(axis=0))
 
 
-def _evidence_and_shares(estimate: Estimate, config: MappingConfig) -> tuple[tuple[float, Floats], Floats]:
+def _evidence(estimate: Estimate, config: MappingConfig) -> tuple[float, Floats, Floats]:
     """Return the logarithms of the evidence but for the ranges, and of each range's density (m,), and its independent share."""
     ranges = estimate.ranges
     assert ranges is not None
     graph = estimate.problem
     squared = edge_cost(ranges, ranges.residuals(graph))
     density, share = log_densities(ranges, graph, config.ranges.min_sigma)
-    return (laplace_marginal_likelihood(graph) + 0.5 * squared, density), share
+    return laplace_marginal_likelihood(graph) + 0.5 * squared, density, share
 
 
 def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
@@ -235,11 +235,9 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.ranges is None or estimate.steps is None:
         return estimate
-    config, optimizer = task.config, Optimizer()
-    held = estimate.solved(rough(config.solver), optimizer)[0]
-    estimate = held if _let_go(held, estimate) else estimate
-    for solver in (rough(config.solver), config.solver):
-        estimate = with_range_noise(estimate, config).solved(solver, optimizer)[0]
+    optimizer = Optimizer()
+    held = estimate.solved(rough(task.config.solver), optimizer)[0]
+    estimate = _learn_ranges(held if _let_go(held, estimate) else estimate, task, optimizer)
     task.stages.end("ranges re-estimated")
     return estimate
 
@@ -253,8 +251,8 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None:
         return estimate
     if estimate.steps is None or not estimate.rests_on_ranges:
-        weak = _learn_ranges(estimate, task, steady=True)
-        estimate = _learn_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
+        weak = _learn_ranges(estimate, task, Optimizer(), steady=True)
+        estimate = _learn_ranges(estimate, task, Optimizer()) if _let_go(estimate, weak) else weak
     return with_selected_priors(estimate, task.config)
 
 
@@ -264,9 +262,8 @@ def with_selected_priors(estimate: Estimate, config: MappingConfig) -> Estimate:
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, measured, config.calibration))
 
 
-def _learn_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
+def _learn_ranges(estimate: Estimate, task: Task, optimizer: Optimizer, *, steady: bool = False) -> Estimate:
     """Return the optimum with ranges whose noise was learnt there; steady: see range_measurements.learn_noise."""
-    optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
         # The marginal likelihood is valid only at the optimum for the weights with which it is computed.
         estimate = with_range_noise(estimate, task.config, steady=steady).solved(solver, optimizer)[0]

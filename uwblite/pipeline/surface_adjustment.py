@@ -5,10 +5,10 @@ that the views of a column from all sides show one circle, and that a surface's 
 and columns become unknowns themselves, with their offsets, and are eliminated (graph/eliminated.py). Then the pairs get the
 resulting relative poses, so that later stages start from there; the rays are used again for the covariances.
 
-The weight of a ray is learnt from the residuals (lidar/ray_noise.py). Where rays are nearly independent, pairs add nothing on
-walls, and their points there get hardly any weight; where walls bend, all rays of one place get the weight of a few, and pairs
-keep their weight. On columns they get hardly any: lines through points of a column lie inside it, to the side from which it is
-seen.
+The weight of a ray is learnt from its residuals (lidar/ray_equations.py). Where rays are nearly independent, pairs add nothing
+on walls, and their points there get hardly any weight; where walls bend, all rays of one place get the weight of a few, and
+pairs keep their weight. On columns they get hardly any: lines through points of a column lie inside it, to the side from which
+it is seen.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,42 +29,46 @@ from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
 from ..graph.work import RAYS
 from ..lidar.cloud_rasters import ScanClouds
-from ..lidar.columns import Circles, fitted_circles, join_circles, surroundings
+from ..lidar.columns import (
+    Circles,
+    around_columns,
+    fitted_circles,
+    fitted_columns,
+    join_circles,
+    on_columns,
+    surroundings,
+)
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
-from ..lidar.ray_noise import UNLEARNT, RayNoise
 from ..lidar.surface_rays import (
-    NEAR,
+    UNLEARNT,
     MeasuredSurfaces,
+    RayNoise,
+    ShapePolicy,
     SurfaceRays,
     Surfaces,
-    around_columns,
     as_rays,
-    fitted_columns,
-    on_columns,
-    points_on,
     surfaces_of,
 )
-from ..lidar.walls import Pieces, find_walls, straight_pieces
+from ..lidar.walls import Pieces, find_walls, points_on, straight_pieces
 from ..odometry.attached import ScanPoints
 from ..odometry.wheels import noise_at
 from .estimate import Estimate, Task
 from .keyframe_data import rays_of
+from .lidar_stages import STILL
 
 
 @dataclass(frozen=True, slots=True)
 class SurfacePolicy:
     """Adjustment of poses and surfaces."""
 
-    on_rim: ClassVar[float] = 0.06
-    """Distance from a column's rim up to which the middle of a straight piece is on it, m."""
     ahead: ClassVar[float] = 2.0
     """Farthest that a lidar is from its keyframe, m: its mounting, and the way to the scan."""
     steps: ClassVar[int] = 6
     """Most Gauss-Newton steps."""
     settling: ClassVar[int] = 2
     """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
-    still: ClassVar[float] = 1e-3
+    still: ClassVar[float] = STILL
     """The next change of the poses, rms, m, that ends them once noise and pairs have settled."""
     kernel: ClassVar[float] = 3.0
     wider: ClassVar[float] = 4.0
@@ -82,9 +86,9 @@ def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfa
     """Return the surfaces of the map with clouds at poses (k, 3)."""
     circles, pieces, on = _shapes(scans, task, len(poses))
     columns = join_circles(circles, poses)
-    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, SurfacePolicy.on_rim)
+    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, ShapePolicy.on)
     middles = se2.transform_each(poses, pieces.keyframe, pieces.centre)
-    walls = find_walls(pieces, poses, ~near.on_rim(middles, SurfacePolicy.on_rim))
+    walls = find_walls(pieces, poses, ~near.on_rim(middles, ShapePolicy.on))
     columns, on = fitted_columns(around, poses, columns), on.renumbered(walls.of_piece)
     surfaces = surfaces_of(walls.centre, walls.normal, columns)
     rays = concatenated([on, on_columns(around, poses, columns, len(walls.centre)).packed()])
@@ -110,7 +114,7 @@ def _around(columns: Floats, poses: Floats, none: SurfaceRays, scans: ScanClouds
     reach = max(r.log.scans.range_max for r in task.recordings.each if r.log.scans is not None)
     reach = min(task.config.clouds.range_max, reach)
     within = cKDTree(columns[:, :2]).query(poses[:, :2])[0] < reach + SurfacePolicy.ahead
-    near = surroundings(columns, NEAR)
+    near = surroundings(columns, ShapePolicy.around)
     return concatenated([none, *(around_columns(as_rays(r), poses, near).packed() for r in _rays(scans, task, within))])
 
 

@@ -1,9 +1,8 @@
 """Alternatives: other explanations of the same measurements, compared by their evidence.
 
 An alternative changes a problem: its priors, what is fixed in it, or where its search begins. It is solved from the present
-estimate, and stands against the problem as it is, and against all other alternatives, by posterior odds: the ratio of their
-evidence (evidence.py) times their prior odds. One for which there is positive evidence is taken; one that very strong evidence
-does not refute stays open, for the findings; the rest is dropped.
+estimate, and stands against all others by posterior odds: the ratio of their evidence (evidence.py) times their prior odds. One
+for which there is positive evidence is taken; one that very strong evidence does not refute stays open, for the findings.
 """
 
 from collections.abc import Callable, Iterable

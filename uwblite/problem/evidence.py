@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..graph.graph import Graph, PriorEdges
-from ..graph.joint_covariance import calibration_covariance
+from ..graph.marginals import calibration_covariance
 
 
 def laplace_marginal_likelihood(graph: Graph) -> float:

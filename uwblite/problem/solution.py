@@ -1,6 +1,7 @@
 """Solution of a problem and of its parts: the optimum, of which no anchor's squared height is below 0."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -9,6 +10,15 @@ from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from ..graph.unknowns import free_unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class SolutionPolicy:
+    """When optimisations end after which others follow: relative decreases of chi2, and most iterations."""
+
+    rough: ClassVar[float] = 1e-4
+    rough_iterations: ClassVar[int] = 12
+    comparable: ClassVar[float] = 1e-5
 
 
 def solve(graph: Graph, config: SolverConfig, optimizer: Optimizer | None = None) -> tuple[Graph, SolverSummary]:
@@ -40,21 +50,13 @@ def with_nonnegative_heights(graph: Graph) -> Graph:
 
 def rough(solver: SolverConfig) -> SolverConfig:
     """Return the solver settings for an optimisation after which weights are re-estimated and another one follows."""
-    iterations, decrease = min(solver.max_iterations, _ROUGH_ITERATIONS), max(solver.relative_decrease, _ROUGH_DECREASE)
-    return replace(solver, max_iterations=iterations, relative_decrease=decrease)
-
-
-_ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
-"""Most iterations of such an optimisation, and the relative decrease of chi2 that ends it."""
+    iterations = min(solver.max_iterations, SolutionPolicy.rough_iterations)
+    return replace(solver, max_iterations=iterations, relative_decrease=max(solver.relative_decrease, SolutionPolicy.rough))
 
 
 def comparable(solver: SolverConfig) -> SolverConfig:
     """Return the solver settings for an optimisation whose evidence is compared; the chosen one is then continued."""
-    return replace(solver, relative_decrease=max(solver.relative_decrease, _COMPARABLE))
-
-
-_COMPARABLE = 1e-5
-"""Relative decrease of chi2 that ends such an optimisation."""
+    return replace(solver, relative_decrease=max(solver.relative_decrease, SolutionPolicy.comparable))
 
 
 def stretch(graph: Graph, first: int, last: int) -> Graph:

@@ -19,7 +19,7 @@ from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
 from ..graph.graph import Edges, Graph
-from ..graph.joint_covariance import calibration_covariance
+from ..graph.marginals import calibration_covariance
 from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
 

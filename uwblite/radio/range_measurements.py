@@ -50,9 +50,9 @@ def range_edges(
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
         given[attached.anchor] - np.where(is_given[attached.anchor], attached.rise, 0.0),
         range_indices(calibration, attached.anchor, anchor_ids, attached.tag),
-        noise.kernel,
-        (plausible(attached.ranges, max_range) & attached.inside).astype(np.float64),
         attached.stamps,
+        kernel=noise.kernel,
+        weights=(plausible(attached.ranges, max_range) & attached.inside).astype(np.float64),
     )
 
 

@@ -56,34 +56,25 @@ def rgb(code: str) -> Colour:
     return red, green, blue
 
 
-PATH: Colour = rgb("2563eb")
-PATHS: tuple[Colour, ...] = (PATH, rgb("7c3ab4"), rgb("00808c"), rgb("5c4033"))
-"""Of the recordings, in turn."""
-ACCEPTED: Colour = rgb("ea7814")
-REJECTED: Colour = rgb("8a93a0")
-ANCHOR: Colour = rgb("d01c3c")
+PALETTE = {
+    "path0": ("2563eb", "6a9bff"),
+    "path1": ("7c3ab4", "7c3ab4"),
+    "path2": ("00808c", "00808c"),
+    "path3": ("5c4033", "5c4033"),
+    "accepted": ("ea7814", "ff9a40"),
+    "rejected": ("8a93a0", "96a0ae"),
+    "anchor": ("d01c3c", "ff6480"),
+    "start": ("169650", "3fc47c"),
+    "doubted": ("fabe14", "fabe14"),
+    "nlos": ("d81b60", "ff6aa5"),
+}
+"""By names, on a light ground and on a dark one: recordings, closures, anchors, and what does not agree with the map."""
+PATHS = tuple(rgb(light) for name, (light, _) in PALETTE.items() if name.startswith("path"))
+ACCEPTED, REJECTED, ANCHOR, START, DOUBTED = (
+    rgb(PALETTE[n][0]) for n in ("accepted", "rejected", "anchor", "start", "doubted")
+)
 PROPOSED: Colour = rgb("6e28a0")
 """Anchors that do not stand there yet."""
-START: Colour = rgb("169650")
-DOUBTED: Colour = rgb("fabe14")
-"""Stretches of a path that are not to be trusted."""
-NLOS: Colour = rgb("d81b60")
-"""Ranges that do not agree with the map."""
-
-ON_DARK: dict[Colour, Colour] = {
-    PATH: rgb("6a9bff"),
-    ACCEPTED: rgb("ff9a40"),
-    REJECTED: rgb("96a0ae"),
-    ANCHOR: rgb("ff6480"),
-    START: rgb("3fc47c"),
-    NLOS: rgb("ff6aa5"),
-}
-"""What stands for a colour on a dark ground."""
-
-
-def hexadecimal(colour: Colour, *, dark: bool = False) -> str:
-    """Return a colour as HTML has it."""
-    return "#{:02x}{:02x}{:02x}".format(*(ON_DARK.get(colour, colour) if dark else colour))
 
 
 def share(colour: Colour, alpha: float = 1.0) -> tuple[float, float, float, float]:

@@ -1,24 +1,14 @@
 """The frame of all pages: colours and style, the style of a map's SVG, and the script that zooms the report's map."""
 
-from .canvas import ACCEPTED, ANCHOR, DOUBTED, NLOS, PATHS, REJECTED, START, hexadecimal
+from .canvas import PALETTE
 
-_COLOURS = {
-    "doubted": DOUBTED,
-    "accepted": ACCEPTED,
-    "rejected": REJECTED,
-    "anchor": ANCHOR,
-    "start": START,
-    "nlos": NLOS,
-    **{f"path{k}": colour for k, colour in enumerate(PATHS)},
-}
-"""By their names in styles."""
-LIGHT, DARK = ("".join(f"--{n}:{hexadecimal(c, dark=dark)};" for n, c in _COLOURS.items()) for dark in (False, True))
+_LIGHT, _DARK = ("".join(f"--{name}:#{codes[ground]};" for name, codes in PALETTE.items()) for ground in (0, 1))
 
 STYLE = (
     ":root{--paper:#f6f7f9;--card:#fff;--ink:#1b1f24;--faint:#667;--line:#d5d9de;--shade:#0003;--good:#e7f5e9;--warn:#fff4d6;"
-    "--bad:#fde4e1;--unsure:#ef6c00;--halo:#fff;--ground:#cdcdcd;" + LIGHT + "}@media (prefers-color-scheme:dark){"
+    "--bad:#fde4e1;--unsure:#ef6c00;--halo:#fff;--ground:#cdcdcd;" + _LIGHT + "}@media (prefers-color-scheme:dark){"
     ":root{--paper:#14181e;--card:#1a1f26;--ink:#e4e7eb;--faint:#9aa3ad;--line:#3a4049;--shade:#fff4;--good:#17301b;"
-    "--warn:#3a2f10;--bad:#451c19;--unsure:#ffa040;--halo:#000;--ground:#2a2a2a;" + DARK + "}"
+    "--warn:#3a2f10;--bad:#451c19;--unsure:#ffa040;--halo:#000;--ground:#2a2a2a;" + _DARK + "}"
     ".map image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}"
     """
 *{box-sizing:border-box}

@@ -67,8 +67,9 @@ def gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Fact]]:
         a, b = float(stamps[k]), float(stamps[k + 1])
         held = bool(way[k] < CutPolicy.stands)
         stood = held and bool(turn[k] < CutPolicy.stands)
+        same = same_place(log, a, b) if held else None
         # A gyro may have turned with the robot while no sensor measured its distance.
-        if held and _elsewhere_after(log, a, b):
+        if held and (range_motion.excess(log, a, b) > 0.0 if same is None else not same):
             at.append(a)
             facts.append(Fact.of("carried", at=[a - float(stamps[0])], silent=b - a))
         elif stood:
@@ -99,12 +100,6 @@ def _as_between_others(odometry: Odometry) -> Bools:
     (way, turn), moved = _ways(odometry), np.diff(odometry.stamps) > 0.0
     usual = [float(np.quantile(part[moved], CutPolicy.usual)) if moved.any() else 0.0 for part in (way, turn)]
     return np.asarray((way > CutPolicy.stands) & (way <= usual[0]) & (turn <= usual[1]))
-
-
-def _elsewhere_after(log: SensorLog, a: float, b: float) -> bool:
-    """Return whether lidar or radio find the robot elsewhere after a time in which the wheels stood."""
-    same = same_place(log, a, b)
-    return not same if same is not None else range_motion.excess(log, a, b) > 0.0
 
 
 def _inside(stamps: Floats, a: float, b: float) -> Bools:

@@ -45,9 +45,8 @@ def _fits_laser(log: SensorLog) -> float:
 def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the laser mounted upright or upside down, as its turns show.
 
-    A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in
-    opposite directions. This repairs the first two; the third would give the mirror image of the place, and nothing in
-    the recording distinguishes them.
+    A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in opposite
+    directions. This repairs the first two; the third would give a mirror image, and nothing distinguishes them.
     """
     if _fits_laser(log) >= 0.0:
         return log, []
@@ -82,10 +81,10 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
 
 
 def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> float:
-    """Return by how much motions of lidar and wheels differ with the laser mounted so, m, mean over turning pairs.
+    """Return by how much motions of lidar and wheels differ with the laser mounted so, m, mean over clear pairs.
 
-    A laser that was mounted another way round stands where it was given; where the wheels drive another way instead, it
-    stands elsewhere on their base, and its tag as well. Turns swing the laser about the base: that distinguishes the two.
+    A laser mounted another way round stands where it was given; where the wheels drive another way instead, it stands elsewhere
+    on their base, and its tag as well. Turns swing the laser about the base: that distinguishes the two.
     """
     laser = se2.compose(se2.compose(se2.inverse(given), pairs.lidar[clear]), given)
     base = se2.compose(se2.compose(mount, laser), se2.inverse(mount))

@@ -58,11 +58,9 @@ def _most_change(way: Floats | float, noise: float) -> Floats:
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
-    """Return the motion between two times by the ranges minus that by the wheels, m; 0 = not larger.
+    """Return the motion between two times, s, by the ranges minus that by the wheels, m; 0 = not larger.
 
-    Parameters
-    ----------
-    start, end : s; the readings before start and those after end are compared, and those between with each other.
+    The readings before the first and those after the last are compared, and those between with each other.
     """
     by_anchor, size = _by_anchor(log), MotionPolicy.window
     middle = size // 2 + 1
@@ -84,9 +82,10 @@ def excess(log: SensorLog, start: float, end: float) -> float:
             found.append(np.where(np.isfinite(change), change, -np.inf))
     if not found:
         return 0.0
-    # Bursts of late readings, now of one anchor and then of another, agree only when compared with each other; most moments
-    # have none.
-    agreed = _agreed(np.stack(found)).max(axis=1)
+    # What enough of the anchors exceed, at least. Bursts of late readings, now of one anchor and then of another, agree only
+    # when compared with each other; most moments have none.
+    needed = min(max(MotionPolicy.votes, len(found) // 2), len(found))
+    agreed = np.sort(np.stack(found), axis=0)[-needed].max(axis=1)
     agreed = np.sort(agreed[np.isfinite(agreed)])
     return max(0.0, float(agreed[(len(agreed) - 1) // 2]) - _way(log, np.array([start, end]))) if len(agreed) else 0.0
 
@@ -94,9 +93,7 @@ def excess(log: SensorLog, start: float, end: float) -> float:
 def cuts(log: SensorLog, jumps: Floats) -> list[float]:
     """Return the times, s, at which the ranges to several anchors jump together and permanently by more than the robot drove.
 
-    Parameters
-    ----------
-    jumps : (b,) times at which the odometry jumps, s: there one anchor is enough, where no other one is in reach.
+    Where the odometry jumps (b,), s, one anchor is enough, where no other one is in reach.
     """
     spans, by_anchor = [np.zeros((0, 3))], _by_anchor(log)
     for stamps, ranges in by_anchor:
@@ -145,9 +142,7 @@ def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
 def _together(spans: list[Floats], jumps: Floats) -> list[float]:
     """Return the middles of the times, s, in which enough of the anchors in reach jump.
 
-    Parameters
-    ----------
-    spans : of each anchor (n, 3) two neighbouring readings' stamps, s, and by how much they differ beyond what is plausible, m.
+    Spans are of each anchor (n, 3) two neighbouring readings' stamps, s, and the change beyond what is plausible, m.
     """
     found: list[float] = []
     votes = np.concatenate(spans)
@@ -160,12 +155,6 @@ def _together(spans: list[Floats], jumps: Floats) -> list[float]:
         if anchors >= max(least, reached // 2) and all(abs(0.5 * (start + end) - t) > MotionPolicy.apart for t in found):
             found.append(0.5 * float(same[:, 0].max() + same[:, 1].min()))
     return sorted(found)
-
-
-def _agreed(over: Floats) -> Floats:
-    """Return the value that enough of the anchors exceed, from the excess (a, ...) of each."""
-    needed = min(max(MotionPolicy.votes, len(over) // 2), len(over))
-    return np.asarray(np.sort(over, axis=0)[-needed])
 
 
 def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:

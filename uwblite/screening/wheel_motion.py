@@ -30,7 +30,7 @@ class PairPolicy:
     per_stand: ClassVar[int] = 8
     """Further pairs in each stretch in which the wheels stand."""
     stands: ClassVar[int] = 30
-    """Such stretches that are tested, the longest first."""
+    """Such stretches, the longest first."""
     apart: ClassVar[float] = 0.1
     """Usual distance between the scans of a pair, m."""
     spans: ClassVar[tuple[float, float]] = (0.1, 1.0)
@@ -215,7 +215,6 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
 
 
 def _period(middle: Floats) -> float:
-    """Return the usual time between scans, s; a millisecond at least."""
     return max(float(np.median(np.diff(middle))), 1e-3)
 
 

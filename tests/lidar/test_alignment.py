@@ -6,11 +6,10 @@ from helpers import registration_worlds as worlds
 from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
-from uwblite.lidar import pair_alignment
+from uwblite.lidar import scan_matching
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined, make_cloud
-from uwblite.lidar.pair_alignment import align_pairs
-from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
+from uwblite.lidar.scan_matching import align_pairs, match, nondegenerate_step, pairs_of
 
 TRUTH = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
 I, J = np.array([0, 0, 2]), np.array([1, 2, 1])
@@ -18,27 +17,27 @@ I, J = np.array([0, 0, 2]), np.array([1, 2, 1])
 
 @pytest.fixture(scope="module")
 def world():
-    """Clouds, their raster, the points of each pair and the true poses of the pairs."""
+    """The raster of some clouds, the pairs, and their true poses."""
     clouds = scanned(TRUTH, ROOM, 0.005, 1)
-    return clouds, rasterize(clouds, 0.05, 0.8), pair_points(clouds, J, 200), se2.between(TRUTH[I], TRUTH[J])
+    return rasterize(clouds, 0.05, 0.8), pairs_of(clouds, I, J, 200), se2.between(TRUTH[I], TRUTH[J])
 
 
 def test_one_iteration_is_one_step_of_the_matches(world):
-    clouds, raster, points, exact = world
+    raster, pairs, exact = world
     guess = exact + np.array([0.05, -0.04, 0.03])
-    step = nondegenerate_step(match(clouds, raster, I, guess, points, 0.3, 0.15))[0]
+    step = nondegenerate_step(match(raster, pairs, guess, 0.3, 0.15))[0]
     assert 0.01 < np.abs(step).max() < 0.15
-    found = align_pairs(clouds, raster, I, guess, points, 0.3, 0.3, iterations=1)
+    found = align_pairs(raster, pairs, guess, 0.3, 0.3, iterations=1)
     np.testing.assert_allclose(se2.between(found.pose, guess + step), 0.0, atol=1e-12)
-    np.testing.assert_array_equal(found.factors.matched, match(clouds, raster, I, found.pose, points, 0.3, 0.15).matched)
+    np.testing.assert_array_equal(found.factors.matched, match(raster, pairs, found.pose, 0.3, 0.15).matched)
 
 
 def test_no_step_is_longer_than_allowed(world):
     """0.3 m and 0.15 rad; a longer one keeps its direction."""
-    clouds, raster, points, exact = world
+    raster, pairs, exact = world
     guess = exact + np.array([0.6, 0.5, 0.1])
-    step = nondegenerate_step(match(clouds, raster, I, guess, points, 0.8, 0.4))[0]
-    found = align_pairs(clouds, raster, I, guess, points, 0.8, 0.8, iterations=1)
+    step = nondegenerate_step(match(raster, pairs, guess, 0.8, 0.4))[0]
+    found = align_pairs(raster, pairs, guess, 0.8, 0.8, iterations=1)
     taken = found.pose - guess
     taken[:, 2] = se2.wrap_angle(taken[:, 2])
     long = (np.hypot(step[:, 0], step[:, 1]) > 0.3) | (np.abs(step[:, 2]) > 0.15)
@@ -50,10 +49,10 @@ def test_no_step_is_longer_than_allowed(world):
 
 def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
     """By 0.6 rad, four times what is allowed; by half of what is allowed; 0.6 m and 0.3 rad, both twice as far."""
-    clouds, raster, points, exact = world
+    raster, pairs, exact = world
     steps = np.array([[0.04, 0.0, -0.6], [0.1, 0.0, 0.075], [0.0, 0.6, 0.3]])
-    monkeypatch.setattr(pair_alignment, "nondegenerate_step", lambda factors: (steps, None))
-    found = align_pairs(clouds, raster, I, exact, points, 0.8, 0.8, iterations=1)
+    monkeypatch.setattr(scan_matching, "nondegenerate_step", lambda factors: (steps, None))
+    found = align_pairs(raster, pairs, exact, 0.8, 0.8, iterations=1)
     taken = se2.wrap_angle(found.pose[:, 2] - exact[:, 2])
     np.testing.assert_allclose(taken, [-0.15, 0.075, 0.15])
     np.testing.assert_allclose((found.pose - exact)[:, :2], [[0.01, 0.0], [0.1, 0.0], [0.0, 0.3]], atol=1e-12)
@@ -61,18 +60,18 @@ def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
 
 def test_pairs_go_on_at_the_last_gate_until_none_moves(world):
     """By then one more step would move no pair; the first step was far from that."""
-    clouds, raster, points, exact = world
+    raster, pairs, exact = world
     guess = exact + np.array([0.2, -0.15, 0.1])
     moves = []
-    for pose in (guess, align_pairs(clouds, raster, I, guess, points, 0.5, 0.5, iterations=60).pose):
-        moves.append(np.abs(nondegenerate_step(match(clouds, raster, I, pose, points, 0.5, 0.25))[0]).max())
+    for pose in (guess, align_pairs(raster, pairs, guess, 0.5, 0.5, iterations=60).pose):
+        moves.append(np.abs(nondegenerate_step(match(raster, pairs, pose, 0.5, 0.25))[0]).max())
     assert moves[0] > 0.05
     assert moves[1] < 1e-3
 
 
 def test_motions_are_recovered_and_distinguished_from_guesses(world):
-    clouds, raster, points, exact = world
-    found = align_pairs(clouds, raster, I, exact + np.array([0.15, -0.1, 0.08]), points, 0.5, 0.1)
+    raster, pairs, exact = world
+    found = align_pairs(raster, pairs, exact + np.array([0.15, -0.1, 0.08]), 0.5, 0.1)
     error = se2.between(exact, found.pose)
     # Points err by 5 mm and are means in cells of 2 cm; some 150 of them hold a pose.
     assert np.abs(error[:, :2]).max() < 0.01
@@ -87,8 +86,8 @@ MOTION, CENTRE = np.array([0.8, -0.5, 0.6]), (3.0, 1.5)
 def aligned(target, source, guesses):
     """Align one pair of clouds from several guesses (g, 3)."""
     clouds, i = joined([target, source]), np.zeros(len(guesses), dtype=np.intp)
-    points = pair_points(clouds, i + 1, len(source.points))
-    return align_pairs(clouds, rasterize(clouds, 0.05, 0.8), i, guesses, points, 0.8, 0.15, 30)
+    pairs = pairs_of(clouds, i, i + 1, len(source.points))
+    return align_pairs(rasterize(clouds, 0.05, 0.8), pairs, guesses, 0.8, 0.15, 30)
 
 
 def distance(found):
@@ -131,28 +130,27 @@ def test_a_corridor_constrains_across_and_not_along(heading):
 
 def test_a_pair_ends_where_it_ends_alone(world):
     """Pairs that have come to rest are left alone; the others do not notice."""
-    clouds, raster, _, exact = world
+    raster, pairs, exact = world
     guess = exact + np.array([[0.0, 0.0, 0.0], [0.2, -0.2, 0.1], [-0.02, 0.01, 0.0]])
-    points = pair_points(clouds, J, 200)
-    together = align_pairs(clouds, raster, I, guess, points, 0.5, 0.15)
+    together = align_pairs(raster, pairs, guess, 0.5, 0.15)
     for k in range(3):
         row = slice(k, k + 1)
-        alone = align_pairs(clouds, raster, I[row], guess[row], pair_points(clouds, J[row], 200), 0.5, 0.15)
+        alone = align_pairs(raster, pairs.rows(row), guess[row], 0.5, 0.15)
         np.testing.assert_allclose(alone.pose[0], together.pose[k], atol=1e-9)
 
 
 def test_a_gate_shrinks_with_the_steps_of_its_pair(world, monkeypatch):
     """One pair begins where it belongs and comes to the last gate at once, the others 0.25 m off and do not."""
-    clouds, raster, points, exact = world
+    raster, pairs, exact = world
     guess = exact + np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.0], [0.0, 0.25, 0.0]])
     gates = []
 
-    def noted(clouds, raster, i, pose, points, gate, scale):
-        gates.append(np.broadcast_to(gate, len(i)))
-        return match(clouds, raster, i, pose, points, gate, scale)
+    def noted(raster, pairs, pose, gate, scale):
+        gates.append(np.broadcast_to(gate, len(pairs)))
+        return match(raster, pairs, pose, gate, scale)
 
-    monkeypatch.setattr(pair_alignment, "match", noted)
-    found = align_pairs(clouds, raster, I, guess, points, 0.5, 0.12)
+    monkeypatch.setattr(scan_matching, "match", noted)
+    found = align_pairs(raster, pairs, guess, 0.5, 0.12)
     np.testing.assert_array_equal(gates[0], 0.5)
     np.testing.assert_allclose(gates[1], [0.12, 0.4, 0.4])
     np.testing.assert_allclose(se2.between(exact, found.pose), 0.0, atol=0.01)

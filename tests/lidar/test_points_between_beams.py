@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.beam_gaps import _on_one_line, filled
+from uwblite.lidar.clouds import _on_one_line, filled
 from uwblite.odometry.attached import ScanPoints
 
 
