@@ -21,7 +21,7 @@ USUAL = {
         "factorisations": 53, "factor entries": 591_590, "products": 1_666_339,
     },
     "no ranges": {
-        "points": 172_768, "products": 1_031_901, "look-ups": 1_678_120, "factorisations": 41,
+        "points": 89_882, "products": 1_031_901, "look-ups": 1_678_120, "factorisations": 41,
         "factor entries": 1_236_253, "rays": 751_112,
     },
 }  # fmt: skip

@@ -1,7 +1,8 @@
 """Whether the minimum that an optimisation found is the global one.
 
-The cost F of every edge is bounded from below by a Hermitian form that touches it at the estimate (TangentForm). With
-headings z of magnitude 1 their sum is x^H M x + const, and with Lambda_k = Re(conj(z_k) (M x)_k) at the estimate the matrix
+The cost F of every edge is bounded from below by a Hermitian form that touches it at the estimate (TangentForm). With poses as
+complex numbers, t for the place and z = exp(i theta) for the heading, the sum is x^H M x + const, and with
+Lambda_k = Re(conj(z_k) (M x)_k) at the estimate the matrix
 
     S = M - diag(Lambda on headings, 0 on places)
 
@@ -13,10 +14,8 @@ places): no cost is below F(estimate) - eta times the number of headings. -eta i
 Without the tangents this is the Lagrangian dual of the chordal problem (D. Rosen, L. Carlone, A. Bandeira, J. Leonard,
 SE-Sync, IJRR 2019; complex: T. Fan, H. Wang, M. Rubenstein, T. Murphey, CPL-SLAM, T-RO 2020) and, with ranges, that of
 CORA (A. Papalia, A. Fishberg, B. O'Neill, J. How, D. Rosen, J. Leonard, T-RO 2024), its unit vectors eliminated. The
-tangents make it hold for the cost that the solver minimises: angles as angles, information of any shape.
-
-In a form, poses are complex numbers, t for the place and z = exp(i theta) for the heading; so are anchors. What touches with
-its gradient, and lies below everywhere:
+tangents make it hold for the cost that the solver minimises: angles as angles, information of any shape. What touches with its
+gradient, and lies below everywhere:
 
 * of a range: (sqrt(q) - d)^2 is convex in the squared distance q, and so lies above its tangent, which weighs q with
   1 - d / rho at the estimate rho: negative where the range was measured longer than the estimate has it;
@@ -27,14 +26,14 @@ its gradient, and lies below everywhere:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
+from .chordal_start import Complexes, as_complex
 from .elimination import work_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
@@ -45,7 +44,6 @@ from .range_edges import RangeEdges
 from .solver import SolverConfig, optimize
 from .unknowns import free_unknowns
 
-Complexes = NDArray[np.complex128]
 _Parts = Sequence[tuple[Ints, Any]]
 """A linear function of the numbers, one an edge: their indices (e,) and coefficients (e,)."""
 
@@ -78,7 +76,7 @@ class TangentForm:
         n, a = len(graph.poses), len(graph.anchors)
         # The origin is moved to the middle of the places, so that numbers are small for any map frame.
         places = np.concatenate([graph.poses[:, :2], graph.anchors]) - graph.poses[:, :2].mean(axis=0)
-        self.x: Complexes = np.concatenate([_complex(places), np.exp(1j * graph.poses[:, 2]), [1.0]])
+        self.x: Complexes = np.concatenate([as_complex(places), np.exp(1j * graph.poses[:, 2]), [1.0]])
         """(2 n + a + 1,) places of poses and anchors, headings of poses and of the map."""
         self.places = n + a
         """How many of them are places."""
@@ -96,14 +94,17 @@ class TangentForm:
         if isinstance(edges, RangeEdges):
             arm = edges.tag_positions(graph.poses) - graph.poses[edges.pose, :2]
             parts: _Parts = ((edges.pose, 1.0), self._carried(edges.pose, arm), (self._anchor + edges.anchor, -1.0))
-            self._add_distance(weights / edges.sigma**2, edges.ranges, edges.distances(graph), parts)
+            self._add_square(weights / edges.sigma**2 * (1.0 - edges.ranges / edges.distances(graph)), parts)
         elif isinstance(edges, PointDistanceEdges | AnchorDistanceEdges):
             if isinstance(edges, AnchorDistanceEdges):
                 parts = ((self._anchor + edges.i, 1.0), (self._anchor + edges.j, -1.0))
             else:
-                one, other = (self.places + edges.i, _complex(edges.point_i)), (self.places + edges.j, -_complex(edges.point_j))
+                one, other = (
+                    (self.places + edges.i, as_complex(edges.point_i)),
+                    (self.places + edges.j, -as_complex(edges.point_j)),
+                )
                 parts = ((edges.i, 1.0), one, (edges.j, -1.0), other)
-            self._add_distance(weights / edges.sigma**2, edges.distance, distances(edges, graph), parts)
+            self._add_square(weights / edges.sigma**2 * (1.0 - edges.distance / distances(edges, graph)), parts)
         elif isinstance(edges, RelativePoseEdges):
             L, r = _weighted(graph, edges, weights)
             i, j = self.places + edges.i, self.places + edges.j
@@ -123,7 +124,7 @@ class TangentForm:
     def _carried(self, pose: Ints, arm: Floats) -> tuple[Ints, Complexes]:
         """Return the part of a point that is fixed to a pose, given by its offset from the pose in the map frame (e, 2)."""
         heading = self.places + pose
-        return heading, _complex(arm) * np.conj(self.x[heading])
+        return heading, as_complex(arm) * np.conj(self.x[heading])
 
     def _add(self, row: Ints, column: Ints, value: Complexes) -> None:
         """Add 2 Re(conj(x_row) value x_column)."""
@@ -136,17 +137,13 @@ class TangentForm:
             for column, d in parts[:k]:
                 self._add(row, column, weight * np.conj(c) * d + 0j)
 
-    def _add_distance(self, weight: Floats, measured: Floats, expected: Floats, parts: _Parts) -> None:
-        """Add the tangent of weight (distance - measured)^2 in the squared distance."""
-        self._add_square(weight * (1.0 - measured / expected), parts)
-
     def _add_pose(
         self, L: Floats, r: Floats, turned: Floats, frame: Ints, ends: _Parts, end_heading: Ints | None = None
     ) -> None:
         """Add the tangents of |r|^2, r = L (place in the frame, turned back (e,), then heading) whitened (e, d)."""
         tau, kappa = _largest_below(L)
         g = np.einsum("eji,ej->ei", L, r)
-        self._add_offset(tau, _complex(g) * np.exp(1j * turned), frame, ends)
+        self._add_offset(tau, as_complex(g) * np.exp(1j * turned), frame, ends)
         if end_heading is not None:
             self._add_turn(kappa, g[:, 2], frame, end_heading)
 
@@ -169,10 +166,6 @@ class TangentForm:
         self._add(i, j, -slope * np.exp(1j * delta) * self.x[i] * np.conj(self.x[j]))
 
 
-def _complex(vectors: Floats) -> Complexes:
-    return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
-
-
 def _weighted(graph: Graph, edges: RelativePoseEdges | LandmarkEdges | PriorEdges, weights: Floats) -> tuple[Floats, Floats]:
     """Return L (e, d, d) and whitened residuals (e, d) with the weights of the edges in them."""
     scale = np.sqrt(weights)
@@ -187,23 +180,25 @@ def _largest_below(L: Floats) -> tuple[Floats, Floats]:
         return tau, np.zeros_like(tau)
     kappa = information[:, 2, 2]
     coupled = np.any(information[:, :2, 2] != 0.0, axis=1)
-    scale = 1.0 / np.sqrt(np.maximum(np.stack([tau, tau, kappa], axis=1), _LEAST))
+    scale = 1.0 / np.sqrt(np.maximum(np.stack([tau, tau, kappa], axis=1), np.finfo(np.float64).tiny))
     share = np.clip(np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0], 0.0, 1.0)
     share = np.where(coupled, share, 1.0)
     return tau * share, kappa * share
 
 
-_LEAST = 1e-300
+@dataclass(frozen=True, slots=True)
+class CertificatePolicy:
+    """Rounding errors, and the effort of a bound."""
 
-
-_SHARE, _NOTHING = 1e-6, 1e-3
-"""Share of chi2, and chi2 itself, by which a global minimum may be above its bound: rounding error."""
-_ROUNDING = 1e-15
-"""Error of a factor's pivots as a share of the largest of them."""
-_POLISHED = SolverConfig(relative_decrease=1e-15, max_iterations=30)
-"""The bound is as good as the gradient is small."""
-_HALVINGS = 12
-"""Of the logarithm of eta between negligible and worthless, ten decimal powers: the last is a step of 0.6 %."""
+    share: ClassVar[float] = 1e-6
+    least: ClassVar[float] = 1e-3
+    """Share of chi2, and chi2 itself, by which a global minimum may be above its bound."""
+    rounding: ClassVar[float] = 1e-15
+    """Error of a factor's pivots as a share of the largest of them."""
+    polished: ClassVar[SolverConfig] = SolverConfig(relative_decrease=1e-15, max_iterations=30)
+    """The bound is as good as the gradient is small."""
+    halvings: ClassVar[int] = 12
+    """Of the logarithm of eta between negligible and worthless, ten decimal powers: the last is a step of 0.6 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,11 +224,11 @@ def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
     chi2, reason = graph.chi2(), outside(graph)
     if reason:
         return Certificate(False, 0.0, reason)
-    negligible = _SHARE * chi2 + _NOTHING
+    negligible = CertificatePolicy.share * chi2 + CertificatePolicy.least
     try:
-        minimum, summary = optimize(graph, _POLISHED, None, allowed)
+        minimum, summary = optimize(graph, CertificatePolicy.polished, None, allowed)
         S, D = certificate_matrix(minimum)
-        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * work_of(S) > allowed:
+        if np.isfinite(allowed) and summary.work + (2 + CertificatePolicy.halvings) * work_of(S) > allowed:
             return Certificate(False, 0.0, "its edges tie so many poses to so many others that the matrix would fill up")
         bound = max(summary.chi2 - _gap(S, D, 0.5 * negligible, summary.chi2), 0.0)
     except SolverError as problem:
@@ -271,13 +266,13 @@ def _reduction(graph: Graph, form: TangentForm, measured: Bools) -> tuple[Ints, 
 def _gap(S: sparse.csc_matrix, D: Floats, negligible: float, chi2: float) -> float:
     """Return how far below the estimate the bound lies at most: negligible, up to chi2, or infinite."""
     headings = float(D.sum())
-    negligible = max(negligible, _ROUNDING * headings * float(abs(S.diagonal()).max()))
+    negligible = max(negligible, CertificatePolicy.rounding * headings * float(abs(S.diagonal()).max()))
     if _is_positive(S, D * negligible / headings):
         return negligible
     if negligible >= chi2 or not _is_positive(S, D * chi2 / headings):
         return np.inf
     low, high = np.log(negligible), np.log(chi2)
-    for _ in range(_HALVINGS):
+    for _ in range(CertificatePolicy.halvings):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _is_positive(S, D * np.exp(middle) / headings) else (middle, high)
     return float(np.exp(high))

@@ -9,6 +9,7 @@ F. Dellaert, Initialization techniques for 3D SLAM, ICRA 2015.)
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
@@ -18,6 +19,13 @@ from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
 from .unknowns import free_unknowns
+
+Complexes = NDArray[np.complex128]
+
+
+def as_complex(vectors: Floats) -> Complexes:
+    """Return x + i y (...) of vectors or poses (..., 2 or 3)."""
+    return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
 
 
 def chordal_start(graph: Graph) -> Graph | None:
@@ -33,12 +41,12 @@ def chordal_start(graph: Graph) -> Graph | None:
         return None
     i, j, T = (np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j"))
     information = np.concatenate([np.sum(e.sqrt_information**2, axis=1) * e.own_weights[:, None] for e in relative])
-    z = np.exp(1j * graph.poses[:, 2])
-    places = graph.poses[:, 0] + 1j * graph.poses[:, 1]
+    z: Complexes = np.exp(1j * graph.poses[:, 2])
+    places = as_complex(graph.poses)
     try:
         z = _solved((i, j), np.exp(1j * T[:, 2]), np.zeros(len(i)), information[:, 2], z, free)
-        z /= np.maximum(np.abs(z), _LEAST)
-        step = z[i] * (T[:, 0] + 1j * T[:, 1])
+        z /= np.maximum(np.abs(z), np.finfo(np.float64).tiny)
+        step = z[i] * as_complex(T)
         places = _solved((i, j), np.ones(len(i)), step, information[:, :2].mean(axis=1), places, free)
     except SolverError:
         return None
@@ -48,10 +56,7 @@ def chordal_start(graph: Graph) -> Graph | None:
     return replace(graph, poses=np.where(free[:, None], poses, graph.poses))
 
 
-_LEAST = 1e-300
-
-
-def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Floats, values: Floats, free: Bools) -> Floats:
+def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Floats, values: Complexes, free: Bools) -> Complexes:
     """Return the complex numbers (n,) with x_j = factor x_i + step (e,) in least squares, those that are not free as given."""
     (i, j), e, root = ends, np.arange(len(weight)), np.sqrt(weight)
     entries = np.concatenate([root + 0j, -root * factor]), (np.concatenate([e, e]), np.concatenate([j, i]))

@@ -4,22 +4,29 @@ A matrix is kept as blocks of its lower triangle. The places of the values in a 
 gathers the values with one indexing operation.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
-from ..arrays import WIDE, Bools, Floats, Ints
+from ..arrays import WIDE, Floats, Ints, Table
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
+from .graph import POSE, WIDTHS
 from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
 from .work import ENTRIES, FACTORISATIONS, Work
 
-_LARGE, _PANEL = 400_000, 8
-"""Entries from which on SuperLU updates so many columns together; one at a time below."""
+
+@dataclass(frozen=True, slots=True)
+class SuperLUPolicy:
+    """How SuperLU goes through a matrix."""
+
+    large: ClassVar[int] = 400_000
+    panel: ClassVar[int] = 8
+    """Entries from which on so many columns are updated together; one at a time below."""
 
 
 class Factor(Protocol):
@@ -42,7 +49,7 @@ def counted(factor: Factor, work: Work) -> Factor:
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
     """Factorise without pivoting; panels of few columns suit factors as sparse as these (half the time of the default)."""
-    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.nnz < _LARGE else _PANEL
+    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.nnz < SuperLUPolicy.large else SuperLUPolicy.panel
     try:
         return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=panel, options=options)
     except RuntimeError as problem:
@@ -78,8 +85,7 @@ class BandedFactor:
 class BorderedFactor:
     """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T.
 
-    Where A = L L^T is a band, S = C - V^T V with V = L^-1 B^T: a quarter of the time, since LAPACK's second half, with L^T, is
-    the slower one for many columns.
+    Where A = L L^T is a band, S = C - V^T V with V = L^-1 B^T, in a quarter of the time.
     """
 
     def __init__(self, inside: Factor, border: Floats) -> None:
@@ -116,7 +122,7 @@ class Layout(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks:
+class Blocks(Table):
     """The lower triangle of a symmetric matrix as one array of blocks, each row by row."""
 
     row: Ints
@@ -124,9 +130,9 @@ class Blocks:
     column: Ints
     """(b,) first column."""
     height: Ints
-    """(b,) rows, at most 3."""
+    """(b,) rows, at most those of a pose."""
     width: Ints
-    """(b,) columns, at most 3."""
+    """(b,) columns, at most those of a pose."""
     start: Ints
     """(b,) place of the first value."""
     size: int
@@ -139,20 +145,16 @@ class Blocks:
 
     def inside(self, size: int) -> "Blocks":
         """Return the blocks within the first rows and columns; no block crosses this limit."""
-        return self._some(self.row < size, size)
+        return replace(self.rows(self.row < size), size=size)
 
     def below(self, size: int) -> "Blocks":
         """Return the blocks whose rows come after the first."""
-        return self._some(self.row >= size, self.size)
-
-    def _some(self, keep: Bools, size: int) -> "Blocks":
-        row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
-        return Blocks(row, column, height, width, start, size)
+        return self.rows(self.row >= size)
 
     def entries(self) -> tuple[Ints, Ints, Ints]:
         """Return row, column and place of every value in the lower triangle."""
         found = []
-        for i, j in np.ndindex(3, 3):
+        for i, j in np.ndindex(POSE * 2):
             has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
             found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
         rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -180,7 +182,8 @@ class SparseLayout:
         n = blocks.size
         row, column, height, width, start, down, across = _both_triangles(blocks)
         # Blocks run along the last axis: numpy's loops are as long as it.
-        i, j = np.arange(3, dtype=np.int32)[:, None, None], np.arange(3, dtype=np.int32)[:, None]
+        j = np.arange(WIDTHS["poses"], dtype=np.int32)[:, None]
+        i = j[:, :, None]
         own, above = np.flatnonzero(row == column), np.cumsum(height, dtype=np.int32) - height
         above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
         tall = np.bincount(column, height, n).astype(np.intp)[column[own]]
@@ -188,7 +191,7 @@ class SparseLayout:
         at = indptr.astype(np.int32).take(column + j, mode="clip") + (above + i)
         place = (start + i * down) + j * across
         place[..., own] = start[own] + np.maximum(i, j) * down[own] + np.minimum(i, j)
-        has: Ints | slice = np.flatnonzero((i < height) & (j < width)) if np.min(height) < 3 else slice(None)
+        has: Ints | slice = np.flatnonzero((i < height) & (j < width)) if np.min(height) < len(j) else slice(None)
         at = at.reshape(-1)[has]
         indices, self._source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.intp)
         indices[at] = np.broadcast_to(row + i, place.shape).reshape(-1)[has]

@@ -61,14 +61,9 @@ class _Front:
 
 
 def selected_inverse(factor: SymmetricFactor, rows: Ints, columns: Ints) -> Floats:
-    """Return entries (k,) of the inverse of a symmetric matrix, at places (k,) where the matrix itself is not empty.
+    """Return entries (k,) of the inverse of a symmetric matrix, at rows and columns (k,) where the matrix itself is not empty.
 
     0 where it holds a zero that its factor need not fill.
-
-    Parameters
-    ----------
-    factor : by SuperLU in symmetric mode.
-    rows, columns : (k,) places.
 
     Raises
     ------
@@ -107,11 +102,10 @@ def _fronts(lower: sparse.csc_matrix) -> list[_Front]:
     """Cut L into ranges; R of a range is what its columns touch and what the ranges before it hand on."""
     ranges = _ranges(lower)
     owner = np.repeat(np.arange(len(ranges)), [end - start for start, end, _ in ranges])
-    fronts = []
-    for start, end, below in ranges:
-        rows = np.concatenate([np.arange(start, end), below])
-        fronts.append(_Front(rows, end - start, int(owner[below[0]]) if len(below) else -1))
-    return fronts
+    return [
+        _Front(np.append(np.arange(start, end), below), end - start, int(owner[below[0]]) if len(below) else -1)
+        for start, end, below in ranges
+    ]
 
 
 def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
@@ -148,8 +142,7 @@ def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
     parent = np.minimum.reduceat(np.where(lower.indices > column, lower.indices, n), lower.indptr[:-1]).tolist()
     deepest = list(range(n + 1))
     for j, above in enumerate(parent):
-        if deepest[j] < deepest[above]:
-            deepest[above] = deepest[j]
+        deepest[above] = min(deepest[above], deepest[j])
     cuts, end = [], n
     while end:
         start = max(deepest[end - 1], end - _WIDEST)

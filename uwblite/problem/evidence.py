@@ -8,7 +8,8 @@ to that extent: the scatter is an error that all explanations have alike, so tha
 pass for precision.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -85,8 +86,17 @@ def with_prior_sigma(graph: Graph, sigma: Floats, mean: Floats | None = None) ->
     return replace(graph, edges=tuple(edges))
 
 
-_SCATTERS = 60
-"""Scatters tried between a hundredth of the least standard deviation and ten times the prior's, evenly in their logarithm."""
+@dataclass(frozen=True, slots=True)
+class ScatterPolicy:
+    """Scatters tried, evenly in their logarithm, as shares of the least standard deviation and of the prior's."""
+
+    tried: ClassVar[int] = 60
+    least: ClassVar[float] = 0.01
+    most: ClassVar[float] = 10.0
+
+
+_TINY = np.finfo(np.float64).tiny
+"""Precision of a part that shows nothing; it is the same on either side."""
 
 
 def log_odds_of_constant(values: Floats, sigmas: Floats, prior: float) -> float:
@@ -101,7 +111,7 @@ def log_odds_of_constant(values: Floats, sigmas: Floats, prior: float) -> float:
     """
     second = 2 * np.arange(len(values)) >= len(values)
     total = np.bincount(second, sigmas**-2.0, 2)
-    means = np.bincount(second, values * sigmas**-2.0, 2) / np.maximum(total, _NOTHING)
+    means = np.bincount(second, values * sigmas**-2.0, 2) / np.maximum(total, _TINY)
     with np.errstate(divide="ignore"):
         of_halves = np.asarray(total**-0.5, dtype=np.float64)
     return min(_log_odds(values, sigmas, prior), _log_odds(means, of_halves, prior))
@@ -113,17 +123,15 @@ def _log_odds(values: Floats, sigmas: Floats, prior: float) -> float:
     Each part's estimate is N(v, s^2 + t^2) with the common value v; the scatter t has a uniform prior of its logarithm, and is
     integrated out on either side.
     """
-    low = 0.01 * float(min(sigmas.min(initial=np.inf), prior))
-    scatter = np.append(0.0, np.geomspace(low, 10.0 * prior, _SCATTERS))[:, None]
+    least = float(min(sigmas.min(initial=np.inf), prior))
+    scatter = np.append(0.0, np.geomspace(ScatterPolicy.least * least, ScatterPolicy.most * prior, ScatterPolicy.tried))[
+        :, None
+    ]
     precision = 1.0 / (sigmas**2 + scatter**2)
     total, pulled = precision.sum(axis=1), precision @ values
-    without = 0.5 * np.sum(np.log(np.maximum(precision, _NOTHING)), axis=1) - 0.5 * np.sum(precision * values**2, axis=1)
+    without = 0.5 * np.sum(np.log(np.maximum(precision, _TINY)), axis=1) - 0.5 * np.sum(precision * values**2, axis=1)
     gain = 0.5 * pulled**2 / (total + prior**-2.0) - 0.5 * np.log1p(total * prior**2)
     return float(np.logaddexp.reduce(without + gain) - np.logaddexp.reduce(without))
-
-
-_NOTHING = 1e-300
-"""Precision of a part that shows nothing; it is the same on either side."""
 
 
 def without_prior(values: Floats, sigmas: Floats, prior: float) -> tuple[Floats, Floats]:
