@@ -94,7 +94,7 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(off.shape[1])
     for k in np.flatnonzero(well.sum(axis=0) >= _ENOUGH):
-        by_all, by_best = (spread(off[some[:, k], k]) for some in (seen, well))
+        by_all, by_best = (_growing(off[some[:, k], k], own[some[:, k]]) for some in (seen, well))
         factor[k] = np.clip(by_all if by_all < _ALIKE * by_best else by_best, _LEAST_FACTOR, 1.0 / _LEAST_FACTOR)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
@@ -102,6 +102,28 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
 _MUCH_WORSE, _ALIKE = 6.0, 2.0
 """Ratio of a measured step's standard deviation to that of the wheels, from which on their difference may show its errors; it
 does where the noise by all steps is so many times that by the better ones."""
+
+
+def _growing(off: Floats, step: Ints) -> float:
+    """Return the robust standard deviation of differences (m,) of steps (m,) by how it grows with the way.
+
+    Errors of wheels add up. That of one cloud's pose, or of its stamp, is in the steps before and after it with opposite signs.
+    So the sum over n following steps has n times the variance of the wheels or more, and the least quotient of all n is the
+    nearest to it (the slope of a variogram, without its nugget).
+    """
+    begins = np.flatnonzero(np.diff(step, prepend=-2) != 1)
+    place = np.arange(len(step)) - np.repeat(begins, np.diff(np.append(begins, len(step))))
+    least = spread(off)
+    for n in _SUMS:
+        number = np.cumsum(place % n == 0) - 1
+        sums = np.bincount(number, off)[np.bincount(number) == n]
+        if len(sums) >= _ENOUGH // 2:
+            least = min(least, spread(sums) / np.sqrt(n))
+    return float(least)
+
+
+_SUMS = (2, 4, 8)
+"""Numbers of following steps whose differences are summed: up to two metres, over which errors of the floor are alike."""
 
 
 def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> OdometryEdges:
@@ -116,14 +138,14 @@ def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> Odometry
     wheels : edges between neighbouring poses, in the order of the poses.
     certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by measurements other than the wheels.
     """
-    if len(wheels) < _PATCH:
+    if len(wheels) < _SUMS[-1]:
         return wheels
     frame, covariance = se2.rotation(graph.poses[:, 2]), np.linalg.inv(certainty + _UNKNOWN * np.eye(certainty.shape[1]))
     of_pose = np.einsum("nia,nij,nja->na", frame, covariance, frame)
     root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
     ends, roots = (np.pad(np.cumsum(v, axis=0), ((1, 0), (0, 0))) for v in (wheels.residuals(graph), root))
     variances = np.full((2, root.shape[1]), np.nan)
-    for variance, n in zip(variances, (1, _PATCH), strict=True):
+    for variance, n in zip(variances, (1, _SUMS[-1]), strict=True):
         # Windows that cross the boundary of two recordings are excluded.
         first = np.flatnonzero(wheels.j[n - 1 :] - wheels.i[: len(wheels) - n + 1] == n)
         summed, mean = (ends[first + n] - ends[first]) / np.sqrt(n), (roots[first + n] - roots[first]) / n
@@ -136,8 +158,6 @@ def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> Odometry
     return replace(wheels, sqrt_information=wheels.sqrt_information / np.where(np.isnan(factor), 1.0, factor))
 
 
-_PATCH = 8
-"""Steps over which errors of the floor are alike: two metres and more."""
 _UNKNOWN = 1e-3
 """Information of a pose that nothing measures, 1/m^2 and 1/rad^2."""
 
