@@ -104,6 +104,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "corners": LeftOut(("clouds.linearity=0.85",)),
     "deskewing": LeftOut(log=flat),
+    "broken stretches": _stage("broken_stretches.replace_broken_stretches"),
     "slips in turns": _stage("calibration_checks.with_slip_in_turns"),
     "moved anchors": _stage("anchor_places.decide_places"),
     "new and absent anchors": _stage("anchor_places.name_new_and_absent_anchors"),

@@ -17,6 +17,7 @@ from .constraints import Constraints
 from .map_result import MapResult
 from .pipeline import (
     anchor_places,
+    broken_stretches,
     calibration_checks,
     closure_rounds,
     constraint_edges,
@@ -111,6 +112,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
                 yield lidar_stages.refine_jointly
                 yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
+                yield broken_stretches.replace_broken_stretches
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places

@@ -65,9 +65,9 @@ def test_a_fault_of_one_sensor_explains_what_that_sensor_shows(sensor, named):
 ])  # fmt: skip
 def test_a_cause_of_a_stretch_explains_what_goes_with_its_times(kind, times, still, named):
     """Where both have times, these meet; where all ranges are meant, they show no more without it; nothing else."""
-    cause = replace(doubt("carried", ""), stretches=((10.0, 20.0),))
+    cause = replace(doubt("worse-than-parts", ""), stretches=((10.0, 20.0),))
     found = explained([cause, replace(doubt(kind, ""), stretches=times)], lambda _: still)
-    assert causes(found)[kind] == (("carried",) if named else ())
+    assert causes(found)[kind] == (("worse-than-parts",) if named else ())
 
 
 def planted_view(wrong):

@@ -12,7 +12,7 @@ WHEELS = (
 LIDAR = (
     "laser-turned-over", "laser-turned-away", "scans-do-not-match", "wheels-against-lidar", "free-space-violation",
     "repeated-scans", "repeated-readings", "own-body", "scales", "turn-scale", "loose-links", "untied-parts", "no-closure",
-    "odometry-alone", "path-displaced", "clock-offset",
+    "odometry-alone", "worse-than-parts", "path-displaced", "clock-offset",
 )  # fmt: skip
 RADIO = (
     "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",

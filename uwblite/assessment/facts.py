@@ -409,6 +409,23 @@ def path_displaced(
 
 
 @_rule
+def worse_than_parts(recording: int, stretch: tuple[float, float], start: float, off: float, turned: float) -> Finding:
+    """Doubt the stretch of a map in which the lidar is not understood: without its matches there all fits better."""
+    begin, end = (time - start for time in stretch)
+    text = (
+        f"from t = {begin:.0f} to {end:.0f} s the lidar is not understood: with its matches there left out and "
+        f"all scans matched anew, the robot moves {off:.1f} m and {turned:.0f} deg differently, and ranges, wheels and rays "
+        "together are more probable; the map follows that"
+    )
+    cure = (
+        f"`end={begin:.0f}` gives the part that is supported best; map that, or "
+        "`use_lidar=false` for what wheels and ranges alone say"
+    )
+    figures = {"off": off, "turned": turned}
+    return Finding("worse-than-parts", DOUBT, text, cure, "lidar", (stretch,), recording, figures=figures)
+
+
+@_rule
 def new_anchor(anchor: str, recording: int, silent: Sequence[int]) -> Finding:
     """Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges."""
     text = f"anchor {anchor} has ranges only from recording {recording} on: {_drove_there(silent)}, so it is new or was off"

@@ -154,6 +154,7 @@ OPTIONS = {
     "mounting.T_base_laser": "--laser-pose",
     "mounting.tag_position": "--tag",
     "mounting.anchor_height": "--anchor-height",
+    "use_lidar=false": "--without lidar",
     "start": "uwblite convert run.log after.log --start",
     "end": "uwblite convert run.log before.log --end",
     "folder": "--out",

@@ -17,6 +17,7 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..findings import Fact
 from ..radio.place_evidence import Explanation, MovePolicy, PlaceModel, Track, intervals_of
+from ..radio.place_intervals import explain
 from ..radio.range_noise import short_term_sigma
 from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
@@ -99,6 +100,11 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
     return radios
 
 
+def range_evidence(estimate: Estimate, task: Task) -> float:
+    """Return the logarithm of the evidence of all ranges along the estimate's path, their anchors placed anew."""
+    return sum(explain(radio.model).evidence for radio in radio_tracks(estimate, task))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Change:
     """A radio's change to another place within a recording."""
@@ -124,23 +130,45 @@ def _changes(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> Iter
                 yield _Change(number, other, int(each.place[one[-1]]), frames)
 
 
+def _groups(radios: Sequence[RadioTrack], found: Sequence[Explanation]) -> list[list[_Change]]:
+    """Return changes within recordings, each group with all that may be at the time of its first one."""
+    groups, changes = list[list[_Change]](), list(_changes(radios, found))
+    for change in changes:
+        if not any(change.with_other(other) for group in groups for other in group):
+            groups.append([other for other in changes if change.with_other(other)])
+    return groups
+
+
 def without_moves_of_path(
     estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation]
 ) -> tuple[list[Explanation], list["BrokenStep"]]:
-    """Return the explanations without moves that a broken step of the path explains better, and the broken steps.
-
-    Changes that may be at the same time are judged together, for all radios.
-    """
-    changes, judged, kept, broken = list(_changes(radios, found)), list[_Change](), list(found), list[BrokenStep]()
-    for change in changes:
-        if any(change.with_other(other) for other in judged):
-            continue
-        judged += [other for other in changes if change.with_other(other)]
-        moves = [other for other in _changes(radios, kept) if change.with_other(other)]
-        if moves and (rival := BrokenStep(estimate, task, radios, kept, moves)).gain() + rival.log_prior() > 0.0:
+    """Return the explanations without moves that a broken step of the path explains better, for all radios together; and the
+    broken steps."""
+    kept, broken = list(found), list[BrokenStep]()
+    for group in _groups(radios, found):
+        rival = BrokenStep(estimate, task, radios, kept, [c for c in _changes(radios, kept) if group[0].with_other(c)])
+        if rival.moves and rival.gain() + rival.log_prior() > 0.0:
             kept = rival.found
             broken.append(rival)
     return kept, broken
+
+
+def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
+    """Return broken steps that explain ranges beside anchors that move together, the best one of each such time, with its gain.
+
+    Parameters
+    ----------
+    suspects : keyframes before which a step may be broken as well, also where the ranges say nothing against it.
+    """
+    radios, best = radio_tracks(estimate, task), list[tuple[float, BrokenStep]]()
+    found = [explain(radio.model) for radio in radios]
+    for group in _groups(radios, found) or [[]]:
+        tried = [BrokenStep(estimate, task, radios, found, group)] if group else []
+        end = tried[0].end if tried else len(estimate.graph.poses)
+        tried += [BrokenStep(estimate, task, radios, found, group, int(k)) for k in suspects if k < end]
+        gains = [step.gain() for step in tried]
+        best += [(max(gains), tried[int(np.argmax(gains))])] if tried else []
+    return best
 
 
 class BrokenStep:
@@ -148,10 +176,11 @@ class BrokenStep:
 
     def __init__(
         self, estimate: Estimate, task: Task, radios: Sequence[RadioTrack], found: Sequence[Explanation],
-        moves: Sequence[_Change],
+        moves: Sequence[_Change], begin: int | None = None,
     ) -> None:
         self.estimate, self.radios, self.moves, self.found, self.before = estimate, radios, moves, list(found), list(found)
-        begin, end = self._extent(task)
+        heard, end = self._extent(task) if moves else (0, len(estimate.graph.poses))
+        begin = heard if begin is None else begin
         self.recording = task.recordings.each[int(task.recordings.of_keyframe[begin])]
         self.begin = max(begin, self.recording.rows.start + 1)
         self.end = min(end, self.recording.rows.stop)
@@ -199,6 +228,17 @@ class BrokenStep:
         poses[self.begin : self.end] = se2.compose(self._displacement(), poses[self.begin : self.end])
         return poses
 
+    def places(self, anchors: Floats) -> Floats:
+        """Return anchors (a, 2) at the places that the ranges show with the stretch moved, m."""
+        assert self.estimate.ranges is not None
+        anchors = anchors.copy()
+        for radio, each in zip(self.radios, self.found, strict=True):
+            of = self.estimate.ranges.anchor[radio.rows[radio.chosen]]
+            for number in radio.numbers:
+                own = each.place[(of == number) & (each.place >= 0)]
+                anchors[number] = each.places[np.bincount(own).argmax()] if len(own) else anchors[number]
+        return anchors
+
     def _displacement(self) -> Floats:
         """Return the motion (3,) of the stretch in the map."""
         origin = self.estimate.graph.poses[self.begin - 1]
@@ -241,6 +281,8 @@ class BrokenStep:
 
     def _motions_of_anchors(self, home: Floats) -> list[Floats]:
         """Return motions (3,) of the stretch that would move the anchors of the moves back to where they were."""
+        if not self.moves:
+            return []
         places = [self.before[move.radio].places for move in self.moves]
         former = [move.before for move in self.moves]
         later = [int(self.before[move.radio].place[move.interval[0]]) for move in self.moves]
