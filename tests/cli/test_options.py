@@ -16,7 +16,6 @@ from uwblite.findings import doubt
         ("upside down (`mounting.laser_flipped`)?", "upside down (--laser-flipped)?"),
         ("yards (`range_unit=0.9144`)", "yards (`uwblite convert --range-unit=0.9144`)"),
         ("cut at `end=12`", "cut at `uwblite convert run.log before.log --end=12`"),
-        ("`use_lidar=false` leaves it out", "`--without lidar` leaves it out"),
         ("`use_lidar=true`, `frame`, a ` alone", "`use_lidar=true`, `frame`, a ` alone"),
     ],
 )  # fmt: skip

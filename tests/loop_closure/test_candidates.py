@@ -8,12 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.loop_closure.candidates import (
-    Candidates,
     _among,
     _near,
     any_uncertain,
     best_per_submap,
-    missed,
     overlap_probability,
 )
 from uwblite.loop_closure.closures import LoopClosureConfig
@@ -87,13 +85,3 @@ def test_places_are_uncertain_from_three_sigma_in_the_worst_direction(sigma, fou
     graph, recording = SimpleNamespace(poses=poses), np.zeros(4, dtype=np.intp)
     assert any_uncertain(graph, joint, np.array([0, 1, 2]), recording, LoopClosureConfig()) is found
     assert any_uncertain(graph, joint, np.array([0, 1]), recording, LoopClosureConfig()) is False
-
-
-def test_missed_are_pairs_of_the_graph_s_own_guess_that_share_too_little():
-    config = LoopClosureConfig()
-    spread = np.array([config.direct, config.direct, 1.01 * config.direct])
-    ends, none = np.array([3, 4, 5]), np.zeros((3, 3, 3))
-    candidates = Candidates(ends, ends + 10, np.zeros((3, 3)), none, spread, np.zeros(6, dtype=bool))
-    overlap = (config.overlap, config.overlap - 0.01, 0.0)
-    closures = SimpleNamespace(candidates=tuple(SimpleNamespace(overlap=share) for share in overlap))
-    assert missed(candidates, closures, config) == {(4, 14)}

@@ -48,7 +48,7 @@ def looked_for(walls):
     recording = np.zeros(len(truth), dtype=np.intp)
     pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
     covariance = JointCovariance(graph, pieces.reference)
-    few = propose(graph, covariance, pieces, recording, set(), set(), False, CONFIG)
+    few = propose(graph, covariance, pieces, recording, set(), False, CONFIG)
     assert np.all(few.spread <= CONFIG.search_limit)
     return truth, pieces, uncertain_pairs(graph, covariance, pieces, recording, set(), False, CONFIG, CONFIG.direct)
 

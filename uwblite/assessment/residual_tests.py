@@ -15,7 +15,6 @@ from ..graph.calibration import RANGE_SCALE
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..loop_closure.chain_breaks import untied_breaks
-from ..loop_closure.closures import LoopClosureConfig
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import blocked
@@ -29,6 +28,8 @@ _FREE, _EARLY = 0.1, 0.05
 """Least share of ranges in line of sight to represent all, and share that gross errors make too short."""
 NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
+_SLIP, _SLIP_ANGLE = 1.0, 0.2
+"""m and rad, by which wheels that slip are off in a step at most."""
 _SUDDEN, _JUMP, _CARRIED = 5.0, 20.0, 0.5
 """Standard deviations that a step of faultless wheels hardly ever exceeds, and one of wheels on the floor never; and the size,
 m or rad, too large for slip."""
@@ -134,7 +135,7 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         if not estimate.placed.any():
             # Loops pull at steps that nothing else measures; a torn map is off by more than wheels slip.
             way, turn = _error_of(wheels, far, whitened)
-            far = far[(way > LoopClosureConfig.slip) | (turn > LoopClosureConfig.slip_angle)]
+            far = far[(way > _SLIP) | (turn > _SLIP_ANGLE)]
         measured[far] = False
         loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
         far = np.intersect1d(far, loose)

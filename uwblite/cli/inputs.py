@@ -13,25 +13,20 @@ from ..io.folders import refuse_foreign_picture
 from ..io.formats import read_recording, refuse_existing
 from ..io.log_parts import each_once
 from ..io.source import read_settings
-from ..io.stored_result import StoredAnchor, read_space
 from ..io.uwb_mapping import UwbMapping, parse_mappings
 from ..sensor_log import SensorLog, SensorMounting
 from . import console
 
 if TYPE_CHECKING:
-    from ..grid.occupancy_grid import OccupancyGrid
     from ..pipeline.mapping_config import MappingConfig
 
 
-def space_to_plan(args: argparse.Namespace, head: str) -> tuple["OccupancyGrid", tuple[StoredAnchor, ...], str, str]:
-    """Return grid and anchors of a map, and the names of a table with this head and of a picture that may be written."""
+def table_and_picture(args: argparse.Namespace, head: str) -> tuple[str, str]:
+    """Return the names of a plan's table, which begins so, and picture, which may be written."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, head)
-    warnings = list[str]()
-    grid, anchors = read_space(args.map, warnings)
-    console.note_of(args.map, warnings)
-    return grid, anchors, table, picture
+    return table, picture
 
 
 def name_recordings_once(args: argparse.Namespace) -> None:

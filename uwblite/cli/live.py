@@ -19,7 +19,7 @@ from ..io.stored_result import StoredResult, read_result
 from ..localization import LocalizerState
 from ..localization.known_map import KnownMap, from_result
 from ..localization.live_feed import LiveFeed, Patience
-from ..server.live import LivePage, PoseStatus
+from ..server.live import MOST_ALTERNATIVES, LivePage, PoseStatus
 from . import console
 from .inputs import mounted
 from .interruption import stopped_by
@@ -142,16 +142,12 @@ def line_of(state: LocalizerState) -> str:
     if state.reason:
         fields["reason"] = state.reason
     if len(state.alternatives):
-        fields["alternatives"] = [[round(v, 3) for v in row] for row in state.alternatives[:_MOST_ALTERNATIVES].tolist()]
+        fields["alternatives"] = [[round(v, 3) for v in row] for row in state.alternatives[:MOST_ALTERNATIVES].tolist()]
     if state.silent:
         fields["silent"] = {name: round(age, 1) for name, age in state.silent.items()}
     if state.moved_anchors:
         fields["moved_anchors"] = list(state.moved_anchors)
     return json.dumps(console.plain(fields), allow_nan=False)
-
-
-_MOST_ALTERNATIVES = 8
-"""In a line."""
 
 
 def tell_doubts(result: StoredResult) -> None:

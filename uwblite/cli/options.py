@@ -154,7 +154,6 @@ OPTIONS = {
     "mounting.T_base_laser": "--laser-pose",
     "mounting.tag_position": "--tag",
     "mounting.anchor_height": "--anchor-height",
-    "use_lidar=false": "--without lidar",
     "start": "uwblite convert run.log after.log --start",
     "end": "uwblite convert run.log before.log --end",
     "folder": "--out",
@@ -170,8 +169,8 @@ def name_options(text: str) -> str:
 
 def _option(match: "re.Match[str]") -> str:
     name, value = match[1], match[2] or ""
-    option = OPTIONS.get(name + value) or (OPTIONS[name] + value if name in OPTIONS else "")
-    return f"`{option}`" if " " in option else option or match[0]
+    option = OPTIONS[name] + value if name in OPTIONS else match[0]
+    return f"`{option}`" if " " in option else option
 
 
 def name_options_in(findings: "Iterable[Finding]") -> "tuple[Finding, ...]":

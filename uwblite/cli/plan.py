@@ -7,18 +7,22 @@ import numpy as np
 
 from ..io.files import write_text
 from ..io.png import write_png
+from ..io.stored_result import read_space
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.drawn_map import DrawnAnchor, DrawnMap
 from ..report.picture import draw_map
 from . import console
-from .inputs import space_to_plan
+from .inputs import table_and_picture
 
 _HEAD = "x,y,theta,distance,clearance"
 """Of the table."""
 
 
 def run(args: argparse.Namespace) -> int:
-    grid, anchors, table, picture = space_to_plan(args, _HEAD)
+    table, picture = table_and_picture(args, _HEAD)
+    warnings = list[str]()
+    grid, anchors = read_space(args.map, warnings)
+    console.note_of(args.map, warnings)
     try:
         places = [np.array(p) for p in (args.start, *args.via, args.goal)]
         path = make_planner(grid, args.radius, unknown=args.unknown).plan(places[0], places[1:], step=args.step)

@@ -7,19 +7,23 @@ import numpy as np
 
 from ..io.files import write_text
 from ..io.png import write_png
+from ..io.stored_result import read_space
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
 from ..report.drawn_map import DrawnAnchor
 from ..report.picture import draw_errors, side_by_side
 from ..report.printable import signed
 from . import console
-from .inputs import space_to_plan
+from .inputs import table_and_picture
 
 _HEAD = "id,x,y,mean_error,error_95"
 """Of the table."""
 
 
 def run(args: argparse.Namespace) -> int:
-    grid, anchors, table, picture = space_to_plan(args, _HEAD)
+    table, picture = table_and_picture(args, _HEAD)
+    warnings = list[str]()
+    grid, anchors = read_space(args.map, warnings)
+    console.note_of(args.map, warnings)
     placed = [DrawnAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
     plan = plan_anchors(grid, np.array([a.position for a in placed]).reshape(-1, 2), args.count, reach=args.reach)
     figures = _figures(args, plan, len(placed))

@@ -130,8 +130,13 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
         text = f"forwards and backwards the recording is found at different places for {1.0 - agreed:.0%} of its poses"
         findings.append(doubt("ambiguous-place", text, agreed=round(agreed, _DIGITS)))
     return Localization(
-        log.odometry.stamps[rows][there], poses[there], covariances[there], localized, overlap,
-        of_severity(findings, WARNING), of_severity(findings, DOUBT),
+        log.odometry.stamps[rows][there],
+        poses[there],
+        covariances[there],
+        localized,
+        overlap,
+        of_severity(findings, WARNING),
+        of_severity(findings, DOUBT),
     )
 
 

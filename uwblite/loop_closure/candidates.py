@@ -20,7 +20,7 @@ from ..graph.marginals import JointCovariance
 from ..lidar import submaps
 from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps
-from .closures import Closures, LoopClosureConfig
+from .closures import LoopClosureConfig
 
 Tried = set[tuple[int, int, bool]]
 """Target, source, and whether they were searched, of pairs that were tried."""
@@ -74,8 +74,8 @@ class Candidates(Table):
 
 
 def propose(
-    graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: Tried,
-    missed: set[tuple[int, int]], constrained: bool, config: LoopClosureConfig, beyond: float = -1.0,
+    graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: Tried, constrained: bool,
+    config: LoopClosureConfig, beyond: float = -1.0,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
@@ -84,7 +84,6 @@ def propose(
     graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
     recording : (k,) recording of each keyframe.
     tried : in earlier rounds; not proposed again.
-    missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     constrained : ranges constrain the trajectory.
     beyond : pairs that are no more uncertain, m, are left out.
     """
@@ -92,15 +91,13 @@ def propose(
     poses = graph.poses[reference]
     a, b, distance = _near(poses, recording[reference], config)
     guess, covariance = se2.between(poses[a], poses[b]), marginals.relative(reference[a], reference[b])
-    astray = _among(np.stack([a, b]), missed)
-    covariance[astray] += np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     spread = _spread(covariance)
     seen = surface_cells(submaps.clouds, poses)
     common = np.asarray((seen @ seen.T).todense())[a, b]
     size = np.maximum(np.diff(seen.indptr), 1)
     expected = common / np.minimum(size[a], size[b])
     doubtful = spread > config.direct
-    worth = np.where(doubtful & ~astray, overlap_probability(guess, covariance, config.reach), expected)
+    worth = np.where(doubtful, overlap_probability(guess, covariance, config.reach), expected)
     near = distance < config.reach + np.minimum(spread, config.search_limit)
     possible = np.where(doubtful, near & (worth > 0.0), expected > rules.shared)
     possible &= (np.minimum(size[a], size[b]) > rules.cells) & (spread > beyond) & (spread <= config.search_limit)
@@ -150,13 +147,6 @@ def best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
     return np.array(sorted(kept), dtype=np.intp)
 
 
-def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -> set[tuple[int, int]]:
-    """Return (target, source) of candidates that were matched from the graph's guess and shared too few points."""
-    few = np.array([record.overlap < config.overlap for record in found.candidates], dtype=bool)
-    few &= candidates.spread <= config.direct
-    return set(zip(candidates.target[few].tolist(), candidates.source[few].tolist(), strict=True))
-
-
 def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
     """Return first keyframe (s,), one past the last (s,) and reference (s,) of stretches, each overlapping the next by half.
 
@@ -193,7 +183,7 @@ def uncertain_pairs(
 ) -> Candidates:
     """Return pairs of stretches that may overlap and are more uncertain than a limit, m, the likeliest first; see propose."""
     wide = _of_stretches(config)
-    found = replace(propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, beyond), long=True)
+    found = replace(propose(graph, covariance, pieces, recording, tried, constrained, wide, beyond), long=True)
     chance = overlap_probability(found.guess, found.covariance, wide.reach)
     order = np.argsort(-chance, kind="stable")
     return found.rows(order[chance[order] > CandidatePolicy.never])

@@ -46,11 +46,6 @@ class LoopClosureConfig:
     best places that are right have more, and 4 of the 147 that are wrong, 3 where one corridor is a copy of another."""
     uniqueness: ClassVar[float] = 0.85
     """A second place that matches this share as well as the first makes a search ambiguous."""
-    slip: ClassVar[float] = 1.0
-    """Standard deviation, m, added to the graph's guess where matching from it failed although the sub-maps ought to
-    overlap and no range constrains the trajectory: the wheels may have slipped. Such pairs are searched once more."""
-    slip_angle: ClassVar[float] = 0.2
-    """The same for the heading, rad."""
     agrees: ClassVar[float] = 4.0
     """Standard deviations within which measurements of a pose agree; of its three directions together, by the Mahalanobis
     distance, 0.1 % are farther off. Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong far

@@ -48,7 +48,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         base, found, stretches = _with_long_stretches_tied(base, estimate, task)
         covariance = None
     del first
-    tried, missed = Tried(), set[tuple[int, int]]()
+    tried = Tried()
     refined = config.refinement.rounds > 0 and not estimate.rests_on_ranges
     pieces, built, dynamic = None, base.poses, 0.0
     for lap in range(rules.rounds):
@@ -57,18 +57,16 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
             (pieces, free), built = _static(pieces, base, estimate), base.poses
             dynamic = visibility.dynamic_share(pieces, free, base.poses, of)
         covariance = covariance or JointCovariance(base.with_edges(found.edges), pieces.reference)
-        candidates = closure_candidates.propose(base, covariance, pieces, of, tried, missed, with_ranges, rules)
+        candidates = closure_candidates.propose(base, covariance, pieces, of, tried, with_ranges, rules)
         covariance = None  # For a thousand sub-maps it takes a hundred megabytes.
         tried |= candidates.names(rules)
         loose = replace(rules, through=max(rules.through, dynamic))
         new = _verified(candidates, pieces, free, loose, task, task.stages.reporter("loop closure"))
-        missed |= set() if with_ranges else closure_candidates.missed(candidates, new, rules)
         before = base.poses
         base, found = _reconciled(base, found, new, task)
         counts = {"candidates": len(candidates.target), "accepted": len(new.edges), "kept": len(found.edges)}
         task.stages.end(Stage("loop closure", lap + 1), submaps=len(pieces), **counts)
-        tied = len(new.edges) <= RoundPolicy.few * len(found.edges) or (refined and _settled(candidates, before, base, config))
-        if tied and missed <= {(a, b) for a, b, searched in tried if searched}:
+        if len(new.edges) <= RoundPolicy.few * len(found.edges) or (refined and _settled(candidates, before, base, config)):
             break
     if stretches is not None:
         _check_open_loops(base, found, stretches, with_ranges, task)

@@ -1,7 +1,7 @@
 """What is made of a recording at its keyframes: clouds, and again, where keyframes are moved in time or added, all edges.
 
 The lidar's clock is known only once scans have been matched, and so is where the odometry needs more keyframes. Poses are
-then interpolated on the trajectory.
+then interpolated on the trajectory; clouds are made again only where scans or times have changed.
 """
 
 from collections.abc import Iterator
@@ -40,6 +40,15 @@ def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work
     return _with_raster(replace(built, work=work), config, delay, len(built.points))
 
 
+def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
+    """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over."""
+    former = np.concatenate([_former(*pair, config, old.delay) for pair in zip(before.each, after.each, strict=True)])
+    parts = [part for r in after.each for part in _clouds_of(r, config, old.delay, former[r.rows] < 0)]
+    place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
+    both = clouds.joined([old.clouds, *parts]).chosen(place)
+    return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(part.points) for part in parts))
+
+
 def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -> ScanClouds:
     """Return clouds with rasters, and count so many points of them as made."""
     built.work[POINTS] += new
@@ -47,13 +56,34 @@ def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -
     return ScanClouds(built, raster, delay)
 
 
-def _clouds_of(recording: Recording, config: MappingConfig, delay: float) -> Iterator[Clouds]:
-    """Yield the clouds of the keyframes of a recording, some at a time; empty ones without lidar."""
+def _clouds_of(recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None) -> Iterator[Clouds]:
+    """Yield the clouds of the keyframes of a recording, or of those wanted (k,), some at a time; empty ones without lidar."""
     if not recording.has_scans:
-        none, offsets = np.zeros(0, dtype=np.intp), np.zeros(len(recording.frames) + 1, dtype=np.intp)
+        count = len(recording.frames) if wanted is None else int(wanted.sum())
+        none, offsets = np.zeros(0, dtype=np.intp), np.zeros(count + 1, dtype=np.intp)
         yield Clouds(offsets, np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))
-    for some, rays in rays_of(recording, config, delay):
-        yield clouds.build(replace(rays, keyframe=rays.keyframe - some.start), some.stop - some.start, config.clouds)
+    for some, rays in rays_of(recording, config, delay, wanted):
+        built = clouds.build(replace(rays, keyframe=rays.keyframe - some.start), some.stop - some.start, config.clouds)
+        yield built if wanted is None else built.chosen(np.flatnonzero(wanted[some]))
+
+
+def _former(before: Recording, after: Recording, config: MappingConfig, delay: float) -> Ints:
+    """Return the former keyframe (k,) with the same time and scans as each new one; -1 = there is none."""
+    stamps, old = after.frames.stamps, before.frames.stamps
+    at = np.minimum(np.searchsorted(old, stamps), len(old) - 1)
+    same = old[at] == stamps
+    log = after.log.with_later_scans(delay)
+    if log.scans is not None:
+        owners, counts = [], []
+        for frames in (before.frames, after.frames):
+            owner, chosen = choose_scans(log.scans, frames, config.keyframes)
+            owners.append(np.full(len(log.scans.stamps), -1))
+            owners[-1][chosen] = owner
+            counts.append(np.bincount(owner, minlength=len(frames)))
+        then, now = owners
+        moved = (now >= 0) & (then != at[now])
+        same &= (np.bincount(now[moved], minlength=len(stamps)) == 0) & (counts[0][at] == counts[1])
+    return np.where(same, before.first + at, -1)
 
 
 def rays_of(
@@ -68,8 +98,8 @@ def rays_of(
         owner, chosen = owner[wanted[owner]], chosen[wanted[owner]]
     for first in range(0, len(frames), _AT_ONCE):
         some = slice(first, min(first + _AT_ONCE, len(frames)))
-        own = (owner >= some.start) & (owner < some.stop)
-        if wanted is None or own.any():
+        if wanted is None or wanted[some].any():
+            own = (owner >= some.start) & (owner < some.stop)
             yield some, scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
 
 

@@ -178,7 +178,7 @@ def _with_keyframes_where(estimate: Estimate, doubtful: Bools, task: Task) -> Es
     after = denser(before, steps, NeighbourPolicy.cuts, estimate.lidar.delay)
     if len(after.stamps) == len(before.stamps):
         return None
-    scans = keyframe_data.make(after, task.config, estimate.lidar.delay, task.stages.work)
+    scans = keyframe_data.remake(estimate.lidar, before, after, task.config)
     task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
     return replace(with_keyframes(estimate, before, after), scans=scans)
 

@@ -27,13 +27,13 @@ def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, s
     first.run(torn=not others)
     if first.misfit() < config.agreement:
         return first.estimate()
-    tried, slipping = [_likeliest_heading(first, others)], list[Attempt]()
+    heading, slipping = _likeliest_heading(first, others), list[Attempt]()
     while len(slipping) < config.slipping_starts and (not slipping or slipping[-1].slips.any()):
         # The wheels may have slipped in the first stretch as well.
         slipping.append(Attempt(graph, measured, config, search, [each.first for each in slipping]))
         slipping[-1].run()
     agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
-    return max([*tried, *agreeing], key=Attempt.evidence).estimate()
+    return max([heading, *agreeing], key=Attempt.evidence).estimate()
 
 
 def _likeliest_heading(first: Attempt, others: Sequence[Attempt]) -> Attempt:

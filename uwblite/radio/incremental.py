@@ -31,11 +31,10 @@ class IncrementalPolicy:
 
     piece: ClassVar[int] = 100
     """Poses added at once; over so many the guess may not bend by more than about a radian."""
-    window: ClassVar[int] = 400
-    """Poses optimised after each piece, older ones fixed; also those after which a new anchor is no longer the first to be
-    removed."""
+    window: ClassVar[int] = 4 * piece
     widening: ClassVar[int] = 4
-    """Factor on the window where it does not fit."""
+    """Poses optimised after each piece, older ones fixed, and the factor on them where they do not fit; also those after which
+    a new anchor is no longer the first to be removed."""
     resolve_factor: ClassVar[float] = 1.5
     """Everything is optimised again when there are so many times the poses."""
     significance: ClassVar[float] = 5.0
@@ -44,9 +43,8 @@ class IncrementalPolicy:
     again: ClassVar[float] = 1.2
     """Ranges before an anchor is searched, and the factor on them after which it is searched again."""
     position_sigma: ClassVar[float] = 0.5
-    """An anchor less certain than this is not added yet, m."""
     drift: ClassVar[float] = 0.1
-    """Assumed error of the path over the ranges an anchor is searched from, m."""
+    """An anchor less certain than this is not added yet, m; assumed error of the path that it is searched from, m."""
     outlier: ClassVar[float] = 4.0
     outlier_share: ClassVar[float] = 0.3
     """Standard deviations beyond which a range is an outlier, and the share of these with which an anchor is removed."""

@@ -37,15 +37,14 @@ class MovePolicy:
     most_ranges: ClassVar[int] = 1000
     """Ranges of one radio that are compared, spread evenly; a place needs no more."""
     splits: ClassVar[int] = 3
-    """Times tried first, spread evenly over the ranges of an interval."""
+    likely: ClassVar[int] = 2
+    """Times tried first, spread evenly over an interval's ranges, and divisions from which the search for times goes on."""
     laps: ClassVar[int] = 4
     """Rounds between places and times, and between places and errors; two or three are usual."""
-    grid: ClassVar[int] = 4001
-    """Errors at which a density is summed."""
-    likely: ClassVar[int] = 2
-    """Divisions of an interval from which the search for times is continued."""
     compared: ClassVar[int] = 3
     """Places by a part of the ranges that are compared."""
+    grid: ClassVar[int] = 4001
+    """Errors at which a density is summed."""
     farthest: ClassVar[float] = 1.0
     """m; the longest step of a descent."""
     nearest: ClassVar[float] = 0.1

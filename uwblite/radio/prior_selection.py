@@ -40,12 +40,11 @@ class UnitPolicy:
     too_short: ClassVar[float] = 0.01
     """Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a
     radio: ranges too long may come from late first paths, too short ones do not."""
+    fewest: ClassVar[int] = 3
     least_heights: ClassVar[float] = 0.3
-    """Least spread of squared heights, m^2: anchors 1.5 m above the tag, mounted within 10 cm."""
+    """Least number of anchors for a common mean, and spread of squared heights, m^2: 1.5 m above the tag, within 10 cm."""
     together: ClassVar[float] = 4.0
     """Ratio of the prior width of the mean to that of a single square: all anchors of a hall may be twice as high as usual."""
-    fewest: ClassVar[int] = 3
-    """Least number of anchors for a common mean."""
 
 
 def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:

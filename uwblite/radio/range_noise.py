@@ -68,10 +68,9 @@ def assumed(config: RangeNoiseConfig) -> RangeNoise:
     return RangeNoise(float(np.sqrt(config.sigma**2 - slow**2)), slow, config.correlation_length)
 
 
-_ENOUGH_PAIRS = 20
-"""Pairs of residuals that show a covariance; also triples of neighbours in time that show noise."""
-_SILENCE = 4.0
-"""Usual times between neighbours beyond which the robot has turned in between."""
+_ENOUGH_PAIRS, _SILENCE = 20, 4.0
+"""Pairs of residuals that show a covariance, or triples of neighbours in time that show noise; usual times between neighbours
+beyond which the robot has turned in between."""
 
 
 def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: RangeNoiseConfig) -> float:
@@ -97,10 +96,8 @@ def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: Range
 
 _DISTANCES = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
 """m; bounds of the distances between places of which covariances are compared."""
-_LENGTHS = np.geomspace(0.3, 8.0, 15)
-"""m; correlation lengths that are tried."""
-_MOST_SLOW = 0.95
-"""Share of the variance that is slow at most."""
+_LENGTHS, _MOST_SLOW = np.geomspace(0.3, 8.0, 15), 0.95
+"""Correlation lengths that are tried, m, and share of the variance that is slow at most."""
 _MOST_PAIRED = 1000
 """Most ranges of an anchor whose pairs are counted; more do not change the correlation, and the cost grows with the square."""
 
@@ -167,12 +164,8 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
 
 
 def independent_shares(positions: Floats, groups: Iterable[Ints | Bools], config: RangeNoiseConfig) -> Floats:
-    """Return which share (m,) of each range is independent of its neighbours in its group, by the correlation assumed.
-
-    Parameters
-    ----------
-    positions : (m, 2) tag at the ranges, m. groups : rows of each; a range of none is independent.
-    """
+    """Return which share (m,) of each range is independent of its neighbours in its group, by the correlation assumed; a range
+    of no group is independent."""
     noise, shares = assumed(replace(config, sigma=1.0)), np.ones(len(positions))
     for own in groups:
         shares[own] = effective_sigma(positions[own], noise) ** -2

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from .. import se2
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import ACCEPTED, ANCHOR, DOUBTED, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, Colour, rgb
@@ -32,8 +31,8 @@ _ROW = 26
 """Pixels of a row of the strip below."""
 _SCALE = 2
 """Pixels per pixel of the font; ticks have one."""
-_TICK_EVERY = 130
-"""Pixels between ticks, about."""
+_TICK_EVERY, _LONGEST_BAR = 130, 220
+"""Pixels between ticks, about, and of the scale bar at most."""
 _AXIS = 34
 """Pixels of the axes at the origin."""
 _LONGEST_NAME = 16
@@ -105,7 +104,7 @@ def draw_map(drawn: DrawnMap, *, caption: str = "", size: int = SIZE, tint: Tint
     scale = _pixels_per_metre(extent, resolution, size)
     low = np.floor(low / resolution) * resolution
     width, height = np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int).tolist()
-    length = round_length(min(220.0, width / 4.0) / scale)
+    length = round_length(min(_LONGEST_BAR, width / 4) / scale)
     keys = [Key(f"{length:g} m", INK, "bar", length * scale), *([Key(caption)] if caption else []), *_legend(drawn)]
     rows = rows_of(width, [*keys, *(tint.keys if tint is not None else ())])
     image = np.full((height + _ROW * len(rows) + _GAP, width, 3), PAPER, dtype=np.uint8)
@@ -164,6 +163,7 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
     pixels = scale * grid.geometry.resolution
     each, together = max(round(pixels), 1), max(round(1.0 / pixels), 1)
     first = np.rint((grid.geometry.origin - low) / grid.geometry.resolution).astype(int)
+    # Rows and columns of cells that share a pixel begin there; where none do, each is one of its own.
     row_starts, col_starts = (
         np.unique((begin + np.arange(n)) // together, return_index=True)[1]
         for begin, n in zip(first[::-1], grid.log_odds.shape, strict=True)
@@ -173,6 +173,7 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
         for extreme in (np.maximum, np.minimum)
     )
     cells = np.where(surest_wall > _WALL_SHOWS, surest_wall, surest_floor)
+    # The block of cells that each row and column of pixels shows; the picture may reach farther than they do.
     row, col = (height - 1 - np.arange(height)) // each - first[1] // together, np.arange(width) // each - first[0] // together
     rows, cols = (np.flatnonzero((place >= 0) & (place < n)) for place, n in zip((row, col), cells.shape, strict=True))
     shown = _SHADES[np.rint(_LEVELS * expit(cells)).astype(np.uint8)]
@@ -194,7 +195,7 @@ def _draw_axes(canvas: Canvas, low: Floats, scale: float) -> None:
             canvas.lines(np.array([[*edge, *(edge + _TICK * inward)]]), _THIN, INK)
             if 2 * _PAD < along < size[axis] - 2 * _PAD:
                 half = np.array([(WIDTH + 1) * len(f"{value + 0.0:g}"), HEIGHT]) / 2
-                canvas.text(edge + (_GAP + half) * inward - half, f"{value + 0.0:g}", INK, 1, PAPER)
+                canvas.text(edge + (_TICK + _GAP + half) * inward - half, f"{value + 0.0:g}", INK, 1, PAPER)
     origin = np.array([-low[0] * scale, size[1] + low[1] * scale])
     if ((origin >= 0) & (origin < size)).all():
         for name, ahead in zip("xy", _AXIS * np.array([[1.0, 0.0], [0.0, -1.0]]), strict=True):
@@ -217,12 +218,13 @@ def _draw_anchor(canvas: Canvas, anchor: DrawnAnchor, side: str, pixel: Callable
     """Draw an anchor's ellipse of two standard deviations, its place and its name."""
     colour = PROPOSED if anchor.kind == "proposed" else ANCHOR
     if (axes := ellipse(anchor.covariance)) is not None:
-        around = np.stack([axes[0] * np.cos(_TURN), axes[1] * np.sin(_TURN)], axis=1)
-        outline = pixel(anchor.position + se2.rotate(axes[2], around))
+        major, minor, turn = axes
+        ahead, aside = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        outline = pixel(anchor.position + np.outer(major * np.cos(_TURN), ahead) + np.outer(minor * np.sin(_TURN), aside))
         canvas.polygon(outline[:-1], colour, _FAINT)
         canvas.polyline(outline, _THIN, colour, _STRONG)
     place = pixel(anchor.position)
-    canvas.polygon(place + (_GAP + 4) * _TRIANGLE, FLOOR)
+    canvas.polygon(place + 1.5 * _GAP * _TRIANGLE, FLOOR)
     canvas.polygon(place + _GAP * _TRIANGLE, colour)
     name = anchor.id if len(anchor.id) <= _LONGEST_NAME else anchor.id[: _LONGEST_NAME - 2] + ".."
     (left, _), (_, top) = _SCALE * HEIGHT * name_box(side, len(name))
