@@ -91,8 +91,7 @@ def unknowns(
 ) -> tuple[Unknown, ...]:
     """List the scalar unknowns that a recording with these anchors adds to a graph.
 
-    Odometry, tag and clocks, and the systematic errors of ranges to an anchor, are each recording's own: another robot,
-    another tag, another day. The scale of the ranges and the mounting of the laser are shared by all.
+    All but the scale of the ranges and the mounting of the laser are each recording's own: another robot, another day.
 
     Parameters
     ----------

@@ -128,13 +128,12 @@ def outlier_thresholds(graph: Graph) -> dict[int, float]:
 
 
 def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]:
-    """Return the squared residuals of the chosen kinds in units of their squared thresholds."""
     residuals = {k: graph.edges[k].residuals(graph) for k in thresholds}
     return {k: np.einsum("ed,ed->e", r, r) / thresholds[k] ** 2 for k, r in residuals.items()}
 
 
 def _worst(graph: Graph, thresholds: Mapping[int, float]) -> float:
-    """Return the largest of the same, 0 without any."""
+    """Return the largest squared residual in units of its squared threshold, 0 without any."""
     return max((float(np.max(s)) for s in _squared(graph, thresholds).values() if len(s)), default=0.0)
 
 

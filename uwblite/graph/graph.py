@@ -204,6 +204,8 @@ class Graph:
 
     def has_free(self, index: Ints) -> Bools:
         """Return which columns of indices (e, k) of calibration values, -1 = none, hold a free one."""
+        if self.fixed_calibration.all():
+            return np.zeros(index.shape[1], dtype=bool)
         return np.any(np.append(~self.fixed_calibration, False)[index], axis=0)
 
     def with_edges(self, *edges: Edges) -> "Graph":

@@ -7,8 +7,8 @@ need no permutation.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +32,13 @@ _Block = tuple[str, Ints, tuple[int, ...]]
 """Name, unknown (e,) touched by each edge, and shape of an edge's Jacobian."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Places:
-    """Places of the products of some edges of one kind."""
+class _Places(NamedTuple):
+    """Of some edges of one kind: places of all products of two Jacobian columns among the values, which of them count twice,
+    and rows of the gradient of the products with the residual."""
 
     products: _Small
-    """Place of every product of two Jacobian columns among the values."""
     twice: Ints
-    """Which of them count twice."""
     rows: _Small
-    """Row of the gradient of every product of a column with the residual."""
 
 
 class NormalEquations:
@@ -148,9 +145,8 @@ class NormalEquations:
     ) -> None:
         """Find the place of every product of two Jacobian columns of one edge.
 
-        The product of column i of node a and column j of node b lands at ``base + row stride + column`` of their
-        block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
-        Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
+        That of column i of node a and column j of node b lands at a start plus i and j times a step in their block. Where a and
+        b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
         following, first = iter(which), corner.astype(np.int32)
         self._places: list[list[_Places]] = []
@@ -165,7 +161,7 @@ class NormalEquations:
             )
 
     def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: _Small) -> _Places:
-        """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
+        """Find the places of some edges' products; the block of nodes p and q is blocks[p][q] (e,)."""
         rows: list[_Small] = []
         products: list[_Small] = []
         twice, count = [_NONE], 0
@@ -208,13 +204,11 @@ class NormalEquations:
                     self._add_products(weighted, jacobian, place)
 
     def _add_slopes(self, weighted: Floats, residuals: Floats, places: _Places) -> None:
-        """Add the products of some edges' weighted Jacobian columns (d, k, e) and residuals (e, d) to g."""
         slopes = np.empty(weighted.shape[1:])
         _contract(weighted, residuals.T[:, None], slopes)
         self.gradient += np.bincount(places.rows, slopes.reshape(-1), self.unknowns.size + 1)[:-1]
 
     def _add_products(self, weighted: Floats, jacobian: Floats, places: _Places) -> None:
-        """Add the products of some edges' Jacobian columns (d, k, e) to H."""
         products, at, (_, k, e) = np.empty(len(places.products)), 0, jacobian.shape
         for row in range(k):
             block = products[at : at + (row + 1) * e].reshape(row + 1, e)
@@ -279,7 +273,6 @@ def _meetings(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]
 
 
 def _parts(edges: int) -> list[slice]:
-    """Return the edges whose products are in memory at once."""
     return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
 
 

@@ -2,12 +2,15 @@
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, connected
+from ..arrays import Bools, Ints, connected
 from ..errors import SolverError
 from .graph import Edges, Graph, Linearization, PriorEdges
 from .point_edges import LandmarkEdges, PointDistanceEdges
 from .range_edges import RangeEdges
 from .unknowns import free_unknowns
+
+_SINGULAR = 1e-12
+"""Determinant, as a share of the product of the diagonal, up to which the rank of an information is found."""
 
 
 def check(graph: Graph) -> None:
@@ -52,16 +55,9 @@ def independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:
         jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
         gram = jacobians @ jacobians.transpose(0, 2, 1)
         total += gram.shape[0] * gram.shape[1]
-        doubtful = gram[np.abs(_determinants(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
+        doubtful = gram[np.abs(np.linalg.det(gram)) <= _SINGULAR * np.prod(np.einsum("eii->ei", gram), axis=1)]
         total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
     return total
-
-
-def _determinants(matrices: Floats) -> Floats:
-    """Return the determinants (e,) of matrices (e, d, d); of 3 x 3, triple products of rows take a tenth of the time."""
-    if matrices.shape[1] != 3:
-        return np.asarray(np.linalg.det(matrices))
-    return np.einsum("ei,ei->e", matrices[:, 0], np.cross(matrices[:, 1], matrices[:, 2]))
 
 
 def floating_components(graph: Graph) -> Ints:

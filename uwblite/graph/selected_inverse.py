@@ -21,10 +21,8 @@ from scipy.linalg import lapack
 from ..arrays import Floats, Ints
 from ..errors import SolverError
 
-_WIDEST = 64
-"""Columns of a range at most."""
-_OVERHEAD = 10000.0
-"""Fixed cost of a range, in entries: calls of library functions take time even for small matrices."""
+_WIDEST, _OVERHEAD = 64, 1e4
+"""Columns of a range at most, and the fixed cost of one, in entries: calls of library functions take time."""
 
 
 class SymmetricFactor(Protocol):
@@ -51,7 +49,7 @@ class _Front:
     """The range that holds the first row of R; -1 = none."""
 
     def panel(self, lower: sparse.csc_matrix) -> Floats:
-        """Return (rows, width) of L; all of them together would be as large as L itself."""
+        """Return (rows, width) of L."""
         start, end = int(self.rows[0]), int(self.rows[0]) + self.width
         inside = slice(lower.indptr[start], lower.indptr[end])
         panel = np.zeros((len(self.rows), self.width))
@@ -111,7 +109,7 @@ def _fronts(lower: sparse.csc_matrix) -> list[_Front]:
 def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
     """Return start, end and rows below of ranges of columns, joined while that saves work.
 
-    Rows below are passed on to the range that contains the first of them, so that each range has all it needs there.
+    Rows below are passed on to the range that contains the first of them.
     """
     handed: dict[int, Ints] = {}
     done: list[tuple[int, int, Ints]] = []
