@@ -5,17 +5,17 @@ number; the source becomes an image of its normals. For one heading the scores o
 
     score(T) = mean over source points of exp(-d^2 / 2 spread^2) cos(angle between normals),
 
-computed by FFT (after Olson, Real-time correlative scan matching, ICRA 2009, which evaluates it shift by shift). A wall
-seen from its other side lowers the score. Every pose of the grid is scored; none is pruned.
+computed by FFT, or for few shifts one by one, as in Olson, Real-time correlative scan matching, ICRA 2009. A wall seen from
+its other side lowers the score. Every pose of the grid is scored; none is pruned.
 """
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import maximum_filter
 
 from .. import se2
 from ..arrays import Floats, Ints
@@ -30,8 +30,10 @@ Window = tuple[float, float, float]
 """Half widths of a grid of poses in x and y, m, and heading, rad."""
 
 _CELLS_PER_REACH = 4
-_NEIGHBOURHOOD = 3
-"""Cells across in which a local maximum is the largest."""
+_NEIGHBOURS = np.array([offset for offset in np.ndindex(3, 3, 3) if offset != (1, 1, 1)])
+"""(26, 3) of a cell in the middle of three by three by three."""
+_TRANSFORM = 10
+"""Scores of single points that take as long as the transforms of one cell of an image."""
 _ROUNDING = 1e-9
 """Share of a step by which a grid may fall short of its window."""
 
@@ -93,20 +95,26 @@ def score_grid(
     field = surface_field(raster, config.spread).T
     # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
     shape = tuple(fft.next_fast_len(int(size)) for size in field.shape + 2 * reach)
-    spectrum, normals = fft.fft2(field, shape), source.normals @ np.array([1.0, 1j])
+    one_by_one = len(source.points) * scores[0].size < _TRANSFORM * np.prod(shape)
+    windows = sliding_window_view(np.pad(field, 2 * np.repeat(reach, 2).reshape(2, 2)), scores[0].shape)
+    spectrum, normals = None if one_by_one else fft.fft2(field, shape), source.normals @ np.array([1.0, -1j])
     for k, heading in enumerate(headings):
         place = se2.transform([*T_target_source[:2], heading], source.points) - raster.origin[0]
         cell = np.floor(place / config.resolution).astype(np.intp)[:, ::-1]
         inside = np.all((cell >= -reach) & (cell < field.shape + reach), axis=1)
-        product = np.conj(fft.fft2(_image(cell[inside] % shape, normals[inside], shape))) * spectrum
-        product *= np.complex64(np.exp(-1j * heading))
-        target.work[SCORES] += product.size
-        scores[k] = fft.ifft(fft.ifft(product, axis=0)[shift_y], axis=1)[:, shift_x].real
+        cell, turned = cell[inside], (normals[inside] * np.exp(-1j * heading)).astype(np.complex64)
+        if spectrum is None:
+            target.work[SCORES] += len(cell) * scores[k].size
+            scores[k] = np.tensordot(turned, windows[tuple((cell + reach).T)], axes=1).real
+        else:
+            target.work[SCORES] += spectrum.size
+            product = np.conj(fft.fft2(_image(cell % shape, turned.conj(), shape))) * spectrum
+            scores[k] = fft.ifft(fft.ifft(product, axis=0)[shift_y], axis=1)[:, shift_x].real
     scores /= len(source.points)
     return scores, headings, shift_x, shift_y
 
 
-def _image(cell: Ints, values: NDArray[np.complex128], shape: tuple[int, ...]) -> NDArray[np.complex64]:
+def _image(cell: Ints, values: NDArray[np.complex64], shape: tuple[int, ...]) -> NDArray[np.complex64]:
     """Return the sums of values (n,) in their cells (n, 2) of an image of a shape."""
     number, image = np.ravel_multi_index(tuple(cell.T), shape), np.empty(shape, np.complex64)
     image.real, image.imag = (
@@ -117,8 +125,10 @@ def _image(cell: Ints, values: NDArray[np.complex128], shape: tuple[int, ...]) -
 
 def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     """Return indices (c, 3) of local maxima, the best first, none within the separation of a better one."""
-    best, around = scores.max(initial=0.0), maximum_filter(scores, _NEIGHBOURHOOD)
-    peaks = np.argwhere((scores == around) & (scores >= config.least_share * best) & (scores > 0.0))
+    peaks = np.argwhere((scores >= config.least_share * scores.max(initial=0.0)) & (scores > 0.0))
+    padded = np.pad(scores, 1)
+    for offset in _NEIGHBOURS:
+        peaks = peaks[scores[tuple(peaks.T)] >= padded[tuple((peaks + offset).T)]]
     peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")]
     unit = np.array([config.separation_angle / config.angle_step, *[config.separation / config.resolution] * 2])
     chosen: list[Ints] = []
