@@ -28,6 +28,8 @@ class ScanStepPolicy:
 
     reach: ClassVar[float] = 0.4
     """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
+    gate: ClassVar[float] = 0.12
+    """The same at its end: single scans are thinner than the clouds of keyframes, and more often match what they do not show."""
     search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
     """Half-widths of the search, m, m, rad."""
     at_once: ClassVar[int] = 128
@@ -58,7 +60,7 @@ def scan_steps(
     for low in range(0, len(first), ScanStepPolicy.at_once):
         rows = slice(low, low + ScanStepPolicy.at_once)
         raster, pairs = _pairs(scans, mounting, first[rows], second[rows])
-        aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, PairPolicy.gate)
+        aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, ScanStepPolicy.gate)
         enough = aligned.factors.asked >= PairPolicy.fewest
         pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
         poor = np.flatnonzero((share < PairPolicy.good_share) & enough)
@@ -101,7 +103,7 @@ def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScan
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1."""
     raster, pairs = _pairs(scans, mounting, first, second)
-    return directional_overlap(raster, pairs.i, pairs.j, motion, PairPolicy.gate)
+    return directional_overlap(raster, pairs.i, pairs.j, motion, ScanStepPolicy.gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
@@ -128,7 +130,7 @@ def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Fl
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))
-    aligned = align_pairs(raster, pairs, places, ScanStepPolicy.reach, PairPolicy.gate)
+    aligned = align_pairs(raster, pairs, places, ScanStepPolicy.reach, ScanStepPolicy.gate)
     best = int(np.argmax(aligned.share))
     return aligned.pose[best], float(aligned.share[best])
 

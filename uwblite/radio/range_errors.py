@@ -85,8 +85,8 @@ class RangeErrors:
 
     def at(self, places: Floats) -> Floats:
         """Return the errors (...) to expect at places (..., 2) of the tag, m; outside of the table that of its edge."""
-        at = np.moveaxis((places - self.origin) / self.cell, -1, 0)
-        return np.asarray(map_coordinates(self.table, at, order=1, mode="nearest"))
+        at = ((places - self.origin) / self.cell).reshape(-1, 2).T
+        return np.asarray(map_coordinates(self.table, at, order=1, mode="nearest").reshape(places.shape[:-1]))
 
 
 def range_errors(anchor: Ints, tags: Floats, bearings: Floats, errors: Floats, count: int) -> tuple[RangeErrors, ...]:
