@@ -195,6 +195,7 @@ def test_each_is_as_if_solved_for_with_all_others():
     ranges, rng = graph.edges[2], np.random.default_rng(1)
     shifts = rng.normal(size=(3, len(ranges), 1))
     values, sigmas = added_unknown(graph, ranges, shifts)
+    assert [len(none) for none in added_unknown(graph, ranges, shifts[:0])] == [0, 0]
     normal, gradient, number = dense_system(graph)
     lin, weights = ranges.linearize(graph), edge_weights(ranges, graph)
     for shift, value, sigma in zip(shifts, values, sigmas, strict=True):

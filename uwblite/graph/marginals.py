@@ -287,6 +287,8 @@ def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, F
     -------
     (k,) values and (k,) standard deviations, in the unknowns' units; infinite where the graph explains the shifts wholly.
     """
+    if not len(shifts):
+        return np.zeros(0), np.zeros(0)
     total, explained, score = marginals(graph).score(edges, sparse.csr_matrix(shifts.reshape(len(shifts), -1).T))
     whole = np.diagonal(total)
     left = whole - np.diagonal(explained)
