@@ -29,7 +29,7 @@ class ScanStepPolicy:
     reach: ClassVar[float] = 0.4
     """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
     gate: ClassVar[float] = 0.12
-    """The same at its end: single scans are thinner than the clouds of keyframes, and more often match what they do not show."""
+    """The same at its end: single scans are thinner than clouds of keyframes, and more often match what they do not show."""
     search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
     """Half-widths of the search, m, m, rad."""
     at_once: ClassVar[int] = 128
