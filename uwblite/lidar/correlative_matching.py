@@ -96,14 +96,17 @@ def score_grid(
     # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
     shape = tuple(fft.next_fast_len(int(size)) for size in field.shape + 2 * reach)
     one_by_one = len(source.points) * scores[0].size < _TRANSFORM * np.prod(shape)
-    windows = sliding_window_view(np.pad(field, 2 * np.repeat(reach, 2).reshape(2, 2)), scores[0].shape)
-    spectrum, normals = None if one_by_one else fft.fft2(field, shape), source.normals @ np.array([1.0, -1j])
+    normals = source.normals @ np.array([1.0, -1j])
+    if one_by_one:
+        windows = sliding_window_view(np.pad(field, [(2 * side, 2 * side) for side in reach.tolist()]), scores[0].shape)
+    else:
+        spectrum = fft.fft2(field, shape)
     for k, heading in enumerate(headings):
         place = se2.transform([*T_target_source[:2], heading], source.points) - raster.origin[0]
         cell = np.floor(place / config.resolution).astype(np.intp)[:, ::-1]
         inside = np.all((cell >= -reach) & (cell < field.shape + reach), axis=1)
         cell, turned = cell[inside], (normals[inside] * np.exp(-1j * heading)).astype(np.complex64)
-        if spectrum is None:
+        if one_by_one:
             target.work[SCORES] += len(cell) * scores[k].size
             scores[k] = np.tensordot(turned, windows[tuple((cell + reach).T)], axes=1).real
         else:
