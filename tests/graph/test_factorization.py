@@ -25,6 +25,9 @@ def rooms(count, poses):
     return np.vstack([np.stack([(each[:, None] + i).ravel(), (each[:, None] + j).ravel()], axis=1), doors])
 
 
+NOTHING = np.zeros(0, dtype=np.intp)
+
+
 def chosen(pairs, poses, others, **kinds):
     """Choose for poses and other scalars."""
     return choose_ordering(pairs, poses, np.repeat([3, 1], [poses, others]), **kinds)
@@ -111,7 +114,7 @@ def test_anchors_of_any_poses_fill_the_matrix_as_well():
 
 
 def test_the_selected_inverse_needs_a_factor():
-    assert not chosen(chain(500, 40), 500, 10, subtrees=True).iterative
+    assert not chosen(chain(500, 40), 500, 10, last=NOTHING).iterative
 
 
 @pytest.mark.parametrize(("n", "closures", "asked"), [(60, 25, True), (400, 1, True), (700, 700, False)])
@@ -122,7 +125,7 @@ def test_subtrees_of_the_elimination_are_contiguous(n, closures, asked):
     """
     rng = np.random.default_rng(3)
     pairs = anywhere(rng, n, closures) if closures > 1 else np.vstack([chain(n), [[0, n - 1]]])
-    ordering = chosen(pairs, n, 10, subtrees=asked)
+    ordering = chosen(pairs, n, 10, last=NOTHING if asked else None)
     assert (ordering.bordered, ordering.banded) == (not asked, False)
     position = np.argsort(ordering.order)
     filled = np.eye(n, dtype=bool)

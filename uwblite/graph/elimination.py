@@ -248,22 +248,25 @@ class Ordering:
     """Multiplications of a factorisation, where they are many enough to be counted; more than there are, where they are few."""
 
 
-def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = None) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
     ----------
     pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
     width : (n,) scalars of each node.
-    subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
+    last : keep to the sparse form, for the inverse: these poses come after the others, whose subtrees are contiguous.
     """
     policy, each = EliminationPolicy, np.arange(poses)
     if poses < 2:
         return Ordering(each)
     among = pairs.take(np.flatnonzero(np.maximum(pairs[:, 0], pairs[:, 1]) < poses), axis=0)
+    if last is not None:
+        # What remains when all others are eliminated is full.
+        among = np.concatenate([among, last[np.stack(np.triu_indices(len(last), 1), axis=1)]])
+        walk = contiguous(among, minimum_degree(adjacency(among, poses)))[0]
+        return Ordering(walk[np.argsort(np.isin(walk, last), kind="stable")])
     pattern = adjacency(among, poses)
-    if subtrees:
-        return Ordering(contiguous(among, minimum_degree(pattern))[0])
     others = int(width[poses:].sum())
     bordered = others <= policy.widest_border
     tied = poses >= policy.many and len(among) - poses > policy.tied * poses
