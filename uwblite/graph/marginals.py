@@ -245,7 +245,7 @@ class JointCovariance:
 
 
 def _end_of_inverse(factor: SuperLU, numbers: Ints) -> Floats:
-    """Return the inverse (m, m) at numbers (m,), 0 at fixed scalars (-1), from the end of H = L D L^T behind the first of them."""
+    """Return the inverse (m, m) at numbers (m,), 0 at fixed scalars (-1), from the end of H = L D L^T behind the first."""
     first = np.min(numbers, initial=len(factor.perm_c), where=numbers >= 0)
     end = np.sort(factor.perm_c[first:]).astype(np.intp)
     root, row = factor.L[:, end][end].toarray(order="F"), np.searchsorted(end, factor.perm_c[numbers])
