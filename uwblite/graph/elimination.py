@@ -21,7 +21,6 @@ from scipy.sparse.linalg import spilu
 
 from ..arrays import WIDE, Ints
 from .graph import WIDTHS
-from .schwarz_cg import expected_work
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +31,11 @@ class EliminationPolicy:
     """Distance in the band, poses, up to which the banded factorisation wins."""
     widest_border: ClassVar[int] = 48
     """Scalars in a border; more of them stay in the sparse matrix."""
-    many: ClassVar[int] = 500
-    tied: ClassVar[int] = 4
-    """From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all
-    poses are connected, in the rooms of a site or the streets of a town only those nearby."""
-    most_work: ClassVar[float] = 4e9
-    """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9."""
     little_work: ClassVar[float] = 4e8
-    """Multiplications in the envelope of a band up to which those of a sparser order are not counted."""
+    """Multiplications of a factorisation that always pay, a tenth of a second; so many in a band's envelope are not counted."""
+    per_pose: ClassVar[float] = 1e5
+    """Multiplications for each pose beyond which iteration takes less time. In one hall all poses are connected; a hundred
+    times the paper's graph takes a third of that."""
     per_complex: ClassVar[int] = 4
     """Multiplications in one of complex numbers."""
     alone: ClassVar[float] = 6.0
@@ -104,6 +100,11 @@ def is_full(reach: Ints) -> bool:
     factorisation for all others.
     """
     return len(reach) > EliminationPolicy.small and float(np.mean(reach)) > EliminationPolicy.wide * len(reach)
+
+
+def fills_up(multiplications: float, poses: int) -> bool:
+    """Return whether a factorisation takes longer than iteration."""
+    return multiplications > max(EliminationPolicy.little_work, EliminationPolicy.per_pose * poses)
 
 
 def minimum_degree(pattern: sparse.csc_matrix) -> Ints:
@@ -267,17 +268,14 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = No
         walk = contiguous(among, minimum_degree(adjacency(among, poses)))[0]
         return Ordering(walk[np.argsort(np.isin(walk, last), kind="stable")])
     pattern = adjacency(among, poses)
-    others = int(width[poses:].sum())
-    bordered = others <= policy.widest_border
-    tied = poses >= policy.many and len(among) - poses > policy.tied * poses
-    if bordered or tied:
-        order, reach = narrow_order(pattern)
-        if bordered and reach.max() <= policy.widest_band:
-            return Ordering(order, bordered=True, banded=True)
-        if tied and is_full(reach):
-            return Ordering(each, iterative=True)
+    bordered = int(width[poses:].sum()) <= policy.widest_border
+    order, reach = narrow_order(pattern)
+    if bordered and reach.max() <= policy.widest_band:
+        return Ordering(order, bordered=True, banded=True)
+    if is_full(reach):
+        return Ordering(each, iterative=True)
     order = minimum_degree(pattern)
-    if bordered and not tied:
+    if bordered:
         most = WIDTHS["poses"] * float(np.sum((WIDTHS["poses"] * (reach + 1.0)) ** 2))
         if most <= policy.little_work:
             return Ordering(order, bordered=True, work=most)
@@ -287,7 +285,4 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = No
     else:
         every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
         multiplications = work(pairs, every, width, parent)
-    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
-    if multiplications > (expected_work(poses, others, entries) if tied else policy.most_work):
-        return Ordering(each, iterative=True)
-    return Ordering(order, bordered, work=multiplications)
+    return Ordering(each, iterative=True) if fills_up(multiplications, poses) else Ordering(order, bordered, work=multiplications)

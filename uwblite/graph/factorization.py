@@ -16,7 +16,7 @@ from ..arrays import WIDE, Floats, Ints, Table
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
 from .graph import POSE, WIDTHS
-from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
+from .schwarz_cg import Pieces, TwoLevelFactor
 from .work import ENTRIES, FACTORISATIONS, Work
 
 
@@ -210,16 +210,14 @@ class SparseLayout:
 
 
 class IterativeLayout:
-    """Both triangles in compressed columns, and the places of their pieces."""
+    """Both triangles in compressed columns, and pieces of the chain."""
 
     def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
-        """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
         self._sparse, self._pieces = SparseLayout(blocks), pieces
-        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.places)), pieces)
 
     def factor(self, values: Floats) -> TwoLevelFactor:
         """Prepare to solve with these values, up to the next call."""
-        return TwoLevelFactor(self._sparse.matrix(values), self._pieces, self._local)
+        return TwoLevelFactor(self._sparse.matrix(values), self._pieces)
 
 
 class BandedLayout:
