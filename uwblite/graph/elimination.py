@@ -285,4 +285,6 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = No
     else:
         every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
         multiplications = work(pairs, every, width, parent)
-    return Ordering(each, iterative=True) if fills_up(multiplications, poses) else Ordering(order, bordered, work=multiplications)
+    if fills_up(multiplications, poses):
+        return Ordering(each, iterative=True)
+    return Ordering(order, bordered, work=multiplications)
