@@ -153,12 +153,9 @@ class Blocks(Table):
 
     def entries(self) -> tuple[Ints, Ints, Ints]:
         """Return row, column and place of every value in the lower triangle."""
-        found = []
-        for i, j in np.ndindex(POSE * 2):
-            has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
-            found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
-        rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
-        return rows, columns, places
+        i, j = np.indices(POSE * 2)[..., None]
+        i, j, block = np.nonzero((i < self.height) & (j < self.width) & (self.row + i >= self.column + j))
+        return self.row[block] + i, self.column[block] + j, self.start[block] + i * self.width[block] + j
 
 
 def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
