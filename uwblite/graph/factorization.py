@@ -69,13 +69,6 @@ class BandedFactor:
         """Solve for right-hand sides (n,) or (n, m)."""
         return lapack.dpbtrs(self._factor, right, lower=1)[0].reshape(right.shape)
 
-    def half(self, right: Floats, transposed: bool = False) -> Floats:
-        """Solve with Cholesky's L, or with L^T, for right-hand sides (n,) or (n, m)."""
-        # scipy's binding writes beyond an empty array.
-        if not right.size:
-            return right
-        return lapack.dtbtrs(self._factor, right, uplo="L", trans="T" if transposed else "N")[0].reshape(right.shape)
-
     @property
     def nnz(self) -> int:
         """Entries of the factor."""
@@ -83,18 +76,14 @@ class BandedFactor:
 
 
 class BorderedFactor:
-    """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T.
-
-    Where A = L L^T is a band, S = C - V^T V with V = L^-1 B^T, in a quarter of the time.
-    """
+    """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T."""
 
     def __init__(self, inside: Factor, border: Floats) -> None:
         """Complete a factorisation of A by the rows (m, n + m) of [B, C], of C the lower triangle."""
         n = border.shape[1] - len(border)
         self._inside, self._rows = inside, border[:, :n]
-        self._solved = inside.half(self._rows.T) if isinstance(inside, BandedFactor) else inside.solve(self._rows.T)
-        product = (self._solved.T if isinstance(inside, BandedFactor) else self._rows) @ self._solved
-        self._corner, failed = lapack.dpotrf(border[:, n:] - np.tril(product), lower=1)
+        self._solved = inside.solve(self._rows.T)
+        self._corner, failed = lapack.dpotrf(border[:, n:] - np.tril(self._rows @ self._solved), lower=1)
         if failed:
             raise SolverError(SINGULAR)
 
@@ -103,10 +92,7 @@ class BorderedFactor:
         n = self._rows.shape[1]
         inner = self._inside.solve(right[:n])
         outer = lapack.dpotrs(self._corner, right[n:] - self._rows @ inner, lower=1)[0].reshape(right[n:].shape)
-        further = self._solved @ outer
-        if isinstance(self._inside, BandedFactor):
-            further = self._inside.half(further, transposed=True)
-        return np.concatenate([inner - further, outer])
+        return np.concatenate([inner - self._solved @ outer, outer])
 
     @property
     def nnz(self) -> int:
