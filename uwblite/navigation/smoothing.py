@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints
 from .clearance import AT_ONCE, COMFORT, ROUNDING, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
@@ -140,18 +140,13 @@ def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
 
 def _shortcuts(corners: int) -> tuple[Ints, Ints]:
     """Return first and last corner (m,) of every candidate."""
-    begins, ends, reach = [], [], 1
+    pairs, reach = [np.array([corners - 1], dtype=WIDE)], 1  # the whole in one, as 0 * corners + its end
     while reach < corners:
-        stride = max(reach // _STARTS_PER_SHORTCUT, 1)
-        begin = np.arange(0, corners - reach, stride)
-        begins.append(begin)
-        ends.append(begin + reach)
+        begin = np.arange(0, corners - reach, max(reach // _STARTS_PER_SHORTCUT, 1), dtype=WIDE)
+        pairs.append(begin * corners + begin + reach)
         reach *= 2
-    # From both ends to everywhere near, and the whole in one.
-    begins.append(np.array([0]))
-    ends.append(np.array([corners - 1]))
-    pairs = np.unique(np.stack([np.concatenate(begins), np.concatenate(ends)]), axis=1)
-    return pairs[0], pairs[1]
+    begin, end = np.divmod(np.unique(np.concatenate(pairs)), corners)
+    return begin.astype(np.intp), end.astype(np.intp)
 
 
 def walk_back(before: Ints, first: int, last: int) -> Ints:

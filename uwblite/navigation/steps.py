@@ -262,7 +262,7 @@ def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
     for start in range(0, grid.rows, STRIP):
         rows = slice(start, min(start + STRIP, grid.rows))
         part, more = _parted(clearance.passable(rows))
-        inner = part.ravel()
+        inner = part.ravel().astype(np.intp)
         values = (None, col[: len(inner)], row[: len(inner)] + start, clearance.cell_cost(rows).ravel())
         sums.append(np.stack([np.bincount(inner, v, more + 1)[1:] for v in values]))
         label[rows] = np.where(part > 0, part + count, 0)
