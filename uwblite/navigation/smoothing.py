@@ -24,10 +24,8 @@ _PLACES_PER_OCTAVE = 8
 """Places on a straight piece between one distance from its nearer end and twice that distance."""
 _SIEVES = 4
 """How often a shortcut is halved, at whose parts' ends it is looked up first: most of the long ones lead through obstacles."""
-_CORNER_COST = 1e-3
-"""m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
 _GAIN = 1e-3
-"""Relative; a round that gains less is the last."""
+"""Relative; a round that gains less is the last. A corner is worth as many m: of equal lines the one with fewest is taken."""
 _MOST_ROUNDS = 6
 
 
@@ -123,7 +121,7 @@ def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
     costs[across] = along.costs
     kept = piece[begin] == piece[end - 1]
     kept[across] = along.clear
-    graph = csr_matrix((costs[kept] + _CORNER_COST, (begin[kept], end[kept])), shape=(len(places), len(places)))
+    graph = csr_matrix((costs[kept] + _GAIN, (begin[kept], end[kept])), shape=(len(places), len(places)))
     totals, before = dijkstra(graph, indices=0, return_predecessors=True)
     return places[walk_back(before, 0, len(places) - 1)], float(totals[-1])
 
