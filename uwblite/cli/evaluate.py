@@ -29,8 +29,7 @@ from ..evaluation.trajectory import (
 )
 from ..io.csv_table import read_csv
 from ..io.map_server import read_map
-from ..io.results import repair_result
-from ..io.stored_result import read_result
+from ..io.stored_result import read_result, repair_result
 from ..io.tum import read_relations, read_tum
 from . import console
 
