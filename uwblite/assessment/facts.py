@@ -314,13 +314,19 @@ def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "
 
 
 @_rule
-def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]]) -> Finding:
-    """Doubt a recording whose wheels and lidar measure different motions for long, one factor for all taken out."""
-    text = (
-        f"wheels and lidar measure different motions ({spans([(a - start, b - start) for a, b in stretches])}): one of the two "
-        "is stuck, slips or has another scale there than elsewhere; cut that part off, or drive it again"
-    )
-    return Finding("wheels-against-lidar", DOUBT, text, stretches=tuple(stretches))
+def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]], slips: bool) -> Finding:
+    """Doubt a recording whose wheels and lidar measure different motions for long; warn where the wheels slip for a time.
+
+    One factor for all motions is taken out before.
+    """
+    when = spans([(a - start, b - start) for a, b in stretches])
+    text = f"the wheels count more motion than the lidar measures ({when}): they slip there, and the map follows the lidar"
+    if not slips:
+        text = (
+            f"wheels and lidar measure different motions ({when}): one of the two is stuck, slips or has another scale there "
+            "than elsewhere; cut that part off, or drive it again"
+        )
+    return Finding("wheels-against-lidar", WARNING if slips else DOUBT, text, stretches=tuple(stretches))
 
 
 @_rule
