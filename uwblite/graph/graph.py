@@ -10,6 +10,7 @@ chart of g2o, e = Z^-1 (Xi^-1 Xj). What a MapResult states about ranges is measu
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import compress
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -207,6 +208,11 @@ class Graph:
         if self.fixed_calibration.all():
             return np.zeros(index.shape[1], dtype=bool)
         return np.any(np.append(~self.fixed_calibration, False)[index], axis=0)
+
+    def by_calibration(self, index: Ints, columns: Sequence[Floats]) -> list[Block]:
+        """Return the blocks by the calibration values of indices (e, k), -1 = none, that are free, of derivatives (d, e)."""
+        used = compress(zip(index.T, columns, strict=False), self.has_free(index))
+        return [("calibration", np.maximum(i, 0), np.where(i >= 0, column, 0.0).T[..., None]) for i, column in used]
 
     def with_edges(self, *edges: Edges) -> "Graph":
         """Return the graph with further edges; empty ones are left out."""
