@@ -9,6 +9,7 @@ chart of g2o, e = Z^-1 (Xi^-1 Xj). What a MapResult states about ranges is measu
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from itertools import compress
 from typing import Any, ClassVar, NamedTuple, Self
@@ -219,11 +220,11 @@ class Graph:
         return replace(self, edges=self.edges + tuple(e for e in edges if len(e)))
 
     def updated(self, poses: Floats, anchors: Floats, calibration: Floats) -> "Graph":
-        """Return the graph with new estimates."""
-        values = replace(self.calibration, values=calibration)
-        new = replace(self, poses=poses, anchors=anchors, calibration=values, edges=())
-        # There are as many unknowns as before, which is all that is required of edges.
-        object.__setattr__(new, "edges", self.edges)
+        """Return the graph with new estimates, of as many unknowns: what was checked stays so."""
+        new = copy(self)
+        values = {"poses": poses, "anchors": anchors, "calibration": replace(self.calibration, values=calibration)}
+        for name, value in values.items():
+            object.__setattr__(new, name, value)
         return new
 
     def with_estimates_of(self, solved: "Graph") -> "Graph":
