@@ -23,9 +23,8 @@ _FOUND = (0.25, 0.1)
 """m and rad; a pose that is less certain is not found yet."""
 _VAGUE = (0.4, 0.25)
 """m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
-RAY_ELSEWHERE, _RANGE_ELSEWHERE = -0.35, -1.35
-"""Log-likelihoods of a ray, and of an independent range, at the best place of a building that is not the map's: rooms are alike
-in part."""
+_RANGE_ELSEWHERE = -1.35
+"""Log-likelihood of an independent range at the best place of a building that is not the map's."""
 _ALONE = 0.8
 """Least share of ranges that agree where they are alone: 0.9 to 1 in the right place, 0.75 to 0.8 with anchors of another
 building."""
@@ -115,19 +114,18 @@ class Odds:
         return "the scans fit the walls nowhere well; is this the right map?" if against else ""
 
 
-def map_odds(fit: float, ends: float, rays: float, pose: Floats, ranges: Ranges, agreed: float) -> Odds:
+def map_odds(scans: float, ends: float, pose: Floats, ranges: Ranges, agreed: float) -> Odds:
     """Return the odds of a pose (3,), where searches have agreed over so many m.
 
     Parameters
     ----------
-    fit : mean log-likelihood of the rays. ends : rays' ends in known space. rays : how many of them are independent.
+    scans : odds by the rays, of so many ends in known space.
     """
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= SURE * ranges.sigma
     anchors, sees = len(np.unique(ranges.anchor[agree])), ends >= FEW_ENDS
     likelihood = float(shared_likelihood(pose[None], ranges)[0]) - _RANGE_ELSEWHERE * float(series(ranges).share.sum())
-    scans, share = rays * (fit - RAY_ELSEWHERE) if sees else 0.0, float(agree.sum()) / max(len(ranges), 1)
-    enough = anchors >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
-    return Odds(scans, likelihood, share, enough, not (sees and anchors >= 2), agreed)
+    share, enough = float(agree.sum()) / max(len(ranges), 1), anchors >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
+    return Odds(scans if sees else 0.0, likelihood, share, enough, not (sees and anchors >= 2), agreed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +197,7 @@ def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: Floats) 
         x = x - np.linalg.solve(hessian, share * g[0] + information @ x)
         origins = rays.origins * (1.0 + x[-2])
         scaled = Rays(origins + beam * (1.0 + x[-1]), origins, rays.hit)
-    agreement = float(walls.agreement((start + x)[None, :-2], scaled).log_likelihood[0])
+    agreement = float(walls.agreement((start + x)[None, :-2], scaled).odds[0])
     value = min(len(rays.hit), INDEPENDENT * looks) * agreement - 0.5 * float(x @ information @ x)
     return float(x[-1]), float(np.sqrt(np.linalg.inv(hessian)[-1, -1])), value
 
