@@ -41,8 +41,8 @@ class Comparison:
     """Rays' ends in known space."""
     rays: Rays
     """Of the last metres, in the present frame of the base."""
-    looks: int
-    """Number of their scans."""
+    independent: float
+    """How many of them count as independent."""
     ranges: Ranges
 
     @property
@@ -121,22 +121,22 @@ class PlaceSearch:
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        scans, known = np.zeros(len(poses)), np.zeros(len(poses))
+        weight, scans, known = np.zeros((3, len(poses)))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for part in search.units(len(poses), PER_RAY * len(rays.hit)):
                 agreement = self.walls.agreement(poses[part], rays)
-                scans[part], known[part] = independent * agreement.odds, agreement.known
+                weight[part], scans[part] = independent * agreement.log_likelihood, independent * agreement.odds
+                known[part] = agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
-        weight = scans.copy()
         errors, each = self._anchors.errors, (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(ranges)
         for part in search.units(len(poses), each):
             expected = range_model.expected_errors(poses[part], ranges, errors) if errors else None
             weight[part] += range_model.range_likelihood(poses[part], ranges, expected=expected)
             yield each * len(poses[part])
-        new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
+        new = _no_repetition(poses, weight, before)
         places = started.rows(new[before:])
-        return Comparison(places, found.complete, weight[new], scans[new], known[new], rays, looks, ranges)
+        return Comparison(places, found.complete, weight[new], scans[new], known[new], rays, independent, ranges)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:
         """Return a comparison in the present frame of the robot, with the present hypotheses as they are now first."""

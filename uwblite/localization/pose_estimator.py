@@ -159,7 +159,7 @@ class PoseEstimator:
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
-            self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.odds)
+            self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
         if self.tracks:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
@@ -258,7 +258,7 @@ class PoseEstimator:
             undecided
             or verdict.imprecise(self._bank.pose_covariances[best])
             or odds.nowhere
-            or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges)
+            or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
         )
         # That the robot was carried within the window is as unlikely as what counts as certain.
         if not self._reason and odds.total < verdict.CERTAIN * (1 + (self._parts > 1)):

@@ -74,6 +74,8 @@ class Rays(Table):
 class Agreement:
     """How scans agree with the map at poses (h,)."""
 
+    log_likelihood: Floats
+    """Mean over the rays, by which places of the map are compared; 0 = all agree with the map."""
     odds: Floats
     """Mean log-likelihood of the rays against rays elsewhere, times the share of the ends that lie in known space."""
     on_wall: Floats
@@ -166,7 +168,8 @@ class Walls:
 
         An end on a wall counts log 1, one in free space log 0.1; a ray that passes a wall counts as if it ended in free space.
         Without a reading it has the likelihood of a missing return, to the power of a half: what is dark to one ray is dark to
-        its neighbours. A ray that ends in unknown space is left out, and the others say so much less.
+        its neighbours. One that ends in unknown space is between the two; for the odds it is left out, and the others say so
+        much less.
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
         on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
@@ -177,9 +180,11 @@ class Walls:
         ends = np.log(STRANGE + (1.0 - STRANGE) * np.where(passed, 0.0, on_wall))
         value = np.where(rays.hit, ends, np.where(passed, 0.5 * np.log(self.missing), 0.0))
         judged, count = known | passed | ~rays.hit, known.sum(axis=1)
+        likelihood = np.where(judged, value, 0.5 * np.log(STRANGE)).mean(axis=1)
         fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
         share = (known & (on_wall >= 0.5)).sum(axis=1) / np.maximum(count, 1)
-        return Agreement(count / max(rays.hit.sum(), 1) * (fit - ELSEWHERE), share, count.astype(np.float64))
+        odds = count / max(rays.hit.sum(), 1) * (fit - ELSEWHERE)
+        return Agreement(likelihood, odds, share, count.astype(np.float64))
 
 
 def _turned(poses: Floats, points: Floats) -> tuple[Floats, Floats]:
