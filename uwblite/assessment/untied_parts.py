@@ -172,9 +172,9 @@ def _tied(estimate: Estimate, slips: Floats, i: Ints, j: Ints) -> Bools:
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     """Return the steps (s,) of the odometry that the map contradicts and whose sides nothing else connects.
 
-    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known slips,
-    is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end of a
-    recording are no part.
+    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known
+    slips, is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end
+    of a recording are no part.
     """
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
