@@ -83,7 +83,7 @@ def diagnose(
         figures["lidar"] = sensor_checks.lidar_figures(log)
         figures["lidar"]["turning"], turning = sensor_checks.turning_figures(log)
     view = RecordingView(log, repaired, result, refused, figures, turning)
-    rules = (_check_notes, _check_map, _check_sensors, _check_each_sensor)
+    rules = (_check_notes, _check_map, _check_each_sensor)
     return Diagnosis(explained(ranked(finding for rule in rules for finding in rule(view))), figures)
 
 
@@ -114,6 +114,7 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
     if view.result is not None:
         yield from view.result.findings
         return
+    yield from _check_sensors(view)
     for finding in [] if view.repaired is None else check_recording(view.repaired):
         if finding.kind == WHEELS_AGAINST_LIDAR:
             cure = "a map is doubted for it, unless its ranges agree with the lidar there"
