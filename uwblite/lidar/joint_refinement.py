@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, run_starts
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
@@ -146,7 +146,7 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
         own = i * visits + visit[j]
         # Numbers of which the whole part comes first, then the larger share, then the earlier cloud.
         order = np.argsort(own - 0.5 * share, kind="stable")
-        order = order[np.diff(own[order], prepend=-1) != 0]
+        order = order[run_starts(own[order])]
         order = order[np.argsort(i[order] - 0.5 * share[order], kind="stable")]
         i, j = i[order], j[order]
         best = np.arange(len(i)) - np.searchsorted(i, i) < partners

@@ -109,7 +109,7 @@ def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, 
 
 def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of some facings."""
-    usable, many = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1)), OverlapPolicy.facings
+    usable, many = np.flatnonzero(clouds.lines), OverlapPolicy.facings
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
     for part in _parts(len(usable)):
         rows, owner = usable[part], clouds.owner[usable[part]]

@@ -15,7 +15,7 @@ from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import clouds, scan_matching
 from .cloud_rasters import CloudRasters, rasterize
-from .clouds import CloudConfig, Clouds, make_cloud
+from .clouds import CloudConfig, Clouds
 from .correlative_matching import search
 from .overlap import directional_overlap
 from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
@@ -59,7 +59,7 @@ def scan_steps(
     steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
     for low in range(0, len(first), ScanStepPolicy.at_once):
         rows = slice(low, low + ScanStepPolicy.at_once)
-        raster, pairs = _pairs(scans, mounting, first[rows], second[rows])
+        raster, pairs = _pairs(*_clouds(scans, mounting, first[rows], second[rows]))
         aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, ScanStepPolicy.gate)
         enough = aligned.factors.asked >= PairPolicy.fewest
         pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
@@ -79,7 +79,7 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
 
     Points without a match count as one at the gate, unless the first scan could not see there, as along a bare corridor.
     """
-    raster, pairs = _pairs(scans, mounting, first, second)
+    raster, pairs = _pairs(*_clouds(scans, mounting, first, second))
     pairs = _in_sight(raster.clouds, pairs, motion, scans, mounting)
     gate = ScanStepPolicy.reach
     found = scan_matching.match(raster, pairs, motion, gate, gate)
@@ -102,30 +102,34 @@ def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScan
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1."""
-    raster, pairs = _pairs(scans, mounting, first, second)
-    return directional_overlap(raster, pairs.i, pairs.j, motion, ScanStepPolicy.gate)
+    built, i, j = _clouds(scans, mounting, first, second)
+    raster = rasterize(built, CloudConfig.raster, ScanStepPolicy.reach)
+    return directional_overlap(raster, i, j, motion, ScanStepPolicy.gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of either of two scans that stands in the free space of the other, for motions (e, 3), 0..1."""
-    raster, pairs = _pairs(scans, mounting, first, second)
-    free, seen = free_around(raster.clouds), [raster.clouds.cloud(k)[0] for k in range(len(raster.clouds))]
-    steps = zip(pairs.i.tolist(), pairs.j.tolist(), motion, strict=True)
+    built, i, j = _clouds(scans, mounting, first, second)
+    free, seen = free_around(built), [built.cloud(k)[0] for k in range(len(built))]
+    steps = zip(i.tolist(), j.tolist(), motion, strict=True)
     return np.array([violates_free_space(free[a], seen[a], free[b], seen[b], step) for a, b, step in steps])
 
 
-def _pairs(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints) -> tuple[CloudRasters, CloudPairs]:
-    """Return the rasters of the clouds of pairs of scans, and the pairs of clouds (e)."""
+def _clouds(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints) -> tuple[Clouds, Ints, Ints]:
+    """Return the clouds of pairs of scans, and the targets and sources (e,) of the pairs among them."""
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
-    built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = rasterize(built, config.raster, ScanStepPolicy.reach)
-    return raster, pairs_of(built, i, j)
+    return clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config), i, j
+
+
+def _pairs(built: Clouds, i: Ints, j: Ints) -> tuple[CloudRasters, CloudPairs]:
+    """Return the rasters of the targets, and the pairs of clouds (e)."""
+    return rasterize(built, CloudConfig.raster, ScanStepPolicy.reach, i), pairs_of(built, i, j)
 
 
 def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
     """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
-    target, source = (make_cloud(p, p + n) for p, n in (raster.clouds.cloud(int(k)) for k in (pair.i[0], pair.j[0])))
+    target, source = (raster.clouds.chosen(of) for of in (pair.i, pair.j))
     places = search(target, source, guess, ScanStepPolicy.search).poses
     if not len(places):
         return guess, 0.0

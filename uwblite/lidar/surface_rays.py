@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Table, dots
+from ..arrays import WIDE, Bools, Floats, Ints, Table, dots, run_starts
 from ..odometry.attached import ScanPoints
 
 
@@ -153,7 +153,7 @@ class SurfaceRays(Table):
     def bundled(self) -> "SurfaceRays":
         """Return the mean of neighbouring rays of one scan on one surface, with the weight of all of them; the rays of a
         scan are in order."""
-        first = np.flatnonzero(np.diff(np.stack([self.bundle, self.surface]), axis=1, prepend=-1).any(axis=0))
+        first = run_starts(self.bundle, self.surface)
         if not len(first):
             return self
         count = np.diff(np.append(first, len(self.bundle)))[:, None]
