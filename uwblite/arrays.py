@@ -1,6 +1,6 @@
 """Arrays: names for their element types, checks of those from outside, tables joined, robust spreads, runs of flags."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from functools import cache
 from typing import Any, Self, TypeVar, get_args, get_origin
@@ -23,6 +23,10 @@ WIDE = np.int64
 Wides = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+CHUNK = 1 << 14
+"""Rows that are processed together, so that they stay in the processor's cache; bounds the memory, too."""
+TINY = 1e-9
+"""Length, m, or share below which a value is rounding error."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
 MEDIAN_TO_MEAN = 1.2533
@@ -53,6 +57,12 @@ def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
     where = number.reshape(-1).astype(np.intp)
     return used, where[: len(one)], where[len(one) :]
+
+
+def chunks(rows: int, size: int = CHUNK) -> Iterator[slice]:
+    """Yield some rows at a time."""
+    for first in range(0, rows, size):
+        yield slice(first, min(first + size, rows))
 
 
 def run_starts(*columns: NDArray[Any]) -> Ints:

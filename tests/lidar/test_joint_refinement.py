@@ -10,7 +10,7 @@ from helpers.planted import aligned_error, box
 from scipy import sparse
 
 from uwblite import se2
-from uwblite.arrays import rms_length
+from uwblite.arrays import chunks, rms_length
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
@@ -183,8 +183,8 @@ def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_a
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
     whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
-    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
-    monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
+    monkeypatch.setattr(overlap, "chunks", lambda rows: chunks(rows, 37))
+    monkeypatch.setattr(scan_matching, "chunks", lambda rows, *_: chunks(rows, 3))
     parts = overlap.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
     assert parts.shape == whole.shape

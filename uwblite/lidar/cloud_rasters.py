@@ -6,15 +6,11 @@ from functools import cache, reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import WIDE, Floats, Ints
+from ..arrays import CHUNK, WIDE, Floats, Ints, chunks
 from ..graph.work import LOOK_UPS
-from .clouds import Clouds
+from .clouds import CLOUDS_AT_ONCE, Clouds
 
-_CLOUDS_AT_ONCE = 64
-"""Clouds whose rasters are made at once; a bound on the memory."""
 _MOST_NARROW = np.iinfo(np.int16).max
-_AT_ONCE = 1 << 15
-"""Cells that are claimed at once: few points are claimed for by few calls."""
 _RUN_BITS = 4
 _RUN = 1 << _RUN_BITS
 """Cells in y that are kept together: a wall and the cells within reach of it are about as wide."""
@@ -74,12 +70,11 @@ def rasterize(clouds: Clouds, cell: float, reach: float, targets: Ints | None = 
     origin, shape, start = np.zeros((many, 2)), np.zeros((many, 2), dtype=np.int32), np.empty(many, dtype=np.int32)
     run, kept = [np.zeros(1, dtype=np.int32)], [np.full((1, _RUN), NOBODY, dtype=kind)]
     runs = named_runs = 1
-    for first in range(0, many, _CLOUDS_AT_ONCE):
-        some = slice(first, min(first + _CLOUDS_AT_ONCE, many))
+    for some in chunks(many, CLOUDS_AT_ONCE):
         begin, end = clouds.offsets[some.start], clouds.offsets[some.stop]
         usable = begin + np.flatnonzero(writes[begin:end])
         owner, place = clouds.owner[usable], clouds.points.T.take(usable, axis=1).astype(np.float64)
-        count = np.bincount(owner - first, minlength=some.stop - first)
+        count = np.bincount(owner - some.start, minlength=some.stop - some.start)
         begins = (np.cumsum(count) - count)[count > 0]
         if len(begins):
             shown = owner[begins]
@@ -90,7 +85,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float, targets: Ints | None = 
         ends = np.cumsum(wide * tall)
         start[some] = runs + ends - wide * tall
         block = np.full((int(ends[-1]), _RUN), NOBODY, dtype=kind)
-        stride = (tall * _RUN)[owner - first]
+        stride = (tall * _RUN)[owner - some.start]
         cx, cy = ((place - origin.T.take(owner, axis=1)) / cell).astype(np.intp)
         base = (start[owner].astype(np.intp) - runs) * _RUN + cx * stride + cy
         _claim_cells(block.reshape(-1), base, stride, (usable - clouds.offsets[owner]).astype(kind), offsets)
@@ -121,9 +116,9 @@ def _claim_cells(
     cells[base] = number
     last = cells[base] == number
     base, stride, number = base[last], stride[last], number[last]
-    at_once = max(_AT_ONCE // max(len(base), 1), 1)
-    for first in range(0, len(offsets), at_once):
-        dx, dy = offsets[first : first + at_once].T[:, :, None]
+    # Of few points many cells are claimed by one call.
+    for some in chunks(len(offsets), max(CHUNK // max(len(base), 1), 1)):
+        dx, dy = offsets[some].T[:, :, None]
         place = dx * stride + dy + base
         cells[place.ravel()] = np.broadcast_to(number, place.shape).ravel()
 

@@ -20,8 +20,8 @@ from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_b
 
 _TURN = 8.0
 """rad; more than all bearings differ by."""
-_BLOCK = 32
-"""Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
+CLOUDS_AT_ONCE = 64
+"""Clouds that are processed together; bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def facing(normals: Floats, way: Floats) -> Floats:
 def _lines(owner: Ints, points: Floats, config: CloudConfig) -> Lines:
     """Fit lines to all neighbourhoods; a block of clouds shares one tree, in which they lie side by side."""
     parts = []
-    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + CLOUDS_AT_ONCE, CLOUDS_AT_ONCE))
     width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
     for first, last in pairwise(blocks):
         block = points[first:last]

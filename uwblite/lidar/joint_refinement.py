@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, run_starts
+from ..arrays import WIDE, Bools, Floats, Ints, chunks, run_starts
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
@@ -21,12 +21,9 @@ from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from .cloud_rasters import ScanClouds
-from .clouds import Clouds
+from .clouds import CLOUDS_AT_ONCE, Clouds
 from .overlap import surface_cells
 from .scan_matching import CloudPairs, PairFactors, match, measured, pairs_of
-
-_CLOUDS_AT_ONCE = 128
-"""Clouds whose overlaps with all others are in memory at once; a bound on the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,11 +132,11 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
     visits = int(visit.max(initial=0)) + 1
     across, found = seen.T.tocsr(), []
     partners = min(config.partners, max(2, config.most // seen.shape[0]))
-    for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
-        common = seen[first : first + _CLOUDS_AT_ONCE] @ across
+    for some in chunks(seen.shape[0], CLOUDS_AT_ONCE):
+        common = seen[some] @ across
         common.sort_indices()
         common = common.tocoo()
-        i, j = common.row.astype(np.intp) + first, common.col.astype(np.intp)
+        i, j = common.row.astype(np.intp) + some.start, common.col.astype(np.intp)
         share = common.data / np.minimum(size[i], size[j])
         kept = (np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= config.common)
         i, j, share = i[kept], j[kept], share[kept]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Wides
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, chunks
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_of
@@ -38,9 +38,6 @@ class OverlapPolicy:
     facings: ClassVar[int] = 8
     """Directions in which such a cell may face."""
 
-
-_POINTS_AT_ONCE = 1 << 16
-"""Points brought into the map's frame at once."""
 
 Weights = Callable[[Correspondences, CloudPairs, Floats], Floats]
 """Gives the weights (e, n) of points of sources that were looked up in their targets at poses (e, 3)."""
@@ -111,7 +108,7 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of some facings."""
     usable, many = np.flatnonzero(clouds.lines), OverlapPolicy.facings
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
-    for part in _parts(len(usable)):
+    for part in chunks(len(usable)):
         rows, owner = usable[part], clouds.owner[usable[part]]
         cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[rows]) / OverlapPolicy.surface_cell)
         bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[rows]))
@@ -126,17 +123,11 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     return seen
 
 
-def _parts(many: int) -> Iterator[slice]:
-    """Yield rows a bounded number at a time, one part at least."""
-    for first in range(0, max(many, 1), _POINTS_AT_ONCE):
-        yield slice(first, first + _POINTS_AT_ONCE)
-
-
 def _seen_cells(
     owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
 ) -> Iterator[tuple[Wides, Wides]]:
     """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
-    for part in _parts(len(owner)):
+    for part in chunks(max(len(owner), 1)):
         key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * OverlapPolicy.facings + facing[part]
         many = int(key.max(initial=0)) + 1
         yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)

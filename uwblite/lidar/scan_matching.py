@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, concatenated
+from ..arrays import CHUNK, TINY, Bools, Floats, Ints, Table, chunks, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 
@@ -53,12 +53,8 @@ class PairPolicy:
     iterations: ClassVar[int] = 20
 
 
-_AT_ONCE = 1 << 14
-"""Points looked up at once, so that they fit into the processor's cache; it also bounds the memory."""
-_PAIRS_AT_ONCE = 1 << 12
-"""Pairs whose points are listed at once; a bound on the memory."""
-_TINY = float(np.finfo(np.float32).tiny)
-SINGULAR = 1e-9
+_LEAST = float(np.finfo(np.float32).tiny)
+SINGULAR = TINY
 """Share of the largest information below which a direction has none."""
 _FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 _ONE = np.eye(len(_FLOOR))
@@ -120,8 +116,7 @@ def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = PairPolicy.points) -
     take = np.minimum(end - begin, limit)
     rank = np.arange(take.max(initial=0))
     points = np.empty((len(j), len(rank)), dtype=np.int32)
-    for first in range(0, len(j), _PAIRS_AT_ONCE):
-        part = slice(first, first + _PAIRS_AT_ONCE)
+    for part in chunks(len(j)):
         number, taken = (end - begin)[part, None], take[part, None]
         picked = begin[part, None] + (rank * number) // np.maximum(taken, 1)
         points[part] = rows[np.where(rank < taken, picked, len(rows) - 1)]
@@ -182,10 +177,8 @@ def correspondences(
     """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
     # Each coordinate of points and normals in one piece.
     surface = [np.ascontiguousarray(column) for column in (*raster.clouds.points.T, *raster.clouds.normals.T)]
-    at_once = max(_AT_ONCE // max(pairs.points.shape[1], 1), 1)
     gate = np.full(len(pairs), gate)
-    for first in range(0, max(len(pairs), 1), at_once):
-        part = slice(first, first + at_once)
+    for part in chunks(max(len(pairs), 1), max(CHUNK // max(pairs.points.shape[1], 1), 1)):
         yield _looked_up(surface, raster, part, pairs.rows(part), T_i_j[part], gate[part])
 
 
@@ -250,7 +243,7 @@ def _relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floa
 
 def _floored(information: Floats, spurious: Floats) -> Floats:
     """Return spurious information (..., 3, 3) that does not vanish."""
-    floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _TINY
+    floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _LEAST
     return np.asarray(spurious + floor[..., None] * _ONE)
 
 
@@ -268,7 +261,7 @@ def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tu
     """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added: a
     direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m."""
     basis, inverse, values = _relative_eigen(information, spurious)
-    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _TINY), 0.0)
+    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _LEAST), 0.0)
     share = (basis * kept[..., None, :]) @ inverse
     return share @ information, (share @ gradient[..., None])[..., 0]
 
@@ -329,7 +322,7 @@ class Aligned:
     @property
     def rms(self) -> Floats:
         """(e,) root mean square distance of the matches, m."""
-        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, _TINY))
+        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, _LEAST))
 
 
 def limited(step: Floats) -> Floats:

@@ -10,12 +10,12 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, renumbered
+from ..arrays import Bools, Floats, Ints, chunks, renumbered
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import clouds, scan_matching
 from .cloud_rasters import CloudRasters, rasterize
-from .clouds import CloudConfig, Clouds
+from .clouds import CLOUDS_AT_ONCE, CloudConfig, Clouds
 from .correlative_matching import search
 from .overlap import directional_overlap
 from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
@@ -32,8 +32,6 @@ class ScanStepPolicy:
     """The same at its end: single scans are thinner than clouds of keyframes, and more often match what they do not show."""
     search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
     """Half-widths of the search, m, m, rad."""
-    at_once: ClassVar[int] = 128
-    """Pairs of scans whose rasters are in memory at once."""
     well_seen: ClassVar[float] = 0.9
     """Quantile of a scan's readings up to which it sees whatever is there."""
     least_in_sight: ClassVar[float] = 0.5
@@ -56,17 +54,16 @@ def scan_steps(
     -------
     Motions T_first_second (e, 3) and the share of points that match (e,), 0..1; 0 where there are too few.
     """
-    steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
-    for low in range(0, len(first), ScanStepPolicy.at_once):
-        rows = slice(low, low + ScanStepPolicy.at_once)
+    steps, shares = [np.zeros_like(guess[:0])], [np.zeros(0)]
+    for rows in chunks(len(first), CLOUDS_AT_ONCE):
         raster, pairs = _pairs(*_clouds(scans, mounting, first[rows], second[rows]))
         aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, ScanStepPolicy.gate)
         enough = aligned.factors.asked >= PairPolicy.fewest
         pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
         poor = np.flatnonzero((share < PairPolicy.good_share) & enough)
-        allowed = -(-searches * ScanStepPolicy.at_once // len(first))
+        allowed = -(-searches * CLOUDS_AT_ONCE // len(first))
         for row in poor[np.argsort(share[poor], kind="stable")][:allowed].tolist():
-            found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[low + row])
+            found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[rows.start + row])
             if found[1] > share[row]:
                 pose[row], share[row] = found
         steps.append(pose)
