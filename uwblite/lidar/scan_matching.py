@@ -42,7 +42,7 @@ class PairPolicy:
     """Least cosine between the normals of two matched points."""
     measured: ClassVar[float] = 2.0
     """Multiple of the spurious information that a direction must exceed to have been measured."""
-    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
+    farthest: ClassVar[tuple[float, float]] = (2.0 * gate, gate)
     """Longest step of one iteration, m and rad."""
     shrink: ClassVar[float] = 0.8
     """Gate of an iteration as a share of the one before, at most."""

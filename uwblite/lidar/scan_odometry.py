@@ -17,9 +17,8 @@ from . import clouds, scan_matching
 from .cloud_rasters import CloudRasters, rasterize
 from .clouds import CLOUDS_AT_ONCE, CloudConfig, Clouds
 from .correlative_matching import search
-from .overlap import directional_overlap
 from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
-from .visibility import free_around, violates_free_space
+from .visibility import directional_overlap, free_around, violates_free_space
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +29,8 @@ class ScanStepPolicy:
     """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
     gate: ClassVar[float] = 0.12
     """The same at its end: single scans are thinner than clouds of keyframes, and more often match what they do not show."""
-    search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
-    """Half-widths of the search, m, m, rad."""
+    search: ClassVar[float] = 0.6
+    """Half-width of the search, m and rad."""
     well_seen: ClassVar[float] = 0.9
     """Quantile of a scan's readings up to which it sees whatever is there."""
     least_in_sight: ClassVar[float] = 0.5
@@ -127,7 +126,7 @@ def _pairs(built: Clouds, i: Ints, j: Ints) -> tuple[CloudRasters, CloudPairs]:
 def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
     """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
     target, source = (raster.clouds.chosen(of) for of in (pair.i, pair.j))
-    places = search(target, source, guess, ScanStepPolicy.search).poses
+    places = search(target, source, guess, (ScanStepPolicy.search,) * len(guess)).poses
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))

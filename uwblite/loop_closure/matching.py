@@ -17,10 +17,9 @@ from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.overlap import net_overlap
 from ..lidar.scan_matching import Aligned, align_pairs, match, pairs_of
 from ..lidar.submaps import Submaps
-from ..lidar.visibility import FreeSpace, violates_free_space
+from ..lidar.visibility import FreeSpace, net_overlap, violates_free_space
 from .candidates import CandidatePolicy, Candidates
 from .closures import LoopClosureConfig
 from .parallel import batches, in_order
