@@ -42,6 +42,18 @@ class RecordingPolicy:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PosesBetween:
+    """Poses at keyframes and at scans between them."""
+
+    frames: Keyframes
+    """At all of these moments (n)."""
+    keyframe: Ints
+    """(n,) keyframe of the recording from which each pose is seen, counted from its first."""
+    since: Floats
+    """(n, 3) T_keyframe_base; m, m, rad."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """One recording among others."""
 
@@ -51,6 +63,8 @@ class Recording:
     frames: Keyframes
     first: int
     """The graph's number of its first keyframe."""
+    between: PosesBetween | None = None
+    """None where the odometry alone tells the way from keyframe to keyframe."""
 
     @property
     def rows(self) -> slice:
@@ -73,8 +87,11 @@ class Recording:
 
     @property
     def trajectory_stamps(self) -> Floats:
-        """(n,) s of its odometry, and of keyframes where its samples are too far apart to interpolate between."""
+        """(n,) s of its odometry, and of keyframes where its samples are too far apart to interpolate between, or of all scans
+        that measure poses between these."""
         stamps, own = self.log.odometry.stamps, self.frames.stamps
+        if self.between is not None:
+            return np.union1d(stamps, self.between.frames.stamps)
         after = np.searchsorted(stamps, own)
         inside = (after > 0) & (after < len(stamps))
         gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
@@ -82,7 +99,20 @@ class Recording:
 
     def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
         """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
-        return keyframes.dense_trajectory(self.log.odometry, self.frames, poses[self.rows], stamps)
+        frames, own = self.frames, poses[self.rows]
+        if self.between is not None:
+            frames, own = self.between.frames, se2.compose(own[self.between.keyframe], self.between.since)
+        return keyframes.dense_trajectory(self.log.odometry, frames, own, stamps)
+
+    def with_poses_between(self, stamps: Floats, keyframe: Ints, since: Floats) -> "Recording":
+        """Return the recording with poses (m, 3) at further stamps (m,), seen from its keyframes (m,)."""
+        own = np.arange(len(self.frames))
+        moments = np.concatenate([self.frames.stamps, stamps])
+        order = np.argsort(moments, kind="stable")
+        frames = keyframes.at(self.log, moments[order], np.ones(len(order), dtype=bool))
+        keyframe = np.concatenate([own, keyframe])[order]
+        since = np.concatenate([np.zeros((len(own), 3)), since])[order]
+        return replace(self, between=PosesBetween(frames, keyframe, since))
 
     @property
     def name(self) -> str:
