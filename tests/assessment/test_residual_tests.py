@@ -75,7 +75,7 @@ def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
     loop : whether the robot stands at the 79th where it began, and a scan edge says so.
     """
     truth = np.column_stack([np.arange(80) * 0.3, np.zeros(80), np.zeros(80)])
-    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
+    wheels = chained(truth, np.array([0.01, 0.01, 0.003]))
     for step, by in slip.items():
         wheels.motion[step] += by
     pairs = [(k - span, k) for span in scans for k in range(20, 60)] + [(0, 79)] * loop

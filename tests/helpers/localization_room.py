@@ -10,7 +10,8 @@ from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.stored_result import StoredAnchor
 from uwblite.localization import Localizer, Scanner
-from uwblite.localization.known_map import known_map
+from uwblite.localization.known_map import KnownMap, known_anchors
+from uwblite.localization.walls import walls_of
 from uwblite.sensor_log import SensorMounting
 
 CELL = 0.05
@@ -32,6 +33,11 @@ def grid_of(walls, origin=(-1.025, -1.025), size=(10.05, 8.05), cell=CELL):
         row, col = geometry.cell_of(along)
         odds[row, col] = 4.0
     return OccupancyGrid(geometry, odds.astype(np.float32))
+
+
+def known_map(anchors, grid):
+    """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
+    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
 
 
 def known(walls=ODD, anchors=ANCHORS):

@@ -6,13 +6,13 @@ import importlib.util
 import numpy as np
 import pytest
 from conftest import ROOT
+from helpers.localization_room import known_map
 
 from uwblite import se2
 from uwblite.constraints import Constraints
 from uwblite.errors import Cancelled, DataError
 from uwblite.io.carmen import read_log
 from uwblite.io.stored_result import StoredAnchor
-from uwblite.localization.known_map import known_map
 from uwblite.localization.localize import localize
 from uwblite.mapping import build_map
 

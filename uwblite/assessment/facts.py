@@ -208,9 +208,10 @@ TEXTS: Mapping[str, Text] = {
         "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
     ),
     "free-space-violation": Text(
-        "Doubt a map in which points of one visit to a place stand in the free space of another visit.",
-        "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
-        "parts of the map are misplaced to each other; look at the closures in report.html",
+        "Doubt a map in which points of one visit to a place stand in the free space of another visit, by more than what moves "
+        "explains.",
+        "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space, and within one visit "
+        "only {moving:.0%}: parts of the map are misplaced to each other; look at the closures in report.html",
         DOUBT,
     ),
     "open-loops": Text(

@@ -14,12 +14,12 @@ from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..loop_closure.chain_breaks import untied_breaks
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import blocked
 from ..radio.range_noise import short_term_sigma
 from .facts import listed
+from .untied_parts import untied_steps
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -28,8 +28,6 @@ _FREE, _EARLY = 0.1, 0.05
 """Least share of ranges in line of sight to represent all, and share that gross errors make too short."""
 NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
-_SLIP, _SLIP_ANGLE = 1.0, 0.2
-"""m and rad, by which wheels that slip are off in a step at most."""
 _SUDDEN, _JUMP, _CARRIED = 5.0, 20.0, 0.5
 """Standard deviations that a step of faultless wheels hardly ever exceeds, and one of wheels on the floor never; and the size,
 m or rad, too large for slip."""
@@ -130,25 +128,18 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         text = f"between t = {start:.0f} and {end:.0f} s most steps of the wheels contradict the map beyond their noise: {why}"
         found = (warning if lidar else doubt)("odometry-steps", text, start=start, end=end)
         yield between_keyframes(found, recordings, span)
-        measured[stretch[0] : stretch[1] + 1] &= off[stretch[0] : stretch[1] + 1] < _SUDDEN
     if recordings.have_scans:
-        if not estimate.placed.any():
-            # Loops pull at steps that nothing else measures; a torn map is off by more than wheels slip.
-            way, turn = _error_of(wheels, far, whitened)
-            far = far[(way > _SLIP) | (turn > _SLIP_ANGLE)]
-        measured[far] = False
-        loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
-        far = np.intersect1d(far, loose)
-        at = (recordings.stamps[wheels.i[loose]] - recordings.stamps[0]).tolist()
-        if at and not estimate.placed.any():
+        loose = untied_steps(estimate, recordings)
+        if len(loose):
             # Along a bare wall scans leave a direction free, and nothing else connects the parts before and after.
+            at = (recordings.stamps[wheels.i[loose]] - recordings.stamps[0]).tolist()
             text = (
                 f"at t = {listed(at)} s the odometry fails where the lidar cannot measure the travelled distance, as along a "
-                "bare wall, and no loop closure connects the parts before and after: they may be misplaced to each other; "
-                "drive through the first part once more"
+                "bare wall, and neither loop closures nor ranges connect the parts before and after: they may be misplaced to "
+                "each other; drive through the first part once more"
             )
             yield doubt("loose-links", text, at=at)
-    if estimate.placed.any() and len(far):
+    elif estimate.placed.any() and len(far):
         yield _slips(far, whitened, wheels, recordings)
 
 

@@ -11,7 +11,7 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from ..arrays import WIDE, Floats, Ints
@@ -44,13 +44,13 @@ class _Places(NamedTuple):
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], last: ArrayLike | None = None) -> None:
         """Number the unknowns and find the place of every product.
 
         Parameters
         ----------
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
-        subtrees : order for the selected inverse, not for speed.
+        last : order for the inverse, not for speed: these poses are eliminated after the others.
         """
         self.spent = graph.work
         """Counts what is done with these equations."""
@@ -68,7 +68,8 @@ class NormalEquations:
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
-        ordering = choose_ordering(pairs, counts[0], width, subtrees)
+        at_end = None if last is None else node["poses"][np.asarray(last, dtype=np.intp)]
+        ordering = choose_ordering(pairs, counts[0], width, None if at_end is None else np.unique(at_end[at_end >= 0]))
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
@@ -224,7 +225,7 @@ class NormalEquations:
 
     @property
     def matrix(self) -> sparse.csc_matrix:
-        """H, where the order is that of the selected inverse."""
+        """H, where the order is that for the inverse."""
         assert isinstance(self._layout, SparseLayout)
         return self._layout.matrix(self.values)
 
@@ -251,7 +252,7 @@ def _same(one: list[_Block], other: list[_Block]) -> bool:
     )
 
 
-def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = None) -> NormalEquations:
+def filled(graph: Graph, last: ArrayLike | None = None, like: NormalEquations | None = None) -> NormalEquations:
     """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations.
 
     Parameters
@@ -259,7 +260,7 @@ def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = 
     like : normal equations of a graph with the same unknowns and edges, if there are any: they are filled again.
     """
     linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees) if like is None else like
+    normal = NormalEquations(graph, linearized, last) if like is None else like
     normal.fill(linearized, [kernel_weights(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
     return normal
 

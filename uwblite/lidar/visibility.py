@@ -2,7 +2,7 @@
 
 Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud well in front
 of it contradicts their relative pose; one behind it was hidden. If the pose is right, people, glass and doors cause a few per
-cent of such points; if it is wrong, half of the surfaces do.
+cent of such points, within one visit to a place as between two; if it is wrong, half of the surfaces do.
 """
 
 from collections.abc import Sequence
@@ -166,36 +166,40 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
     return float(np.quantile(shares, VisibilityPolicy.usual)) if shares else 0.0
 
 
-def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
+def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, float, int]:
     """Return the share, 0..1, of points of one visit that stand in the free space of another visit to the same place, of those
-    that it could see, and the number of different keyframes on the smaller side of the comparisons, earlier or later.
+    that it could see; the same within one visit; and the number of different keyframes on the smaller side of the comparisons
+    between visits, earlier or later.
 
     Parameters
     ----------
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. recording : (k,) recording.
     """
-    i, j = _revisits(poses, path, recording)
-    free = free_around(clouds)
-    through, seen, compared = 0.0, 0.0, []
-    for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
-        points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(free[a], points)
-        if visible * len(points) >= VisibilityPolicy.common:
-            through += share * visible * len(points)
-            seen += visible * len(points)
-            compared.append((min(a, b), max(a, b)))
-    visits = min((len(set(side)) for side in zip(*compared, strict=True)), default=0)
-    return through / max(seen, 1.0), visits
+    free, shares, visits = free_around(clouds), [], 0
+    for again in (False, True):
+        i, j = _together(poses, path, recording, again)
+        through, seen, compared = 0.0, 0.0, []
+        for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
+            points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
+            share, visible = contradiction(free[a], points)
+            if visible * len(points) >= VisibilityPolicy.common:
+                through += share * visible * len(points)
+                seen += visible * len(points)
+                compared.append((min(a, b), max(a, b)))
+        shares.append(through / max(seen, 1.0))
+        visits = min((len(set(side)) for side in zip(*compared, strict=True)), default=0)
+    return shares[1], shares[0], visits
 
 
-def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]:
-    """Return pairs (p,), (p,) of keyframes that lie together but were not driven one after the other."""
+def _together(poses: Floats, path: Floats, recording: Ints, again: bool) -> tuple[Ints, Ints]:
+    """Return pairs (p,), (p,) of keyframes at one place: the nearest of different visits, or the farthest of one visit."""
     c = VisibilityPolicy
     nearest = range(1, min(c.neighbours, len(poses)) + 1)
     distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=nearest, distance_upper_bound=c.revisit)
     other = np.minimum(other, len(poses) - 1)
-    again = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
-    again &= np.isfinite(distance)
-    i = np.flatnonzero(again.any(axis=1))
+    apart = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
+    paired = (apart == again) & np.isfinite(distance) & (other != np.arange(len(poses))[:, None])
+    i = np.flatnonzero(paired.any(axis=1))
     i = i[np.unique(np.linspace(0, len(i) - 1, min(c.revisits, len(i))).round().astype(np.intp))]
-    return i, other[i, np.argmax(again[i], axis=1)].astype(np.intp)
+    chosen = np.argmax(paired[i], axis=1) if again else len(nearest) - 1 - np.argmax(paired[i, ::-1], axis=1)
+    return i, other[i, chosen].astype(np.intp)

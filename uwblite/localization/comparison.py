@@ -19,6 +19,8 @@ LOOK_BACK, _SEARCH_LOOKS = 4.0, 2.5
 """m driven; places are compared by the scans of the first distance, and the search makes one cloud of those of the second."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
+_NLOS_LEAVES = 0.5
+"""Share of the information of normal errors that ranges have where those with a detour are not known."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; limit of the area of the robot in a map without a grid."""
 
@@ -151,10 +153,9 @@ class PlaceSearch:
         walls = self.walls if few.hit.sum() >= verdict.FEW_BESIDE else None
         poses = hypotheses.refined(poses, ranges, walls, few)
         hessian, _ = range_model.range_factors(poses, ranges)
-        covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
+        covariances = np.linalg.inv(_NLOS_LEAVES * hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
         effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
-        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma)
-        fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
 
 

@@ -30,7 +30,9 @@ _TO_COME = 1e-3
 STILL = 1e-3
 """Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
 _VIOLATION = 0.05
-"""Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
+"""Share of points in free space from which visits do not show the same place; glass and doors cause half of it."""
+_COME_AND_GONE = 2.0
+"""Ratio to the share within one visit that people explain: those of either visit are not there on the other one."""
 _ENOUGH_VISITS = 5
 """Least number of keyframes of either visit for which their free-space violation counts."""
 
@@ -165,10 +167,10 @@ def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) ->
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
-    """Compare the free space of one visit to a place with the points of another."""
-    recordings, poses = task.recordings, estimate.graph.poses
-    share, visits = visibility.free_space_violation(estimate.lidar.clouds, poses, recordings.path, recordings.of_keyframe)
-    task.stages.end("map consistency", visits=visits, free_space_violation=share)
-    if share > _VIOLATION and visits >= _ENOUGH_VISITS:
-        task.stages.note("free-space-violation", share=share, visits=visits)
+    """Compare the free space of one visit to a place with the points of another: what moves shows within one visit as well."""
+    recordings, poses, clouds = task.recordings, estimate.graph.poses, estimate.lidar.clouds
+    share, moving, visits = visibility.free_space_violation(clouds, poses, recordings.path, recordings.of_keyframe)
+    task.stages.end("map consistency", visits=visits, free_space_violation=share, within_one_visit=moving)
+    if share > max(_VIOLATION, _COME_AND_GONE * moving) and visits >= _ENOUGH_VISITS:
+        task.stages.note("free-space-violation", share=share, moving=moving, visits=visits)
     return estimate
