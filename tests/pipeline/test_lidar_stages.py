@@ -66,7 +66,9 @@ def test_scans_between_keyframes_show_where_the_robot_was_when_stamps_of_the_odo
     ]
     assert turned[1] < 0.6 * turned[0]
     np.testing.assert_allclose(after.dense_trajectory(graph.poses, one.frames.stamps), graph.poses, atol=1e-9)
-    assert np.isin(after.between.frames.stamps, after.trajectory_stamps).all()
+    np.testing.assert_array_equal(after.trajectory_stamps, stamps)
+    thinner = replace(after, log=replace(log, odometry=log.odometry.rows(slice(None, None, 2))))
+    assert np.isin(after.between.frames.stamps, thinner.trajectory_stamps).all()
 
 
 @pytest.mark.parametrize("torn", [False, True])

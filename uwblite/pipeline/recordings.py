@@ -31,8 +31,8 @@ class RecordingPolicy:
 
     apart: ClassVar[float] = 1000.0
     """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
-    sparse: ClassVar[float] = 0.15
-    """s between samples of the odometry that interpolation does not bridge well."""
+    sparse: ClassVar[float] = 0.11
+    """s between samples of an odometry slower than 10 Hz, which interpolation does not bridge well."""
     alike: ClassVar[int] = 20
     """Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
     same_moment: ClassVar[float] = 1e-6
@@ -87,11 +87,8 @@ class Recording:
 
     @property
     def trajectory_stamps(self) -> Floats:
-        """(n,) s of its odometry, and of keyframes where its samples are too far apart to interpolate between, or of all scans
-        that measure poses between these."""
-        stamps, own = self.log.odometry.stamps, self.frames.stamps
-        if self.between is not None:
-            return np.union1d(stamps, self.between.frames.stamps)
+        """(n,) s of its odometry, and of keyframes and scans where its samples are too far apart to interpolate between."""
+        stamps, own = self.log.odometry.stamps, (self.between or self).frames.stamps
         after = np.searchsorted(stamps, own)
         inside = (after > 0) & (after < len(stamps))
         gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
