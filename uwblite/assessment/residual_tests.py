@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
@@ -123,7 +124,10 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         return
     whitened = wheels.residuals(estimate.graph)
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED
-    far = np.flatnonzero(measured & (np.abs(whitened).max(axis=1, initial=0.0) > _JUMP))
+    # Wheels that slip count too much; a robot that moved farther than they count was carried, or all anchors were.
+    moved, counted = se2.between(estimate.graph.poses[wheels.i], estimate.graph.poses[wheels.j]), wheels.corrected(estimate.graph)
+    carried = np.hypot(moved[:, 0], moved[:, 1]) > np.hypot(counted[:, 0], counted[:, 1]) + _CARRIED
+    far = np.flatnonzero(np.where(measured, np.abs(whitened).max(axis=1, initial=0.0) > _JUMP, carried))
     if estimate.placed.any() and len(far):
         yield _slips(far, whitened, wheels, recordings)
 
@@ -140,7 +144,7 @@ def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Record
     way, turn = (float(values.max()) for values in _error_of(wheels, at, whitened))
     text = (
         f"at t = {when} s the ranges contradict the odometry by up to {way:.2f} m and {turn:.2f} rad: the wheels slipped or "
-        "were stuck, or the robot was carried"
+        "were stuck, or the robot or all anchors were carried"
     )
     add = doubt if max(way, turn) > _CARRIED else warning
     spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
