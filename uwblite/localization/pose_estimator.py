@@ -29,8 +29,8 @@ _FRESH_WAY = _UNFELT = 0.1
 motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _STILL = 1e-3
 """m; a robot that has driven less stands."""
-_LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
-"""Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
+_LEAST_FRESH = 0.02
+"""Least share of a scan that is new; those of a robot that stands repeat one another."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
@@ -147,8 +147,8 @@ class PoseEstimator:
         if not len(self._bank):
             return
         driven, self._scan_way = self._way - self._scan_way, self._way
-        before, least = self._bank, _LEAST_FRESH if driven > _STILL else _STANDING_FRESH
-        self._bank, found = self._matched(before, walls, rays, some, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
+        before, fresh = self._bank, float(np.clip(driven / _FRESH_WAY, _LEAST_FRESH, 1.0))
+        self._bank, found = self._matched(before, walls, rays, some, fresh)
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
             pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)

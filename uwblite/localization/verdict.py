@@ -11,16 +11,15 @@ import numpy as np
 
 from ..arrays import Floats
 from . import hypotheses
-from .hypotheses import Hypotheses
+from .hypotheses import SAME, Hypotheses
 from .range_model import Ranges, range_errors, range_likelihood, series, shared_likelihood
 from .walls import Rays, Walls
 
 CERTAIN, LIKELY = (float(np.log(odds)) for odds in (400.0, 20.0))
 """Log-likelihoods of a certain place, and of a likely one."""
-_FOUND = (0.25, 0.1)
-"""m and rad; a pose that is less certain is not found yet."""
-_VAGUE = (0.4, 0.25)
-"""m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
+_FOUND, _VAGUE = 2.0, 1.25
+"""Standard deviations that a pose must be known to within one place (hypotheses.SAME) to be found, and not to be lost again: by
+more than 20 : 1, and by 4 : 1."""
 _RANGE_ELSEWHERE = -1.35
 """Log-likelihood of an independent range at the best place of a building that is not the map's."""
 _ALONE = 0.8
@@ -49,14 +48,14 @@ def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
 def imprecise(covariance: Floats) -> str:
     """Return why the only place is not found yet, by its covariance (3, 3), m and rad; "" = it is known well enough."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = sigma[:2].max() <= _FOUND[0] and sigma[2] <= _FOUND[1]
+    known = _FOUND * sigma[:2].max() <= SAME[0] and _FOUND * sigma[2] <= SAME[1]
     return "" if known else "place or heading is not sure yet; drive on"
 
 
 def vague(covariance: Floats) -> str:
     """Return why a pose that is tracked is not known, by its covariance (3, 3), m and rad; "" = it is known."""
     place, heading = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
-    if place <= _VAGUE[0] and heading <= _VAGUE[1]:
+    if _VAGUE * place <= SAME[0] and _VAGUE * heading <= SAME[1]:
         return ""
     return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
 
