@@ -154,7 +154,7 @@ class PlaceSearch:
         hessian /= _FLAT if walls is None else 1.0
         covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
         effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
-        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma, effect)
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
 
 

@@ -107,13 +107,13 @@ class PoseEstimator:
 
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
-        self._bank = self._moved(step, 0.0)
+        self._bank = hypotheses.moved(self._bank, step)
         self.work += hypotheses.PER_MOVE * self._bank.covariance.size * self._bank.mean.shape[1]
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
         """Add unmeasured motion, a standard deviation in m and rad; measurements before and after it cannot be combined."""
-        self._bank = self._moved(_STANDS, sigma)
+        self._bank = hypotheses.moved(self._bank, _STANDS, sigma)
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
@@ -151,7 +151,7 @@ class PoseEstimator:
         self._bank, found = self._matched(before, walls, rays, some, fresh)
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
-            pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)
+            pushed, there = self._matched(hypotheses.moved(self._bank, _STANDS, _UNFELT), walls, rays, some, 1.0)
             if there.odds[0] > max(0.0, found.odds[0] + verdict.CERTAIN / hypotheses.INDEPENDENT):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
@@ -215,9 +215,6 @@ class PoseEstimator:
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         reason = verdict.vague(covariance) if self.tracks else self._reason
         return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
-
-    def _moved(self, step: Floats, slack: float) -> Hypotheses:
-        return hypotheses.moved(self._bank, step, slack, self.known.anchors.slow_sigma)
 
     def _matched(self, bank: Hypotheses, walls: Walls, rays: Rays, some: Rays, fresh: float) -> tuple[Hypotheses, Agreement]:
         """Return hypotheses corrected by a scan, and how some of its rays, turned as the laser is, agree with the map there."""
