@@ -30,8 +30,8 @@ NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
 _JUMP, _CARRIED = 20.0, 0.5
 """Standard deviations that a step of wheels on the floor never exceeds; and the size, m or rad, too large for slip."""
-_MEASURED = 0.15
-"""Steps more uncertain than that, m, are no measurements."""
+_MEASURED = 1.0
+"""Steps more uncertain than wheels that slip, m, are no measurements."""
 _SCALE = 0.15
 """Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
 
@@ -121,10 +121,13 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
             )
             yield doubt("loose-links", text, at=at.tolist())
         return
-    whitened = wheels.residuals(estimate.graph)
-    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED
-    far = np.flatnonzero(measured & (np.abs(whitened).max(axis=1, initial=0.0) > _JUMP))
-    if estimate.placed.any() and len(far):
+    whitened, noise = wheels.residuals(estimate.graph), 1.0 / wheels.sqrt_information[:, 0, 0]
+    if not len(noise) or not estimate.placed.any():
+        return
+    # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
+    off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
+    far = np.flatnonzero((noise < _MEASURED) & (off > _JUMP))
+    if len(far):
         yield _slips(far, whitened, wheels, recordings)
 
 
