@@ -19,9 +19,11 @@ from uwblite.arrays import (
     require_shape,
     rms_length,
     row_medians,
+    run_starts,
     runs_of,
     spread,
     spread_about_median,
+    stable_order,
     unique_rows,
     white_noise,
 )
@@ -43,6 +45,20 @@ def test_the_factor_is_that_of_normal_errors():
 def test_spreads_by_hand():
     assert spread(np.array([-1.0, 2.0, 4.0])) == pytest.approx(2.0 * 1.4826)
     assert spread_about_median(np.array([9.0, 10.0, 13.0])) == pytest.approx(1.4826)
+
+
+@pytest.mark.parametrize("most", [1, 50, 2**31 - 1, 2**62])
+@pytest.mark.parametrize("n", [0, 1, 7, 300])
+def test_keys_sort_in_the_order_of_numpy_however_large(n, most):
+    keys = np.random.default_rng(n).integers(0, most, n)
+    np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
+
+
+def test_a_run_begins_wherever_a_column_changes():
+    one, other = np.array([0, 0, 1, 1, 1, 1]), np.array([5, 5, 5, 6, 6, 5])
+    assert run_starts(one).tolist() == [0, 2]
+    assert run_starts(one, other).tolist() == [0, 2, 3, 5]
+    assert run_starts(one[:0], other[:0]).tolist() == []
 
 
 def test_half_of_the_errors_may_be_outliers():
