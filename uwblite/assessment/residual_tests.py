@@ -131,16 +131,11 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         yield _slips(far, whitened, wheels, recordings)
 
 
-def _error_of(wheels: OdometryEdges, at: Ints, whitened: Floats) -> tuple[Floats, Floats]:
-    """Return way (s,), m, and turn (s,), rad, by which steps (s,) of the odometry are off."""
-    off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
-    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
-
-
 def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Recordings) -> Finding:
     """Return the finding on single steps (s,) that are far off by the ranges, where no scans tie their sides."""
     when = listed([seconds(recordings, k) for k in wheels.i[at].tolist()])
-    way, turn = (float(values.max()) for values in _error_of(wheels, at, whitened))
+    off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
+    way, turn = float(np.hypot(off[:, 0], off[:, 1]).max()), float(np.abs(off[:, 2]).max())
     text = (
         f"at t = {when} s the ranges contradict the odometry by up to {way:.2f} m and {turn:.2f} rad: the wheels slipped or "
         "were stuck, or the robot was carried"
