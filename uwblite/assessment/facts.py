@@ -293,7 +293,6 @@ def exchanged_names(begin: float, at: float, end: float, what: str, anchors: Seq
 def wheels_against_ranges(begin: float, at: float, end: float, what: str, value: float) -> Finding:
     """Warn of wheels that the ranges to the anchors contradict, more than clocks, names and moved anchors would explain."""
     text = {
-        "ways": f"from t = {begin:.0f} to {end:.0f} s the wheels count {value:.2f} times the way that they count otherwise",
         "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
         "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
         "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
