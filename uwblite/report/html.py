@@ -87,7 +87,6 @@ def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
         _section("Loop closures", _closure_table(result)),
-        _section("Stages", _stage_table(result)),
         _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
     title = escape(heading.title)
@@ -234,26 +233,6 @@ def _closure_table(result: MapResult) -> str:
     ]
     listing = _table(("keyframes", "outcome", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")
     return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
-
-
-def _stage_table(result: MapResult) -> str:
-    rows = []
-    for stage in result.stages:
-        values = {name: v for name, v in stage.figures.items() if isinstance(v, int | float) and not isinstance(v, bool) and v}
-        chi2, dof = values.pop("chi2", None), values.pop("dof", 0)
-        ratio = f"{chi2:.0f} / {dof} = {_number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
-        shown = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
-        if ratio or shown:
-            rows.append((stage.name, ratio, shown))
-    table = _table(("stage", "\u03c7\u00b2 / degrees of freedom", "figures"), rows, "")
-    return f"<details><summary>{len(rows)} stages</summary>{table}<p class=hint>{_ABOUT_STAGES}</p></details>"
-
-
-_ABOUT_STAGES = (
-    "Each line is what its stage did; later ones add keyframes and weigh anew. \u03c7\u00b2 below the degrees of freedom is"
-    " intended: ranges, and scans that are matched several times, have errors in common and are given less weight for it."
-    " Lengths are in metres; report.json has all figures, and the time of each stage."
-)
 
 
 def _residuals(result: MapResult) -> str:
