@@ -16,13 +16,11 @@ from ..arrays import Floats, Ints
 from ..findings import DOUBT, Finding, folded
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .canvas import PATHS
-from .drawn_map import drawn_map, shown_closures, thin
+from .drawn_map import MOST_SHOWN, drawn_map, shown_closures, thin
 from .page import SCALED, ZOOM, document, key
 from .printable import duration, escape, sigma_text, sigmas, signed
 from .svg_map import map_svg
 
-_MOST_RESIDUALS = 1500
-"""Residuals of one anchor drawn at most."""
 _USUAL, _LEAST_LIMIT = 0.99, 0.1
 """Share of the residuals that agree which lies within half the scale of their plot, and the least scale, m."""
 _PLOT = 1000, 60
@@ -250,7 +248,7 @@ def _residuals(result: MapResult) -> str:
     for index, anchor in enumerate(result.anchors):
         rows = np.flatnonzero((table["anchor"] == index) & np.isfinite(table["residual"]))
         if len(rows):
-            parts.append(_residual_plot(escape(anchor.id), table, rows[thin(len(rows), _MOST_RESIDUALS)], ends))
+            parts.append(_residual_plot(escape(anchor.id), table, rows[thin(len(rows), MOST_SHOWN)], ends))
     return "".join(parts)
 
 
