@@ -138,11 +138,6 @@ def spread_about_median(values: Floats) -> float:
     return spread(values - np.median(values))
 
 
-def sigma_of_median(values: Floats) -> float:
-    """Return the standard deviation of the median of values (m,)."""
-    return MEDIAN_TO_MEAN * spread_about_median(values) / float(np.sqrt(len(values)))
-
-
 def white_noise(values: Floats) -> float:
     """Return the robust standard deviation of the noise of a smooth series (m,), m > 2, by its second differences.
 
