@@ -279,7 +279,7 @@ def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tu
     (a, b), c = part[:, 0, :2].T, part[:, 1, 1]
     lacking = ~((a > 0.0) & (a * c > b * b) & (np.linalg.det(part) > 0.0))
     if not lacking.any():
-        return part, -np.linalg.solve(information, gradient[..., None])[..., 0]
+        return part, np.asarray(-np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
     step = np.empty_like(gradient)
     step[~lacking] = -np.linalg.solve(information[~lacking], gradient[~lacking, :, None])[..., 0]
     step[lacking], root = nondegenerate_step(information[lacking], spurious[lacking], gradient[lacking])
