@@ -147,9 +147,10 @@ def scan_factors(walls: Walls, poses: Floats, rays: Rays, width: float) -> tuple
     Along an aisle H is the scatter of the walls' normals, which is left out (lidar.degeneracy).
     """
     hessian, spurious, gradient, weight = walls.factors(poses, rays, width)
-    hessian, gradient = measured_part(hessian, spurious, gradient)
     share = np.minimum(INDEPENDENT / np.maximum(weight, 1.0), 1.0) / WALL_SIGMA**2
-    return hessian * share[:, None, None], gradient * share[:, None]
+    information, step = measured_part(hessian, spurious, gradient)
+    information *= share[:, None, None]
+    return information, -np.einsum("hij,hj->hi", information, step)
 
 
 def refined(poses: Floats, ranges: Ranges, walls: Walls | None = None, rays: Rays | None = None) -> Floats:
