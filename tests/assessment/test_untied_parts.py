@@ -9,14 +9,7 @@ from helpers.planted_graphs import plain_ranges, relative_edges
 from helpers.planted_tasks import estimate_of, recordings_of, task_of
 
 from uwblite import se2
-from uwblite.assessment.untied_parts import (
-    _PER_METRE,
-    _PER_SECOND,
-    check_untied_parts,
-    check_untied_recordings,
-    dead_reckoning_error,
-    untied_steps,
-)
+from uwblite.assessment.untied_parts import check_untied_parts, check_untied_recordings, untied_steps
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
@@ -155,30 +148,13 @@ def test_an_end_without_any_measurement_anywhere_is_another_doubt():
     assert doubts() == []
 
 
-def test_dead_reckoning_error_is_what_a_drifting_heading_does():
-    """To first order: places rebuilt from headings that drift by little."""
-    rng = np.random.default_rng(4)
-    durations = rng.uniform(0.5, 2.0, 60)
-    steps = rng.uniform(0.1, 0.4, (60, 1)) * np.column_stack([np.cos(a := np.cumsum(rng.normal(0, 0.4, 60))), np.sin(a)])
-    lengths, small = np.hypot(*steps.T), 1e-4
-    places = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    moved = []
-    for drift in (_PER_METRE * lengths, _PER_SECOND * durations):
-        turned = small * (np.cumsum(drift) - drift / 2.0)
-        c, s = np.cos(turned), np.sin(turned)
-        bent = np.column_stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]])
-        moved.append(np.append(0.0, np.hypot(*(np.cumsum(bent - steps, axis=0)).T)) / small)
-    assert np.allclose(dead_reckoning_error(places, lengths, durations), np.hypot(*moved), rtol=1e-2, atol=1e-4)
-
-
-def test_a_way_around_errs_less_than_one_straight_on():
-    turn = np.linspace(0.0, 2.0 * np.pi, 101)
-    circle = np.column_stack([np.cos(turn), np.sin(turn)]) * 10.0 / np.pi
-    straight = np.column_stack([np.linspace(0.0, 20.0, 101), np.zeros(101)])
-    lengths, none = np.full(100, 0.2), np.zeros(100)
-    around, ahead = (dead_reckoning_error(places, lengths, none)[-1] for places in (circle, straight))
-    assert ahead == pytest.approx(_PER_METRE * 20.0**2 / 2.0)
-    assert around == pytest.approx(_PER_METRE * 20.0 * 10.0 / np.pi, rel=0.01)
+@pytest.mark.parametrize(("turn", "error"), [(0.0, 0.02 * 15.0**2 / 2.0), (2.0 * np.pi, 0.02 * 15.0**2 / (2.0 * np.pi))])
+def test_a_way_around_errs_less_than_one_straight_on(turn, error):
+    """15 m without ranges at the end."""
+    heading = np.maximum(STAMPS - 49.0, 0.0) / 50.0 * turn
+    poses = np.column_stack([np.cumsum(0.3 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0), heading])
+    (found,) = doubts(measured((0, 52)), poses=poses)
+    assert found["error"] == pytest.approx(error, rel=0.05)
 
 
 def doubted(heard, closures=(), few=()):

@@ -23,7 +23,7 @@ def test_without_noise_the_start_is_the_truth():
     np.testing.assert_allclose(se2.between(truth, start.poses), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_headings_end_in_the_same_minimum(seed):
     graph = loop(seed, n=400, anchors=0)[0]
     graph = replace(graph, edges=graph.edges[:2])

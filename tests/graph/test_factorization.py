@@ -158,7 +158,7 @@ def planted(seed):
     return blocks, values, lower + np.tril(lower, -1).T
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_entries_are_those_of_the_lower_triangle_each_once(seed):
     blocks, values, matrix = planted(seed)
     rows, columns, places = blocks.entries()
@@ -169,13 +169,13 @@ def test_entries_are_those_of_the_lower_triangle_each_once(seed):
     np.testing.assert_array_equal(found, np.tril(matrix))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_compressed_columns_hold_both_triangles(seed):
     blocks, values, matrix = planted(seed)
     np.testing.assert_array_equal(SparseLayout(blocks).matrix(values).toarray(), matrix)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_band_solves_the_matrix_inside(seed):
     blocks, values, matrix = planted(seed)
     inner = blocks.size - 2

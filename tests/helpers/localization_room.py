@@ -1,6 +1,7 @@
 """A room with known walls and anchors, and a robot that drives through it: what a live localisation is tested with."""
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -43,7 +44,13 @@ def known_map(anchors, grid):
 def known(walls=ODD, anchors=ANCHORS):
     """Return the room as a localisation knows it."""
     stored = tuple(StoredAnchor(n, np.array(p, dtype=float), np.eye(2) * 1e-4, "ok", 0.0, 0.05) for n, p in anchors.items())
-    return known_map(stored, None if walls is None else grid_of(walls))
+    return KnownMap(known_anchors(stored, {}), None if walls is None else drawn(walls), np.zeros(3))
+
+
+@cache
+def drawn(walls):
+    """Return the walls as a localisation looks them up."""
+    return walls_of(grid_of(walls))
 
 
 def cast(pose, walls=ODD):

@@ -113,7 +113,7 @@ def test_recordings_have_colours_of_their_own():
 
 
 @given(st.integers(0, 10_000), st.floats(0.5, 3000.0))
-@settings(max_examples=30)
+@settings(max_examples=25)
 def test_a_polygon_is_what_lies_within_all_its_edges(seed, size):
     rng = np.random.default_rng(seed)
     angle = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))[:: rng.choice([-1, 1])]

@@ -37,9 +37,9 @@ _MOST = 64
 _ANCHORS, _MEASURED = 2, 3
 """Least number of anchors that end or appear together, or by which more agree than do not; and of ranges to each of them, also
 of constrained keyframes at an end of a recording."""
-_PER_METRE, _PER_SECOND = 0.02, 0.001
-"""rad/m, rad/s; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives
-straight on at 0.2 m/s exceeds the limit below after 7 m; one without other sensors for 10 s is off by some centimetres."""
+_PER_METRE = 0.02
+"""rad/m; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives straight
+on exceeds the limit below after 7 m."""
 _ASTRAY = 0.5
 """m; error of a place from which on the map counts as wrong there."""
 
@@ -87,7 +87,8 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
         for word, edge, rows in (("until", "start", np.arange(first, -1, -1)), ("from", "end", np.arange(last, len(places)))):
             steps, (begin, end) = np.minimum(rows[1:], rows[:-1]), sorted(frames.stamps[rows[[0, -1]]].tolist())
             way, at = float(frames.path[steps].sum()), float(frames.stamps[rows[0]])
-            off = float(dead_reckoning_error(places[rows], frames.path[steps], frames.duration[steps]).max())
+            # A heading that drifts evenly moves the end of a straight path aside by half of the last turn.
+            off = 0.5 * _PER_METRE * way * float(np.hypot(*(places[rows] - places[rows[0]]).T).max())
             if off > _ASTRAY:
                 seconds = at - frames.stamps[0]
                 loose = doubt(
@@ -101,24 +102,6 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
                 )
                 cure = f"`{edge}={seconds:.0f}` leaves that part out"
                 yield replace(loose, recording=recording.number + 1, stretches=((begin, end),), cure=cure)
-
-
-def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
-    """Return the error (k,) of usual wheels at each place (k, 2) of a path, from its first on, m.
-
-    A wrong turn at one place moves each later one to the side by its distance from there; for a heading that drifts evenly
-    along the path these moves add up with their signs: a path around and back has a smaller error than a straight one.
-
-    Parameters
-    ----------
-    lengths, durations : (k-1,) m, s; from each place to the next.
-    """
-    middles = (places[1:] + places[:-1]) / 2.0
-    moved = np.zeros((2, len(places)))
-    for row, turns in zip(moved, (_PER_METRE * lengths, _PER_SECOND * durations), strict=True):
-        arms = np.cumsum(turns)[:, None] * places[1:] - np.cumsum(turns[:, None] * middles, axis=0)
-        row[1:] = np.hypot(arms[:, 0], arms[:, 1])
-    return np.asarray(np.hypot(*moved))
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
@@ -172,9 +155,9 @@ def _tied(estimate: Estimate, slips: Floats, i: Ints, j: Ints) -> Bools:
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     """Return the steps (s,) of the odometry that the map contradicts and whose sides nothing else connects.
 
-    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known slips,
-    is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end of a
-    recording are no part.
+    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known
+    slips, is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end
+    of a recording are no part.
     """
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))

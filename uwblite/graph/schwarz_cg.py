@@ -99,7 +99,7 @@ def local_blocks(matrix: sparse.csc_matrix, number: Ints) -> Floats:
     column, row = np.repeat(place[:-1], np.diff(matrix.indptr)), place[matrix.indices]
     inside = np.flatnonzero((column >= 0) & (row // wide == column // wide))
     flat = np.bincount(row[inside] * wide + column[inside] % wide, matrix.data[inside], count * wide * wide)
-    blocks: Floats = flat.reshape(count, wide, wide)
+    blocks = flat.astype(np.float64, copy=False).reshape(count, wide, wide)
     blocks[:, np.arange(wide), np.arange(wide)] += number == size
     return blocks
 

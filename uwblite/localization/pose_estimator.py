@@ -20,8 +20,8 @@ from .comparison import Comparison, PlaceSearch
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .range_model import repeated
-from .running_fit import FIT_LOST, FIT_SOUND, SUPPORT, full_agreement
-from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
+from .running_fit import SUPPORT, full_agreement
+from .walls import ELSEWHERE, INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 _FRESH_WAY = _UNFELT = 0.1
@@ -152,10 +152,10 @@ class PoseEstimator:
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
             pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)
-            if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
+            if there.odds[0] > max(0.0, found.odds[0] + verdict.CERTAIN / hypotheses.INDEPENDENT):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
-        if self.tracks and (found.fit[0] < FIT_LOST or found.known[0] < 0.5 * int(some.hit.sum())):
+        if self.tracks and (found.odds[0] < ELSEWHERE or found.known[0] < 0.5 * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
@@ -163,7 +163,7 @@ class PoseEstimator:
         best = int(np.argmax(self._bank.log_weight))
         if self.tracks:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
-        self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), odometer.stamp)
+        self._running.add_scan(float(found.odds[best]), odometer.stamp)
 
     def search_or_check(self, *, free: bool) -> None:
         """Look whether the pose still holds; do some units of a search, or begin one where it is time for it.
@@ -210,7 +210,7 @@ class PoseEstimator:
         order = np.argsort(-bank.log_weight, kind="stable")
         best = int(order[0])
         share, covariance = hypotheses.mixed(bank, best)
-        fit = np.exp(running.fit - FIT_SOUND) if self._window.looks else running.ranges / SUPPORT
+        fit = np.exp(running.scans) if self._window.looks else running.ranges / SUPPORT
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self.tracks else 0.5)
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         reason = verdict.vague(covariance) if self.tracks else self._reason
@@ -249,18 +249,16 @@ class PoseEstimator:
             return
         self._bank = found.hypotheses
         best = int(np.argmax(self._bank.log_weight))
-        known, ranges, pose = float(found.known[best]), found.ranges, self._bank.poses[best].copy()
+        ranges, pose = found.ranges, self._bank.poses[best].copy()
         undecided = verdict.undecided(self._bank, best, found.complete)
         # Agreement from before the part that is used speaks of a place from which the robot was carried away.
         agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
-        # Rays that end beyond the map say nothing about it.
-        rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
-        odds = verdict.map_odds(float(found.fit[best]), known, rays, pose, ranges, agreed)
+        odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed)
         self._reason = (
             undecided
             or verdict.imprecise(self._bank.pose_covariances[best])
             or odds.nowhere
-            or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges)
+            or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
         )
         # That the robot was carried within the window is as unlikely as what counts as certain.
         if not self._reason and odds.total < verdict.CERTAIN * (1 + (self._parts > 1)):
