@@ -126,7 +126,8 @@ def _pairs(built: Clouds, i: Ints, j: Ints) -> tuple[CloudRasters, CloudPairs]:
 def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
     """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
     target, source = (raster.clouds.chosen(of) for of in (pair.i, pair.j))
-    places = search(target, source, guess, (ScanStepPolicy.search,) * len(guess)).poses
+    half = ScanStepPolicy.search
+    places = search(target, source, guess, (half, half, half)).poses
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))
