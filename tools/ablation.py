@@ -93,7 +93,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "walls that poses bend": LeftOut(patches=(
         ("lidar.walls._curved", lambda lines, places: np.ones(len(lines.centre), dtype=bool)),
     )),
-    "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment._measured_again", lambda joint, *given: joint),)),
+    "pairs measured again": LeftOut(patches=(("pipeline.surface_adjustment.measured_again", lambda joint, *given: joint),)),
     "noise of wheels by rays": LeftOut(patches=(("pipeline.surface_adjustment.noise_at", lambda graph, wheels, sure: wheels),)),
     "points between beams": LeftOut(patches=(("lidar.clouds.filled", lambda rays: rays),)),
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
@@ -102,6 +102,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "long stretches": LeftOut(patches=(("loop_closure.candidates.any_uncertain", lambda *given: False),)),
     "joint refinement": LeftOut(("refinement.rounds=0",)),
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
+    "scans between keyframes": _stage("lidar_stages.place_scans_between"),
     "corners": LeftOut(("clouds.linearity=0.85",)),
     "deskewing": LeftOut(log=flat),
     "broken stretches": _stage("broken_stretches.replace_broken_stretches"),

@@ -24,7 +24,6 @@ from ..problem.solution import rough, stretch
 from ..sensor_log import SensorLog
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
-from .recordings import Recording
 
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
@@ -44,8 +43,6 @@ class TurningPolicy:
     """m; a mounting, or the origin of a base, is not known better than this."""
     by_tape: ClassVar[float] = 0.03
     """Standard deviation of a mounting that is given and right, m."""
-    significant: ClassVar[float] = CandidatePolicy.sigmas
-    """Standard deviations from which an offset of the lidar is significant."""
     wrong_frame: ClassVar[float] = 0.1
     """Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
     slips: ClassVar[float] = 0.5
@@ -86,7 +83,7 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
     given = all(np.any(r.log.mounting.T_base_laser != 0.0) for r in task.recordings.each if r.has_scans)
     if not given or not slips.any() or abs(offset) < policy.small or graph.fixed_calibration[at]:
         return estimate
-    if abs(offset) < policy.significant * marginals(estimate.problem).covariances.calibration[at]:
+    if abs(offset) < CandidatePolicy.sigmas * marginals(estimate.problem).covariances.calibration[at]:
         return estimate
     widths = np.array([config.sideways_per_turn, min(policy.by_tape, config.laser_offset), config.laser_offset])
     odds = np.array([policy.slips, 1.0 - policy.wrong_frame, policy.wrong_frame])
@@ -139,7 +136,10 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     other = estimate.other_heights
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
-            high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
+            screening = recording.log.screening
+            ratio = float("nan") if screening is None else screening.lidar_by_wheels
+            lidar_agrees = abs(ratio - factor) < abs(ratio - 1.0)
+            high = other is not None and not other.taken and not lidar_agrees
             task.stages.note(
                 "odometry-unit",
                 recording=recording.number + 1,
@@ -149,13 +149,6 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
                 high=other.high if other is not None and high else None,
             )
     return factors
-
-
-def _lidar_agrees(recording: Recording, factor: float) -> bool:
-    """Return whether lidar distances that are a factor longer than the odometry's are likelier than equal ones."""
-    screening = recording.log.screening
-    ratio = float("nan") if screening is None else screening.lidar_by_wheels
-    return abs(ratio - factor) < abs(ratio - 1.0)
 
 
 def late(estimate: Estimate, task: Task) -> float:

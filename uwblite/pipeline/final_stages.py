@@ -130,27 +130,23 @@ def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
 
 def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     """Estimate anchors and their calibration once more at the poses found, errors steady by direction counted as well."""
-    if task.config.ranges.steady == 0.0:
+    if task.config.ranges.steady == 0.0 or estimate.ranges is None:
         return estimate
     estimate = with_range_noise(estimate, task.config, steady=True)
+    assert estimate.ranges is not None
     graph, at_poses = estimate.graph, at_given_poses(estimate.graph)
     if not any(free.any() for free in free_unknowns(at_poses).values()):
         return estimate
-    at_poses = _tie_heights(with_free(at_poses, HEIGHT), estimate, task)
+    # Heights of anchors are alike by what all ranges show.
+    at_poses = with_free(at_poses, HEIGHT)
+    optimum = with_alike_heights(optimize(at_poses.with_edges(estimate.ranges), task.config.solver)[0])
+    at_poses = replace(at_poses, edges=optimum.edges[: len(at_poses.edges)])
     done = replace(estimate, graph=at_poses).solved(task.config.solver)[0].graph
     # What the search itself has fixed are heights put back to 0.
     heights = graph.calibration.of_kinds(HEIGHT)
     fixed = np.where(heights, done.fixed_calibration, graph.fixed_calibration)
     graph = replace(graph, edges=at_poses.edges)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
-
-
-def _tie_heights(at_poses: Graph, estimate: Estimate, task: Task) -> Graph:
-    """Return a graph of anchors and their ranges at given poses with priors of heights by what all of them show."""
-    if estimate.ranges is None:
-        return at_poses
-    optimum = with_alike_heights(optimize(at_poses.with_edges(estimate.ranges), task.config.solver)[0])
-    return replace(at_poses, edges=optimum.edges[: len(at_poses.edges)])
 
 
 def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:

@@ -56,18 +56,20 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """
     estimate, steps = _with_clock_found(make_clouds(estimate, task), task)
     task = task.following(estimate)
-    # With ranges, which judge the path, slips are told later; a step that the clouds contradict is else cut at once.
+    # With ranges, which judge the path, steps that slipped are cut; else those that the clouds contradict.
     doubtful = steps.contradicted() & (estimate.ranges is None)
     cut = _with_keyframes_where(estimate, doubtful, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
     track, by_ranges = _followed(estimate, steps), estimate.odometry.slips
-    wheels = track.wheels if by_ranges is None else track.slipped
-    estimate = _match_neighbours(replace(estimate, odometry=wheels), track, task)
-    if estimate.ranges is None or not np.any(track.slips > NeighbourPolicy.likely):
-        return estimate
-    return _with_slips(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), task.following(estimate))
+    slipped = (track.slips > NeighbourPolicy.likely) & (estimate.ranges is not None)
+    cut = _with_keyframes_where(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), slipped, task)
+    if cut is not None:
+        estimate, task = cut, task.following(cut)
+        track = _followed(estimate, _steps(estimate, task))
+    wheels = track.slipped if by_ranges is not None or slipped.any() else track.wheels
+    return _match_neighbours(replace(estimate, odometry=wheels), track, task)
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
@@ -108,19 +110,6 @@ def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     edges = ScanEdges(i, j, found.T_i_j, root, twist[i], twist[j], names, scans.delay, kernel=kernel)
     wheels = reestimate_wheel_noise(estimate.odometry, found, estimate.graph)
     return _with_inflated_ranges(replace(estimate, odometry=wheels, steps=edges)).solved(rough(task.config.solver))[0]
-
-
-def _with_slips(estimate: Estimate, task: Task) -> Estimate:
-    """Give steps that slipped the uncertainty of that, cut them at their scans, and match neighbours once more.
-
-    Slips are told once the lidar's clock is known: an offset explains what looks like a slip wherever the robot accelerates.
-    """
-    track = _followed(estimate, _steps(estimate, task))
-    cut = _with_keyframes_where(estimate, track.slips > NeighbourPolicy.likely, task)
-    if cut is not None:
-        estimate, task = cut, task.following(cut)
-        track = _followed(estimate, _steps(estimate, task))
-    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
 def _with_clock_at(estimate: Estimate, delay: float) -> Estimate:

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
@@ -43,7 +42,6 @@ from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
 from ..lidar.surface_rays import (
     UNLEARNT,
     MeasuredSurfaces,
-    RayNoise,
     ShapePolicy,
     SurfaceRays,
     Surfaces,
@@ -209,7 +207,10 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
             break
         report(turn + 1, rules.steps + 1)
         if 0 < turn <= rules.settling:
-            joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
+            # Points on walls weigh by the information that the rays leave, those on columns hardly anything.
+            on_walls = max(1.0 - 1.0 / found.noise.alike[0], rules.least)
+            weight = np.array([on_walls, rules.least, 1.0])[kind]
+            joint = measured_again(joint, graph, estimate.lidar, task.config.refinement, weight)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, last=(), like=normal)
         task.stages.work[RAYS] += len(found.rays.keyframe)
@@ -225,14 +226,6 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
         if turn >= rules.settling and step * min(step, before) <= rules.still * before:
             break
     return graph, found
-
-
-def _measured_again(
-    joint: ScanEdges, graph: Graph, scans: ScanClouds, kind: NDArray[np.int8], noise: RayNoise, task: Task
-) -> ScanEdges:
-    """Return the pairs, with points on walls weighted by the information that the rays leave, and hardly any on columns."""
-    weight = np.array([max(1.0 - 1.0 / noise.alike[0], SurfacePolicy.least), SurfacePolicy.least, 1.0])[kind]
-    return measured_again(joint, graph, scans, task.config.refinement, weight)
 
 
 def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> Blocks:
