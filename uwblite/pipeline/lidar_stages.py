@@ -11,6 +11,7 @@ from ..graph.marginals import marginals
 from ..graph.solver import Optimizer
 from ..lidar import joint_refinement, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
+from ..problem.alternatives import EvidencePolicy
 from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.range_errors import without_pattern
 from .estimate import Estimate, Task
@@ -82,7 +83,7 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         # The analysis of other pairs of clouds cannot be used again, and it is large.
         optimizer = Optimizer()
         steady = before.solved(rough(task.config.solver))[0]
-        if evidence_against(with_range_noise(estimate, task.config), steady, task.config) <= 0.0:
+        if evidence_against(with_range_noise(estimate, task.config), steady, task.config) <= EvidencePolicy.positive:
             return _without_pattern(steady, task)
         estimate = _matched_once_more(estimate, shift, task)
         before = estimate
