@@ -30,7 +30,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 # A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 unhurried = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("uwblite", unhurried, max_examples=40)
+settings.register_profile("uwblite", unhurried, max_examples=25)
 settings.register_profile("once", settings.get_profile("uwblite"), max_examples=10)
 settings.load_profile("uwblite")
 

@@ -19,10 +19,11 @@ from uwblite.arrays import (
     require_shape,
     rms_length,
     row_medians,
+    run_starts,
     runs_of,
-    sigma_of_median,
     spread,
     spread_about_median,
+    stable_order,
     unique_rows,
     white_noise,
 )
@@ -44,8 +45,20 @@ def test_the_factor_is_that_of_normal_errors():
 def test_spreads_by_hand():
     assert spread(np.array([-1.0, 2.0, 4.0])) == pytest.approx(2.0 * 1.4826)
     assert spread_about_median(np.array([9.0, 10.0, 13.0])) == pytest.approx(1.4826)
-    # sqrt(pi / 2) = 1.2533 times the standard deviation of a mean of four values.
-    assert sigma_of_median(np.array([-1.0, -1.0, 1.0, 1.0])) == pytest.approx(1.4826 * np.sqrt(np.pi / 2.0) / 2.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("most", [1, 50, 2**31 - 1, 2**62])
+@pytest.mark.parametrize("n", [0, 1, 7, 300])
+def test_keys_sort_in_the_order_of_numpy_however_large(n, most):
+    keys = np.random.default_rng(n).integers(0, most, n)
+    np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
+
+
+def test_a_run_begins_wherever_a_column_changes():
+    one, other = np.array([0, 0, 1, 1, 1, 1]), np.array([5, 5, 5, 6, 6, 5])
+    assert run_starts(one).tolist() == [0, 2]
+    assert run_starts(one, other).tolist() == [0, 2, 3, 5]
+    assert run_starts(one[:0], other[:0]).tolist() == []
 
 
 def test_half_of_the_errors_may_be_outliers():
@@ -54,12 +67,6 @@ def test_half_of_the_errors_may_be_outliers():
     errors[:4000] = 1e6
     # The median size is then the 0.5 / 0.8 = 0.625 quantile of the sizes, 0.887 standard deviations.
     assert spread(errors) == pytest.approx(0.2 * 0.887 * 1.4826, rel=0.03)
-
-
-def test_the_median_of_many_samples_scatters_as_stated():
-    samples = np.random.default_rng(2).normal(3.0, 0.5, (2000, 101))
-    medians = np.median(samples, axis=1)
-    assert np.mean([sigma_of_median(row) for row in samples]) == pytest.approx(medians.std(), rel=0.06)
 
 
 def test_lengths_of_vectors_not_of_their_parts_are_averaged():

@@ -16,7 +16,7 @@ def test_poses_within_the_stretches_of_doubts_are_not_trusted():
     result = small_result()
     stamps = result.stamps
     spans = ((float(stamps[3]), float(stamps[5])), (float(stamps[9]), float(stamps[9])))
-    found = doubted(result, Finding("odometry-steps", "doubt", "", stretches=spans, recording=1), warning("gyro", ""))
+    found = doubted(result, Finding("path-displaced", "doubt", "", stretches=spans, recording=1), warning("gyro", ""))
     trusted = found.trusted(stamps, result.recording)
     assert np.flatnonzero(~trusted).tolist() == [k for k in (3, 4, 5, 9) if result.recording[k] == 0]
     assert [len(path) for path in found.doubted_paths()] == [3, 1]
@@ -26,7 +26,7 @@ def test_poses_within_the_stretches_of_doubts_are_not_trusted():
 def test_a_doubt_about_the_whole_leaves_no_pose_trusted_and_marks_none():
     result = small_result()
     whole = doubt("uncertain", "")
-    part = Finding("odometry-steps", "doubt", "", stretches=((0.0, 1e9),), recording=1)
+    part = Finding("path-displaced", "doubt", "", stretches=((0.0, 1e9),), recording=1)
     for findings in ((whole,), (part, whole)):
         found = doubted(result, *findings)
         assert not found.trusted(result.stamps, result.recording).any()

@@ -45,8 +45,8 @@ def result(room_result):
 
 @pytest.fixture(scope="module")
 def minute(log):
-    """The first 35 s of the room."""
-    return log.crop(0.0, 35.0)
+    """The first 25 s of the room."""
+    return log.crop(0.0, 25.0)
 
 
 def ate(result, truth) -> float:

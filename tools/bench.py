@@ -178,16 +178,20 @@ def bench_icp(repeats: int) -> None:
 
     from uwblite import se2
     from uwblite.lidar.cloud_rasters import rasterize
-    from uwblite.lidar.clouds import joined, make_cloud
+    from uwblite.lidar.clouds import CloudConfig, build
     from uwblite.lidar.scan_matching import align_pairs, pairs_of
+    from uwblite.odometry.attached import ScanPoints
 
     first, second = np.array([0]), np.array([1])
+    config = CloudConfig()
 
     def prepare(target, source, truth):
         """Return what align_pairs asks for; both views look from the middle of the hall."""
-        clouds = [make_cloud(target, np.zeros(2), 0.15), make_cloud(source, se2.inverse(truth)[:2], 0.15)]
-        both = joined(clouds)
-        return rasterize(both, 0.1, 0.5), pairs_of(both, first, second, len(source))
+        scan = np.repeat(np.arange(2), (len(target), len(source)))
+        middles = np.stack([np.zeros(2), se2.inverse(truth)[:2]])[scan]
+        points = np.concatenate([target, source])
+        both = build(ScanPoints(scan, points, middles, np.zeros_like(scan), scan), 2, config)
+        return rasterize(both, config.raster, 0.5, first), pairs_of(both, first, second)
 
     def align(prepared, guess):
         return align_pairs(*prepared, guess[None], 0.5, 0.15).pose[0]

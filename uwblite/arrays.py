@@ -1,6 +1,6 @@
 """Arrays: names for their element types, checks of those from outside, tables joined, robust spreads, runs of flags."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from functools import cache
 from typing import Any, Self, TypeVar, get_args, get_origin
@@ -23,6 +23,10 @@ WIDE = np.int64
 Wides = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+CHUNK = 1 << 14
+"""Rows that are processed together, so that they stay in the processor's cache; bounds the memory, too."""
+TINY = 1e-9
+"""Length, m, or share below which a value is rounding error."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
 MEDIAN_TO_MEAN = 1.2533
@@ -36,14 +40,16 @@ class Table:
 
     def rows(self, which: slice | Ints | Bools) -> Self:
         """Return some of the entries, of tables within it, too; fields that are neither are kept."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        tables = {name: column.rows(which) for name, column in columns.items() if isinstance(column, Table)}
-        arrays = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
-        if isinstance(which, slice):
-            return replace(self, **tables, **{name: column[which] for name, column in arrays.items()})  # type: ignore[type-var]
         # Flags are searched once, and `take` needs half the time of an index for tables of two columns.
-        numbers = np.flatnonzero(which) if which.dtype == np.bool_ else which
-        return replace(self, **tables, **{name: column.take(numbers, axis=0) for name, column in arrays.items()})  # type: ignore[type-var]
+        numbers = np.flatnonzero(which) if isinstance(which, np.ndarray) and which.dtype == np.bool_ else which
+        chosen: dict[str, Any] = {}
+        for f in fields(self):  # type: ignore[arg-type]
+            column = getattr(self, f.name)
+            if isinstance(column, Table):
+                chosen[f.name] = column.rows(numbers)
+            elif isinstance(column, np.ndarray):
+                chosen[f.name] = column[numbers] if isinstance(numbers, slice) else column.take(numbers, axis=0)
+        return replace(self, **chosen)  # type: ignore[type-var]
 
 
 def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
@@ -51,6 +57,27 @@ def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
     where = number.reshape(-1).astype(np.intp)
     return used, where[: len(one)], where[len(one) :]
+
+
+def chunks(rows: int, size: int = CHUNK) -> Iterator[slice]:
+    """Yield some rows at a time."""
+    for first in range(0, rows, size):
+        yield slice(first, min(first + size, rows))
+
+
+def run_starts(*columns: NDArray[Any]) -> Ints:
+    """Return the first row (r,) of each run of rows in which no column (n,) changes."""
+    fresh = np.ones(len(columns[0]), dtype=bool)
+    fresh[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return np.flatnonzero(fresh)
+
+
+def stable_order(keys: Wides) -> Ints:
+    """Return the stable order (n,) of keys (n,), 0 or more: key and place as one number sort in a fifth of the time."""
+    bits = len(keys).bit_length()
+    if int(keys.max(initial=0)).bit_length() + bits >= np.iinfo(WIDE).bits:
+        return np.argsort(keys, kind="stable")
+    return (np.sort((keys << bits) | np.arange(len(keys))) & ((1 << bits) - 1)).astype(np.intp, copy=False)
 
 
 def unique_rows(rows: NDArray[_Number]) -> tuple[NDArray[_Number], Ints]:
@@ -116,11 +143,6 @@ def spread(errors: Floats) -> float:
 def spread_about_median(values: Floats) -> float:
     """Return the robust standard deviation of values (m,) about their median."""
     return spread(values - np.median(values))
-
-
-def sigma_of_median(values: Floats) -> float:
-    """Return the standard deviation of the median of values (m,)."""
-    return MEDIAN_TO_MEAN * spread_about_median(values) / float(np.sqrt(len(values)))
 
 
 def white_noise(values: Floats) -> float:

@@ -122,7 +122,7 @@ class MapResult:
     """The map of one or more recordings."""
 
     stamps: Floats
-    """(n,) s, one per odometry stamp, and one per keyframe between two that are far apart."""
+    """(n,) s, one per odometry stamp, and one per keyframe or matched scan between two that are far apart."""
     trajectory: Floats
     """(n, 3) T_map_base at the stamps."""
     recording: Ints

@@ -113,6 +113,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
                 yield lidar_stages.solve_by_own_errors
                 yield surface_adjustment.adjust_surfaces
                 yield broken_stretches.replace_broken_stretches
+        yield lidar_stages.place_scans_between
         yield lidar_stages.check_map_consistency
     if not (task.recordings.have_scans and config.use_loops):
         yield anchor_places.decide_places

@@ -17,10 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import Floats
 
-_SERIES_BELOW = 1e-2
-"""Angle below which the series replace sin(t)/t and its kin; both branches agree to rounding there."""
-
-
 _ABOVE_MINUS_PI = np.nextafter(-np.pi, 0.0)
 
 
@@ -121,33 +117,23 @@ def between(a: ArrayLike, b: ArrayLike) -> Floats:
     return np.concatenate([xy, wrap_angle(b[..., 2] - a[..., 2])[..., None]], axis=-1)
 
 
-def _sine_terms(theta: Floats) -> tuple[Floats, Floats]:
-    """Return sin(t)/t and (1 - cos t)/t."""
-    theta = np.array(theta, order="C")
-    small = np.abs(theta) < _SERIES_BELOW
-    t = np.where(small, 1.0, theta)
-    t2 = theta * theta
-    a = np.where(small, 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0 * (1.0 - t2 / 42.0)), np.sin(t) / t)
-    b = np.where(small, theta / 2.0 * (1.0 - t2 / 12.0 * (1.0 - t2 / 30.0)), 2.0 * np.sin(t / 2.0) ** 2 / t)
-    return a, b
+def _chord(theta: Floats) -> Floats:
+    """Return the chord of an arc that turns by theta (...) in units of its length, (..., 1); it points half the turn aside."""
+    return np.sinc(theta / (2.0 * np.pi))[..., None]
 
 
 def exp(xi: ArrayLike) -> Floats:
     """Return the pose reached by the constant twist xi (..., 3) = vx, vy, omega in unit time."""
     xi = np.asarray(xi, dtype=np.float64)
-    a, b = _sine_terms(xi[..., 2])
-    x, y = xi[..., 0], xi[..., 1]
-    return np.stack([a * x - b * y, b * x + a * y, wrap_angle(xi[..., 2])], axis=-1)
+    theta = np.array(xi[..., 2], order="C")
+    return np.concatenate([_chord(theta) * rotate(0.5 * theta, xi[..., :2]), wrap_angle(theta)[..., None]], axis=-1)
 
 
 def log(pose: ArrayLike) -> Floats:
     """Return the twist whose exp is the pose; its angle lies in (-pi, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
     theta = wrap_angle(pose[..., 2])
-    a, b = _sine_terms(theta)
-    norm = a * a + b * b
-    x, y = pose[..., 0], pose[..., 1]
-    return np.stack([(a * x + b * y) / norm, (a * y - b * x) / norm, theta], axis=-1)
+    return np.concatenate([rotate(-0.5 * theta, pose[..., :2]) / _chord(theta), theta[..., None]], axis=-1)
 
 
 def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> Floats:

@@ -59,7 +59,7 @@ def test_a_fault_of_one_sensor_explains_what_that_sensor_shows(sensor, named):
 
 
 @pytest.mark.parametrize(("kind", "times", "still", "named"), [
-    ("odometry-steps", ((18.0, 30.0),), set(), True), ("odometry-steps", ((60.0, 70.0),), set(), False),
+    ("moved-anchor", ((18.0, 30.0),), set(), True), ("moved-anchor", ((60.0, 70.0),), set(), False),
     ("ranges-disagree", (), set(), True), ("ranges-disagree", (), {("ranges-disagree", "")}, False),
     ("free-space-violation", (), set(), False),
 ])  # fmt: skip

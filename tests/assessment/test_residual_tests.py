@@ -42,7 +42,7 @@ def test_a_sound_recording_has_no_doubts(sound, without):
 
 @pytest.mark.parametrize("lidar", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ranges_that_are_no_distances(lidar):
-    log = recording(two_rounds())
+    log = recording(two_rounds()[:4000])
     wild = np.random.default_rng(1).uniform(0.5, 15.0, len(log.ranges.stamps))
     result = build_map(replace(log, ranges=replace(log.ranges, ranges=wild)).without(lidar=not lidar))
     assert "range-scatter" in {n.kind for n in result.doubts}
@@ -75,7 +75,7 @@ def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
     loop : whether the robot stands at the 79th where it began, and a scan edge says so.
     """
     truth = np.column_stack([np.arange(80) * 0.3, np.zeros(80), np.zeros(80)])
-    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
+    wheels = chained(truth, np.array([0.01, 0.01, 0.003]))
     for step, by in slip.items():
         wheels.motion[step] += by
     pairs = [(k - span, k) for span in scans for k in range(20, 60)] + [(0, 79)] * loop
@@ -92,21 +92,11 @@ def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
 LONG = dict.fromkeys(range(30, 45), (0.0, 0.0, 0.15))
 
 
-@pytest.mark.parametrize("scans", [(1,), (1, 2)])
-def test_wheels_that_slip_are_a_warning_where_scans_fix_the_steps(scans):
-    (notice,) = judged(LONG, scans)
-    assert (notice.kind, notice.severity, notice.recording) == ("odometry-steps", "warning", 1)
-    assert 25 <= notice.figures["start"] <= 30
-    assert 44 <= notice.figures["end"] <= 50
-    assert notice.stretches == ((50.0 + notice.figures["start"], 50.0 + notice.figures["end"]),)
-    assert f"`end={notice.figures['start']:.0f}`" in notice.cure
-
-
-@pytest.mark.parametrize(("options", "kind"), [
-    ({"scans": (1, 2), "root": (0.0, 100.0, 1000.0)}, "loose-links"), ({"lidar": False}, "odometry-steps"),
+@pytest.mark.parametrize(("options", "kinds"), [
+    ({"scans": (1,)}, []), ({"scans": (1, 2)}, []), ({"scans": (1, 2), "root": (0.0, 100.0, 1000.0)}, ["loose-links"]),
 ])  # fmt: skip
-def test_many_steps_that_no_scan_fixes_are_a_doubt(options, kind):
-    assert [n.kind for n in judged(LONG, **options) if n.severity == "doubt"] == [kind]
+def test_many_steps_that_no_scan_fixes_are_a_doubt(options, kinds):
+    assert [n.kind for n in judged(LONG, **options)] == kinds
 
 
 @pytest.mark.parametrize(("way", "found"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])

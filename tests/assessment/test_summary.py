@@ -36,7 +36,7 @@ LEVEL = SensorMounting(anchor_height=0.0)
 """Anchors at the height of the tag, which is given."""
 
 
-def planted_run(seed=1, metres=100.0, sigma=0.04, **more):
+def planted_run(seed=1, metres=60.0, sigma=0.04, **more):
     """Return stamps, truth and the recording of a path among four anchors."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, metres)

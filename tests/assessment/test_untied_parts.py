@@ -4,42 +4,35 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from helpers.planted_graphs import plain_ranges, relative_edges
 from helpers.planted_tasks import estimate_of, recordings_of, task_of
 
-from uwblite.assessment.untied_parts import (
-    _PER_METRE,
-    _PER_SECOND,
-    check_untied_parts,
-    check_untied_recordings,
-    dead_reckoning_error,
-)
+from uwblite import se2
+from uwblite.assessment.untied_parts import check_untied_parts, check_untied_recordings, untied_steps
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.graph.range_edges import RangeEdges
 from uwblite.loop_closure.closures import no_closures
 from uwblite.sensor_log import LaserScans
 
 STAMPS = np.arange(100.0)
 POSES = np.column_stack([0.3 * STAMPS, np.zeros(100), np.zeros(100)])
+PLACES = np.array([[5.0, 8.0], [22.0, -6.0], [12.0, 9.0], [18.0, 7.0]])
 
 
 def measured(*spans):
     """Ranges of anchors from and until a time (s), each second."""
     at = [np.arange(*span, dtype=np.float64) for span in spans]
     stamps, anchor = np.concatenate(at), np.repeat(np.arange(len(spans)), [len(a) for a in at])
-    count = len(stamps)
-    zero = np.zeros(count)
-    return RangeEdges(
-        stamps.astype(np.intp), anchor, zero + 1.0, zero + 1.0, np.zeros((count, 2)), zero, np.zeros((count, 2)), np.zeros(2),
-        zero, np.full((count, 6), -1), stamps=stamps,
-    )  # fmt: skip
+    pose = stamps.astype(np.intp)
+    return replace(plain_ranges(pose, anchor, np.hypot(*(POSES[pose, :2] - PLACES[anchor]).T), 0.1), stamps=stamps)
 
 
-def scan_edge(i, j):
+def scan_edge(i, j, root=(100.0, 100.0, 300.0)):
     none = np.zeros((1, 3))
-    return ScanEdges(np.array([i]), np.array([j]), none, np.eye(3)[None], none, none, scan_indices(Calibration()))
+    z = se2.between(POSES[[i]], POSES[[j]])
+    return ScanEdges(np.array([i]), np.array([j]), z, np.diag(root)[None], none, none, scan_indices(Calibration()))
 
 
 def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
@@ -47,7 +40,9 @@ def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
     readings = None if scans_at is None else np.ones((len(scans_at), 3), np.float32)
     scans = None if scans_at is None else LaserScans(scans_at, readings, -1.0, 1.0, 0.0, 0.0, 5.0)
     task = task_of(recordings_of(poses, STAMPS, each=[{"scans": scans}]))
-    estimate = estimate_of(Graph(poses, np.zeros((4, 2)), edges=edges), ranges=ranges)
+    edges = edges if ranges is None else (*edges, ranges)
+    wheels = chained(poses, np.array([0.01, 0.01, 0.003]))
+    estimate = estimate_of(Graph(poses, PLACES, edges=edges), ranges=ranges, odometry=wheels)
     return [n.figures for n in check_untied_parts(estimate, task) if n.severity == "doubt"]
 
 
@@ -94,6 +89,25 @@ def test_what_bridges_the_silence():
     assert untied(scans_at=WITHOUT, edges=(scan_edge(20, 39),)) == [(39.0, 70.0)]
 
 
+ALL, ALONG = (100.0, 100.0, 300.0), (1.0, 100.0, 300.0)
+"""What a match fixes, 1/m, 1/m, 1/rad: everything, or the way along a wall to a metre only."""
+
+
+@pytest.mark.parametrize(("slipped", "across", "found"), [
+    ((50,), [], [50]), ((50,), [(50, 51, ALONG)], [50]), ((50,), [(50, 51, ALL)], []), ((50,), [(48, 52, ALL)], []),
+    ((50,), [(45, 55, ALL)], []), ((50,), [(20, 80, ALONG)], [50]), ((50,), [(45, 58, ALONG), (46, 57, ALL)], []),
+    ((30, 32), [], [30]), ((30, 70), [], [30, 70]), ((30, 70), [(20, 60, ALL)], [70]), ((30, 31), [(30, 32, ALL)], []),
+    ((2,), [], []), ((30, 96), [], [30]),
+])  # fmt: skip
+def test_steps_in_which_the_wheels_slip_are_tied_by_scans_that_leave_no_direction_free(slipped, across, found):
+    """A keyframe that hangs on two such steps alone is no part, nor are a few at either end."""
+    wheels = chained(POSES, np.array([0.01, 0.01, 0.003]))
+    wheels.motion[np.array(slipped), 0] += 2.0
+    others = [scan_edge(k, k + 1) for k in range(99) if k not in slipped]
+    graph = Graph(POSES, edges=(*others, *(scan_edge(*edge) for edge in across)))
+    assert untied_steps(estimate_of(graph, odometry=wheels), recordings_of(POSES, STAMPS)).tolist() == found
+
+
 def test_a_robot_that_stands_needs_no_scans():
     assert untied(scans_at=WITHOUT, poses=0.01 * POSES) == []
 
@@ -134,30 +148,13 @@ def test_an_end_without_any_measurement_anywhere_is_another_doubt():
     assert doubts() == []
 
 
-def test_dead_reckoning_error_is_what_a_drifting_heading_does():
-    """To first order: places rebuilt from headings that drift by little."""
-    rng = np.random.default_rng(4)
-    durations = rng.uniform(0.5, 2.0, 60)
-    steps = rng.uniform(0.1, 0.4, (60, 1)) * np.column_stack([np.cos(a := np.cumsum(rng.normal(0, 0.4, 60))), np.sin(a)])
-    lengths, small = np.hypot(*steps.T), 1e-4
-    places = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    moved = []
-    for drift in (_PER_METRE * lengths, _PER_SECOND * durations):
-        turned = small * (np.cumsum(drift) - drift / 2.0)
-        c, s = np.cos(turned), np.sin(turned)
-        bent = np.column_stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]])
-        moved.append(np.append(0.0, np.hypot(*(np.cumsum(bent - steps, axis=0)).T)) / small)
-    assert np.allclose(dead_reckoning_error(places, lengths, durations), np.hypot(*moved), rtol=1e-2, atol=1e-4)
-
-
-def test_a_way_around_errs_less_than_one_straight_on():
-    turn = np.linspace(0.0, 2.0 * np.pi, 101)
-    circle = np.column_stack([np.cos(turn), np.sin(turn)]) * 10.0 / np.pi
-    straight = np.column_stack([np.linspace(0.0, 20.0, 101), np.zeros(101)])
-    lengths, none = np.full(100, 0.2), np.zeros(100)
-    around, ahead = (dead_reckoning_error(places, lengths, none)[-1] for places in (circle, straight))
-    assert ahead == pytest.approx(_PER_METRE * 20.0**2 / 2.0)
-    assert around == pytest.approx(_PER_METRE * 20.0 * 10.0 / np.pi, rel=0.01)
+@pytest.mark.parametrize(("turn", "error"), [(0.0, 0.02 * 15.0**2 / 2.0), (2.0 * np.pi, 0.02 * 15.0**2 / (2.0 * np.pi))])
+def test_a_way_around_errs_less_than_one_straight_on(turn, error):
+    """15 m without ranges at the end."""
+    heading = np.maximum(STAMPS - 49.0, 0.0) / 50.0 * turn
+    poses = np.column_stack([np.cumsum(0.3 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0), heading])
+    (found,) = doubts(measured((0, 52)), poses=poses)
+    assert found["error"] == pytest.approx(error, rel=0.05)
 
 
 def doubted(heard, closures=(), few=()):

@@ -10,7 +10,7 @@ from helpers.planted import drive, odometry, ranges, recording, wander
 from helpers.results import FILES, contents
 
 from uwblite import se2
-from uwblite.cli import main
+from uwblite.cli import console, main
 from uwblite.io.carmen import read_log, write_log
 from uwblite.io.folders import sole_writer
 from uwblite.io.tum import read_tum
@@ -85,20 +85,18 @@ def test_the_command_in_the_report_gives_the_same_bytes(short_log, tmp_path, mon
     assert contents("map_again") == first
 
 
-def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_path, monkeypatch, capsys):
+@pytest.mark.usefixtures("judged")
+def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_path, monkeypatch):
     """What a result says does not depend on where the recording lies, nor on how its path was written."""
     import shutil
 
     (tmp_path / "elsewhere").mkdir()
     shutil.copy(radio_only / "straight.log", tmp_path / "elsewhere" / "straight.log")
-    words = ["--out", str(tmp_path / "one"), "--no-timings", "-q"]
-    assert main(["map", str(radio_only / "straight.log"), *words]) == 3
     monkeypatch.chdir(tmp_path / "elsewhere")
-    words[1] = str(tmp_path / "two")
-    assert main(["map", "straight.log", *words]) == 3
-    one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
+    assert main(["map", "straight.log", "--out", str(tmp_path / "map"), "--no-timings", "-q"]) == 3
+    one, two = contents(radio_only / "straight"), contents(tmp_path / "map")
     assert one == two
-    assert str(tmp_path).encode() not in b"".join(one.values())
+    assert not [path for path in (tmp_path, radio_only) if str(path).encode() in b"".join(one.values())]
 
 
 def test_the_corrected_log_has_the_scans_where_the_map_has_them(mapped, room_log):
@@ -224,22 +222,31 @@ def radio_only(tmp_path_factory):
     return folder
 
 
-def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_path, capsys):
-    for name, code, as_json in (("around", 0, True), ("straight", 3, False), ("straight", 3, True)):
-        out = tmp_path / f"{name}{as_json}"
-        assert main(["map", str(radio_only / f"{name}.log"), "--out", str(out), *["--json"] * as_json]) == code
-        output = capsys.readouterr().out
-        report = json.loads((out / "report.json").read_text())
+@pytest.fixture(scope="module")
+def judged(radio_only):
+    """What `uwblite map` says of both, as text and as JSON, with their exit codes; the maps lie beside the recordings."""
+    said = {}
+    for name in ("around", "straight"):
+        words = ["map", str(radio_only / f"{name}.log"), "--out", str(radio_only / name), "--no-timings"]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(console, "report", lambda _, figures, lines, name=name: said.update({name: (figures, lines)}))
+            code = main(words)
+        said[name] = (code, *said[name])
+    return said
+
+
+def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, judged):
+    for name, expected in (("around", 0), ("straight", 3)):
+        code, summary, lines = judged[name]
+        assert code == expected
+        report = json.loads((radio_only / name / "report.json").read_text())
         assert bool(report["doubts"]) == (code == 3)
-        assert (out / "trajectory.tum").exists()
-        if as_json:
-            summary = json.loads(output)
-            assert (summary["trusted"], summary["exit_code"]) == (code == 0, code)
-            assert summary["doubts"] == report["doubts"]
-        else:
-            doubts = [line.removeprefix("DOUBT: ") for line in output.splitlines() if line.startswith("DOUBT: ")]
-            assert doubts == [doubt["text"] for doubt in report["doubts"]]
-            assert all("mirror-ambiguous" in doubt for doubt in doubts)
+        assert (radio_only / name / "trajectory.tum").exists()
+        assert (summary["trusted"], summary["exit_code"]) == (code == 0, code)
+        assert json.loads(json.dumps(console.plain(summary["doubts"]))) == report["doubts"]
+        doubts = [line.removeprefix("DOUBT: ") for line in lines if line.startswith("DOUBT: ")]
+        assert doubts == [doubt["text"] for doubt in report["doubts"]]
+        assert all("mirror-ambiguous" in doubt for doubt in doubts)
 
 
 @pytest.mark.slow

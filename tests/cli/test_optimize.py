@@ -57,7 +57,7 @@ def test_headings_from_anywhere_end_in_the_certified_minimum(tmp_path, capsys):
     assert wrong["certificate"] == "none: the robust kernel huber has no relaxation"
 
 
-@pytest.mark.parametrize("seed", [4, 6, 12])
+@pytest.mark.parametrize("seed", [4, 12])
 def test_anchors_that_start_far_away_end_in_the_minimum_from_the_truth(tmp_path, capsys, seed):
     graph, truth, where = loop(seed, anchors=4)
     best = optimize(replace(graph, poses=truth, anchors=where))[1].chi2
@@ -67,7 +67,7 @@ def test_anchors_that_start_far_away_end_in_the_minimum_from_the_truth(tmp_path,
     assert figures(capsys, written(tmp_path / "far.pyfg", far))["chi2"] == pytest.approx(best, rel=1e-5)
 
 
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", [3])
 def test_worthless_estimates_do_not_keep_the_search_from_the_minimum_from_the_truth(tmp_path, capsys, seed):
     graph, truth, where = loop(seed, n=200, anchors=4)
     graph = replace(graph, edges=(graph.edges[0], graph.edges[2]))
@@ -80,13 +80,14 @@ def test_worthless_estimates_do_not_keep_the_search_from_the_minimum_from_the_tr
     assert figures(capsys, written(tmp_path / "zero.g2o", worthless))["chi2"] == pytest.approx(best, rel=1e-4)
 
 
-@pytest.mark.parametrize("options", [[], ["--from-odometry"]])
-@pytest.mark.parametrize("known", ["fixed", "priors"])
-@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(
+    ("given", "known", "options"),
+    [(True, "fixed", []), (True, "priors", ["--from-odometry"]), (False, "fixed", ["--from-odometry"]), (False, "priors", [])],
+)
 def test_known_anchors_say_where_the_odometry_lies(tmp_path, capsys, given, known, options):
     """The vertices, where there are any, are the odometry's: in another frame than the anchors, half a turn off."""
-    graph, truth, where = loop(7, n=150, anchors=4)
-    graph = replace(graph, edges=(graph.edges[0], graph.edges[2]), anchors=where, fixed_poses=np.zeros(150, dtype=bool))
+    graph, truth, where = loop(7, n=80, anchors=4)
+    graph = replace(graph, edges=(graph.edges[0], graph.edges[2]), anchors=where, fixed_poses=np.zeros(80, dtype=bool))
     if known == "fixed":
         graph = replace(graph, fixed_anchors=np.ones(4, dtype=bool))
     else:
@@ -202,15 +203,15 @@ def test_what_does_not_converge_is_the_same_bytes_again(tmp_path, monkeypatch, w
 
 
 def test_robust_says_that_nothing_was_left_of_the_closures(tmp_path, capsys):
-    path = written(tmp_path / "random.g2o", at_random(300, 600))
+    path = written(tmp_path / "random.g2o", at_random(150, 300))
     found = figures(capsys, path, "--robust", code=0)
-    assert found["outliers"] == {"RelativePoseEdges": 600}
-    assert (found["closures"]["far_off"], found["closures"]["contradict"]) == (600, True)
+    assert found["outliers"] == {"RelativePoseEdges": 300}
+    assert (found["closures"]["far_off"], found["closures"]["contradict"]) == (300, True)
 
 
 def test_whoever_sets_the_iterations_gets_as_many(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("uwblite.cli.optimize._WORK", 1.0)
-    path = written(tmp_path / "random.g2o", at_random(300, 600))
+    path = written(tmp_path / "random.g2o", at_random(150, 300))
     assert figures(capsys, path, code=3)["iterations"] == 1
     found = figures(capsys, path, "--set", "max_iterations=7", code=3)
     assert (found["iterations"], found["reason"]) == (7, "iterations used up")

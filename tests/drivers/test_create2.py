@@ -36,7 +36,7 @@ def test_transcript_in_every_split_and_among_noise():
     assert {len(frame) for frame in transcript} == {14}
     expected = feed_whole(Create2Protocol, b"".join(transcript))
     assert len(expected) == 20
-    check_transcript(Create2Protocol, transcript, expected, NOISES, splits=100)
+    check_transcript(Create2Protocol, transcript, expected, NOISES)
 
 
 def test_a_frame_by_hand():

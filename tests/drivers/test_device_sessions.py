@@ -97,12 +97,12 @@ def test_lidar_sub_sampled(options):
 @pytest.mark.parametrize("skew", [-2e-4, 0.0, 2e-4])
 def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
     """Two minutes across the wrap of the 24-bit counter, with transport delays of 1 ms and rare ones of 40 ms."""
-    device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 60_000, clock_skew=skew))
+    device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 30_000, clock_skew=skew))
     rng = random.Random(0)
     delay = lambda: 0.04 if rng.random() < 0.02 else rng.expovariate(1000)  # noqa: E731
-    actions, _ = simulate(ScipDriver(ScanRequest(44, 107)), device, 120.0, jitter=delay)
+    actions, _ = simulate(ScipDriver(ScanRequest(44, 107)), device, 60.0, jitter=delay)
     scans = of_kind(actions, LaserScan)
-    assert len(scans) > 1180
+    assert len(scans) > 580
     assert not names(actions) & {"lidar-clock-reset", "lidar-restart"}
     offset = len(sent) - len(scans)
     errors = [scan.stamp - t for scan, (t, _) in zip(scans, sent[offset if offset > 0 else 0 :], strict=False)]
@@ -169,11 +169,10 @@ def test_lidar_with_scip_1_only_is_named():
     assert reopens
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_lidar_damage_costs_the_scans_that_were_damaged(seed):
+def test_lidar_damage_costs_the_scans_that_were_damaged():
     """Noise at one byte in 20,000 hits about every tenth scan; all others arrive with the right ranges."""
     device, sent = lidar()
-    line = FaultyLine([parse_fault("noise=0.00005@3")], seed)
+    line = FaultyLine([parse_fault("noise=0.00005@3")], 1)
     actions, _ = simulate(ScipDriver(), device, 40.0, line=line)
     scans = of_kind(actions, LaserScan)
     lost = sum(item.count for item in of_kind(actions, Lost))
@@ -273,7 +272,7 @@ def test_tag_by_shell_from_every_state(options):
 @pytest.mark.parametrize("dropouts", [0.2, 0.9])
 def test_tag_with_rounds_missing(dropouts):
     device, sent = tag(dropouts=dropouts)
-    actions, _ = simulate(Dwm1001Driver(), device, 60.0)
+    actions, _ = simulate(Dwm1001Driver(), device, 40.0)
     check_ranges(actions, sent, 1, 0.006)
     assert not of_kind(actions, Lost)
 
@@ -313,11 +312,10 @@ def test_tag_settings_that_hurt_are_named():
     assert {"stationary-detection", "not-joined"} <= names(actions)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
+def test_tag_on_a_bad_cable_logs_nothing_wrong():
     """One byte in a hundred is changed and TLV has no sum: reading twice keeps wrong ranges out of the log."""
-    device, sent = tag(seed=seed)
-    line = FaultyLine([parse_fault("noise=0.01@3")], seed)
+    device, sent = tag(seed=1)
+    line = FaultyLine([parse_fault("noise=0.01@3")], 1)
     actions, _ = simulate(Dwm1001Driver(), device, 40.0, line=line)
     epochs = of_kind(actions, RangeEpoch)
     true = {tuple((a, d) for a, d, _ in readings) for _, readings in sent}
@@ -431,13 +429,13 @@ def test_lidar_clock_that_is_reset_in_mid_stream_keeps_its_latency():
     device, sent = lidar()
     device_ms = device.device_ms
     device.device_ms = lambda now: device_ms(now) if now < START + 20 else int(1000 * (now - START - 20))
-    actions, _ = simulate(ScipDriver(), device, 60.0)
+    actions, _ = simulate(ScipDriver(), device, 40.0)
     assert "lidar-clock-reset" in names(actions)
     scans, truth = of_kind(actions, LaserScan), {}
     for true, values in sent:
         truth.setdefault(tuple(values), []).append(true)
     errors = [min(abs(scan.stamp - t) for t in truth[tuple(round(1000 * r) for r in scan.ranges)]) for scan in scans]
-    assert len(scans) > 560
+    assert len(scans) > 360
     assert max(errors) < 0.002
 
 
@@ -535,7 +533,7 @@ def test_tag_with_status_bits_that_the_guide_does_not_name():
 def test_tag_on_a_slow_link_is_stamped_within_what_is_stated(latency, tick, spread):
     """FTDI adapters deliver every 16 ms; a bridge in a network takes 18 or 50 ms. No fix vanishes without being counted."""
     device, sent = tag()
-    actions, reopens = simulate(Dwm1001Driver(), device, 60.0, latency=latency, tick=tick)
+    actions, reopens = simulate(Dwm1001Driver(), device, 40.0, latency=latency, tick=tick)
     assert not reopens
     fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
     epochs = of_kind(actions, RangeEpoch)
@@ -551,11 +549,10 @@ def test_tag_on_a_slow_link_is_stamped_within_what_is_stated(latency, tick, spre
     assert len(epochs) > 0.97 * begun
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
+def test_tag_on_a_link_whose_delay_comes_and_goes():
     """A busy computer: for seconds every answer takes up to 70 ms. No fix is logged twice, each lies within its bracket."""
-    device, sent = tag(seed=seed)
-    rng, calls = random.Random(seed), itertools.count()
+    device, sent = tag()
+    rng, calls = random.Random(0), itertools.count()
     jitter = lambda: rng.uniform(0, 0.07) if (next(calls) // 150) % 2 else 0.001  # noqa: E731
     actions, reopens = simulate(Dwm1001Driver(), device, 80.0, jitter=jitter)
     assert not reopens
@@ -574,7 +571,7 @@ def test_tag_whose_answers_take_longer_than_a_fix_lasts(least, most, share):
     """No fix can be read twice then. What is known to 0.6 s is logged, within its bracket, the rest counted, and both said."""
     device, sent = tag()
     rng = random.Random(0)
-    actions, _ = simulate(Dwm1001Driver(), device, 60.0, jitter=lambda: rng.uniform(least, most))
+    actions, _ = simulate(Dwm1001Driver(), device, 40.0, jitter=lambda: rng.uniform(least, most))
     fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
     epochs = of_kind(actions, RangeEpoch)
     for epoch in epochs:
@@ -585,11 +582,10 @@ def test_tag_whose_answers_take_longer_than_a_fix_lasts(least, most, share):
     assert "uwb-slow" in names(actions)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
+def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated():
     """Answers and scans take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""
     device, sent = lidar()
-    rng = random.Random(seed)
+    rng = random.Random(1)
     actions, _ = simulate(ScipDriver(), device, 40.0, jitter=lambda: rng.uniform(0, 0.025))
     truth = {}
     for true, values in sent:

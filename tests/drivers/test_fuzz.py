@@ -86,7 +86,7 @@ def pieces(words):
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-@settings(max_examples=30)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_protocols_take_anything(name, data):
     make, words = PROTOCOLS[name]

@@ -24,7 +24,7 @@ def test_transcript_in_every_split_and_among_noise(name):
     frames = [BOARDS[name](next(epochs), k, 100 * k) for k in range(12)]
     expected = good(feed_whole(PROTOCOLS[name], b"".join(frames)))
     assert len(expected) == 12
-    check_transcript(PROTOCOLS[name], frames, expected, NOISES, splits=100)
+    check_transcript(PROTOCOLS[name], frames, expected, NOISES)
 
 
 def test_bytes_that_a_user_shows():

@@ -94,7 +94,7 @@ def test_captured_scans(shared_data, name, time, zeros, sixes, sevens, largest):
     assert tuple(event.values.count(code) for code in (0, 6, 7)) == (zeros, sixes, sevens)
     assert min(v for v in event.values if v >= 20) >= 20
     noises = [b"", b"\xff\x00", b"MD0044\n", RNG.randbytes(300)]
-    check_transcript(ScipProtocol, [data, data], [event, event], noises, splits=200)
+    check_transcript(ScipProtocol, [data, data], [event, event], noises)
 
 
 def test_captured_text_lines(shared_data):

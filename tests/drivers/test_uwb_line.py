@@ -91,7 +91,7 @@ def test_transcript_in_every_split_and_among_noise(name):
     expected = good(LineProtocol(FORMS[name]).feed(b"".join(lines), 1.0))
     assert len(expected) >= 12
     noises = [b"", b"\n", b"\xff\xfe\n", b"from: 12\n", b"an1\n", b"boot: ok\r\n", random.Random(3).randbytes(40) + b"\n"]
-    check_transcript(lambda: LineProtocol(FORMS[name]), lines, expected, noises, splits=60)
+    check_transcript(lambda: LineProtocol(FORMS[name]), lines, expected, noises)
 
 
 def board(name):

@@ -99,7 +99,7 @@ def ring(seed, n=20, noise=0.03):
     return Graph(truth, edges=(edges,)), truth
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_ring_is_certified_and_one_wound_once_more_is_not(seed):
     graph, truth = ring(seed)
     assert certify(optimize(graph)[0]).is_global
@@ -161,7 +161,7 @@ def trilateration(poses, bias, seed=0):
     return Graph(np.column_stack([poses, np.zeros(n)]), anchor, (ranges,), fixed_poses=np.ones(n, dtype=bool))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_mirror_image_of_an_anchor_is_not_certified(seed):
     along = np.column_stack([np.linspace(-5, 5, 12), np.random.default_rng(seed).normal(scale=0.5, size=12)])
     graph = trilateration(along, 0.0, seed)
@@ -173,7 +173,7 @@ def test_the_mirror_image_of_an_anchor_is_not_certified(seed):
     assert certified.lower_bound <= best
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_anchor_amid_poses_is_certified_unless_its_ranges_want_it_out_of_the_plane(seed):
     angle = np.arange(12) * np.pi / 6
     around = np.column_stack([1.0 + 4.0 * np.cos(angle), 3.0 + 4.0 * np.sin(angle)])
@@ -181,7 +181,7 @@ def test_an_anchor_amid_poses_is_certified_unless_its_ranges_want_it_out_of_the_
     assert not certify(optimize(trilateration(around, 0.2, seed))[0]).is_global
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_where_the_map_lies_does_not_matter(seed):
     graph, truth = ring(seed)
     far = se2.compose([3e5, -4e6, 2.0], truth)

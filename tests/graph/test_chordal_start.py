@@ -23,7 +23,7 @@ def test_without_noise_the_start_is_the_truth():
     np.testing.assert_allclose(se2.between(truth, start.poses), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_headings_end_in_the_same_minimum(seed):
     graph = loop(seed, n=400, anchors=0)[0]
     graph = replace(graph, edges=graph.edges[:2])
@@ -62,5 +62,6 @@ def test_a_step_from_a_pose_of_uncertain_heading_keeps_its_length():
 def test_where_the_matrix_would_fill_up_there_is_none(monkeypatch):
     graph = at_random(200, 400)
     assert chordal_start(graph) is not None
-    monkeypatch.setattr("uwblite.graph.elimination.EliminationPolicy.most_work", 1e5)
+    monkeypatch.setattr("uwblite.graph.elimination.EliminationPolicy.little_work", 0.0)
+    monkeypatch.setattr("uwblite.graph.elimination.EliminationPolicy.per_pose", 500.0)
     assert chordal_start(graph) is None

@@ -16,7 +16,7 @@ def planted(n=12):
     """Return a graph of n poses, its normal equations, blocks, and the matrix and gradient of the whole system."""
     rng = np.random.default_rng(5)
     graph = loop(n=n)[0]
-    normal = filled(graph, subtrees=True)
+    normal = filled(graph, last=())
     size, count, k, m = normal.unknowns.size, 3, 4, 60
     by_graph = rng.standard_normal((m, size)) * (rng.random((m, size)) < 0.2)
     block = rng.integers(count, size=m)
@@ -92,7 +92,7 @@ def test_what_nothing_measures_stays():
     graph = loop(n=6)[0]
     anchors = np.concatenate([graph.anchors, [[9.0, 9.0]]])
     graph = replace(graph, anchors=anchors, fixed_anchors=np.append(graph.fixed_anchors, False))
-    normal = filled(graph, subtrees=True)
+    normal = filled(graph, last=())
     size = normal.unknowns.size
     nothing = Blocks(
         sparse.csr_matrix((size, size)), sparse.csr_matrix((4, size)), np.eye(4)[None], np.zeros(size), np.zeros((1, 4))

@@ -25,6 +25,9 @@ def rooms(count, poses):
     return np.vstack([np.stack([(each[:, None] + i).ravel(), (each[:, None] + j).ravel()], axis=1), doors])
 
 
+NOTHING = np.zeros(0, dtype=np.intp)
+
+
 def chosen(pairs, poses, others, **kinds):
     """Choose for poses and other scalars."""
     return choose_ordering(pairs, poses, np.repeat([3, 1], [poses, others]), **kinds)
@@ -79,20 +82,19 @@ def test_what_is_not_positive_definite_is_said():
         (chain(60, 16), 60, 10, (True, True, False)),
         (anywhere(np.random.default_rng(0), 200, 300), 200, 10, (True, False, False)),
         (chain(500, 6), 500, 10, (True, True, False)),
-        (chain(500, 40), 500, 10, (False, False, True)),
+        (chain(500, 40), 500, 10, (True, False, False)),
         (rooms(60, 12), 720, 10, (True, False, False)),
         (rooms(30, 80), 2400, 10, (True, False, False)),
         (rooms(4, 600), 2400, 10, (False, False, True)),
-        (chain(499, 40), 499, 10, (True, False, False)),
-        (anywhere(np.random.default_rng(1), 500, 2000), 500, 10, (True, False, False)),
-        (anywhere(np.random.default_rng(1), 500, 2100), 500, 10, (False, False, True)),
+        (anywhere(np.random.default_rng(1), 300, 2000), 300, 10, (True, False, False)),
+        (anywhere(np.random.default_rng(1), 900, 2000), 900, 10, (False, False, True)),
         (anywhere(np.random.default_rng(2), 3000, 5000), 3000, 10, (False, False, True)),
-        (anywhere(np.random.default_rng(2), 3000, 1000), 3000, 10, (True, False, False)),
+        (anywhere(np.random.default_rng(2), 3000, 500), 3000, 10, (True, False, False)),
         (np.zeros((0, 2), dtype=int), 1, 10, (False, False, False)),
     ],
 )
 def test_the_form_follows_the_structure(pairs, poses, others, form):
-    """Borders to 48 scalars, bands to 16 poses; iteration where a factor takes long, or longer than it and edges are many."""
+    """Borders to 48 scalars, bands to 16 poses; iteration where a factor takes much work for each pose."""
     ordering = chosen(pairs, poses, others)
     assert (ordering.bordered, ordering.banded, ordering.iterative) == form
     assert sorted(ordering.order) == list(range(poses))
@@ -111,7 +113,7 @@ def test_anchors_of_any_poses_fill_the_matrix_as_well():
 
 
 def test_the_selected_inverse_needs_a_factor():
-    assert not chosen(chain(500, 40), 500, 10, subtrees=True).iterative
+    assert not chosen(chain(500, 40), 500, 10, last=NOTHING).iterative
 
 
 @pytest.mark.parametrize(("n", "closures", "asked"), [(60, 25, True), (400, 1, True), (700, 700, False)])
@@ -122,7 +124,7 @@ def test_subtrees_of_the_elimination_are_contiguous(n, closures, asked):
     """
     rng = np.random.default_rng(3)
     pairs = anywhere(rng, n, closures) if closures > 1 else np.vstack([chain(n), [[0, n - 1]]])
-    ordering = chosen(pairs, n, 10, subtrees=asked)
+    ordering = chosen(pairs, n, 10, last=NOTHING if asked else None)
     assert (ordering.bordered, ordering.banded) == (not asked, False)
     position = np.argsort(ordering.order)
     filled = np.eye(n, dtype=bool)
@@ -156,7 +158,7 @@ def planted(seed):
     return blocks, values, lower + np.tril(lower, -1).T
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_entries_are_those_of_the_lower_triangle_each_once(seed):
     blocks, values, matrix = planted(seed)
     rows, columns, places = blocks.entries()
@@ -167,13 +169,13 @@ def test_entries_are_those_of_the_lower_triangle_each_once(seed):
     np.testing.assert_array_equal(found, np.tril(matrix))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_compressed_columns_hold_both_triangles(seed):
     blocks, values, matrix = planted(seed)
     np.testing.assert_array_equal(SparseLayout(blocks).matrix(values).toarray(), matrix)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_band_solves_the_matrix_inside(seed):
     blocks, values, matrix = planted(seed)
     inner = blocks.size - 2

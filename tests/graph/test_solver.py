@@ -150,7 +150,7 @@ def test_noiseless_measurements_give_back_the_truth():
     np.testing.assert_allclose(found.anchors, anchors, atol=1e-7)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_minimum_is_that_of_scipy(seed):
     graph, _, _ = loop(seed, n=16)
     found, summary = optimize(graph, CAREFUL)
@@ -649,7 +649,7 @@ def test_the_work_allowed_is_counted(poses, closures):
     assert optimize(graph, SolverConfig(max_iterations=5), allowed=1.0)[1].iterations == 1
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_slope_alone_is_that_of_the_whole_and_leaves_the_rest(seed):
     """At another estimate: H is that of the one before, g is the new one's."""
     graph = mixed(seed)
@@ -661,7 +661,7 @@ def test_the_slope_alone_is_that_of_the_whole_and_leaves_the_rest(seed):
     np.testing.assert_array_equal(normal.gradient, filled(further).gradient)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_last_step_of_a_search_is_as_near_as_was_asked(seed):
     """It is taken unseen where the factor of the step before predicts a negligible decrease."""
     solved, summary = optimize(mixed(seed), SolverConfig(relative_decrease=1e-3))

@@ -101,7 +101,7 @@ def test_long_lines_round_exactly():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 5))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_counts_equal_a_loop_over_cells(seed, rays, scans):
     rng = np.random.default_rng(seed)
     geometry = geometry_of(18)

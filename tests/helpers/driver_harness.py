@@ -28,7 +28,7 @@ def good(events):
     return [event for event in events if not isinstance(event, Corrupt)]
 
 
-def check_transcript(make, frames, expected, noises, splits=200, seed=0):
+def check_transcript(make, frames, expected, noises, splits=40, seed=0):
     """A transcript gives the same events whole, byte by byte, in random splits, and among noise.
 
     Parameters

@@ -1,6 +1,7 @@
 """A room with known walls and anchors, and a robot that drives through it: what a live localisation is tested with."""
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,8 @@ from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.stored_result import StoredAnchor
 from uwblite.localization import Localizer, Scanner
-from uwblite.localization.known_map import known_map
+from uwblite.localization.known_map import KnownMap, known_anchors
+from uwblite.localization.walls import walls_of
 from uwblite.sensor_log import SensorMounting
 
 CELL = 0.05
@@ -34,10 +36,21 @@ def grid_of(walls, origin=(-1.025, -1.025), size=(10.05, 8.05), cell=CELL):
     return OccupancyGrid(geometry, odds.astype(np.float32))
 
 
+def known_map(anchors, grid):
+    """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
+    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
+
+
 def known(walls=ODD, anchors=ANCHORS):
     """Return the room as a localisation knows it."""
     stored = tuple(StoredAnchor(n, np.array(p, dtype=float), np.eye(2) * 1e-4, "ok", 0.0, 0.05) for n, p in anchors.items())
-    return known_map(stored, None if walls is None else grid_of(walls))
+    return KnownMap(known_anchors(stored, {}), None if walls is None else drawn(walls), np.zeros(3))
+
+
+@cache
+def drawn(walls):
+    """Return the walls as a localisation looks them up."""
+    return walls_of(grid_of(walls))
 
 
 def cast(pose, walls=ODD):

@@ -135,3 +135,11 @@ def aligned_error(estimate, truth, mirrored=False) -> float:
         p = p * [1.0, -1.0]
     angle = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
     return float(np.sqrt(np.mean(np.sum((se2.rotate(angle, p) - q) ** 2, axis=1))))
+
+
+def surface_points(walls, columns):
+    """Return points (n, 2), 2 cm apart or less, on walls (w, 4) of up to 8 m and around columns (c, 3)."""
+    share, turn = (np.linspace(0.0, end, 800)[:, None] for end in (1.0, 2.0 * np.pi))
+    points = [wall[:2] + share * (wall[2:] - wall[:2]) for wall in walls]
+    points += [column[:2] + column[2] * np.hstack([np.cos(turn), np.sin(turn)]) for column in columns]
+    return np.concatenate(points)

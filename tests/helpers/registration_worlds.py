@@ -3,7 +3,8 @@
 import numpy as np
 
 from uwblite import se2
-from uwblite.lidar.clouds import Clouds, make_cloud
+from uwblite.lidar.clouds import CloudConfig, Clouds, build
+from uwblite.odometry.attached import ScanPoints
 
 ROOM = np.array(
     [[0, 0, 6, 0], [6, 0, 6, 4.2], [6, 4.2, 3.5, 4.2], [3.5, 4.2, 3.5, 5], [3.5, 5, 0, 5], [0, 5, 0, 0], [2, 2, 2.5, 2.3]],
@@ -28,10 +29,18 @@ def views(walls, truth, rng, spacing=0.05, noise=NOISE):
     return target, se2.transform(se2.inverse(truth), wall_points(walls, rng, spacing, noise))
 
 
+def cloud(points, seen_from=None) -> Clouds:
+    """Return the cloud of single points (n, 2), seen from a place (2,); None = the sides of its normals mean nothing."""
+    config = CloudConfig(voxel=1e-6, normal_radius=0.25, min_neighbours=0, linearity=0.6)
+    seen_from = points if seen_from is None else np.broadcast_to(seen_from, points.shape)
+    nothing = np.zeros(len(points), dtype=np.intp)
+    return build(ScanPoints(nothing, points, seen_from, nothing, nothing), 1, config)
+
+
 def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[Clouds, Clouds]:
     """Return the clouds of two views, both seen from the same place, the centre."""
     target, source = views(walls, truth, rng, spacing, noise)
-    return make_cloud(target, np.asarray(centre)), make_cloud(source, se2.transform(se2.inverse(truth), np.asarray(centre)))
+    return cloud(target, centre), cloud(source, se2.transform(se2.inverse(truth), np.asarray(centre)))
 
 
 def scattered(rng, counts) -> Clouds:

@@ -18,7 +18,8 @@ from helpers.results import EVIL, FILES, contents, small_log, small_result
 from uwblite.errors import ConfigError
 from uwblite.io import folders, results
 from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
-from uwblite.io.results import check_target, is_of_result, repair_result, write_result
+from uwblite.io.results import check_target, write_result
+from uwblite.io.stored_result import is_of_result, repair_result
 from uwblite.io.tum import read_tum
 
 SMALL_PICTURE = np.zeros((2, 3, 3), dtype=np.uint8)

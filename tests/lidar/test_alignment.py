@@ -1,15 +1,18 @@
 """Alignment of many pairs at once: one step as the matches say, none too long, and where it ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import registration_worlds as worlds
 from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
+from uwblite.arrays import concatenated
 from uwblite.lidar import scan_matching
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.clouds import joined, make_cloud
-from uwblite.lidar.scan_matching import align_pairs, match, nondegenerate_step, pairs_of
+from uwblite.lidar.clouds import joined
+from uwblite.lidar.scan_matching import _step, align_pairs, match, nondegenerate_step, pairs_of
 
 TRUTH = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
 I, J = np.array([0, 0, 2]), np.array([1, 2, 1])
@@ -32,6 +35,19 @@ def test_one_iteration_is_one_step_of_the_matches(world):
     np.testing.assert_array_equal(found.factors.matched, match(raster, pairs, found.pose, 0.3, 0.15).matched)
 
 
+def test_a_step_is_the_nondegenerate_one_whatever_was_measured(world):
+    """Of pairs that measure all, of one whose clouds show one direction alone, and of one without matches."""
+    raster, pairs, exact = world
+    factors = match(raster, pairs, exact + np.array([0.05, -0.04, 0.03]), 0.3, 0.15)
+    wall = np.outer([0.6, 0.8, 0.1], [0.6, 0.8, 0.1])
+    hessian = np.concatenate([factors.hessian, [factors.hessian[0].max() * wall, np.zeros((3, 3))]])
+    gradient = np.concatenate([factors.gradient, factors.gradient[:1], np.zeros((1, 3))])
+    mixed = replace(concatenated([factors, factors.rows(slice(2))]), hessian=hessian, gradient=gradient)
+    np.testing.assert_allclose(_step(mixed), nondegenerate_step(mixed)[0], rtol=1e-9, atol=1e-12)
+    assert np.abs(_step(mixed)[:4]).min(axis=1).min() > 0.0
+    np.testing.assert_array_equal(_step(mixed)[4], 0.0)
+
+
 def test_no_step_is_longer_than_allowed(world):
     """0.3 m and 0.15 rad; a longer one keeps its direction."""
     raster, pairs, exact = world
@@ -51,7 +67,7 @@ def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
     """By 0.6 rad, four times what is allowed; by half of what is allowed; 0.6 m and 0.3 rad, both twice as far."""
     raster, pairs, exact = world
     steps = np.array([[0.04, 0.0, -0.6], [0.1, 0.0, 0.075], [0.0, 0.6, 0.3]])
-    monkeypatch.setattr(scan_matching, "nondegenerate_step", lambda factors: (steps, None))
+    monkeypatch.setattr(scan_matching, "_step", lambda factors: steps)
     found = align_pairs(raster, pairs, exact, 0.8, 0.8, iterations=1)
     taken = se2.wrap_angle(found.pose[:, 2] - exact[:, 2])
     np.testing.assert_allclose(taken, [-0.15, 0.075, 0.15])
@@ -111,8 +127,8 @@ def test_people_in_one_cloud_do_not_move_the_other():
     crowd = np.vstack([source, se2.transform(se2.inverse(MOTION), legs)])
     seen_from = se2.transform(se2.inverse(MOTION), np.asarray(CENTRE))
     guess = MOTION[None] + [0.1, 0.05, 0.02]
-    room = make_cloud(target, np.asarray(CENTRE))
-    alone, beside = (distance(aligned(room, make_cloud(s, seen_from), guess)) for s in (source, crowd))
+    room = worlds.cloud(target, np.asarray(CENTRE))
+    alone, beside = (distance(aligned(room, worlds.cloud(s, seen_from), guess)) for s in (source, crowd))
     assert beside < alone + 0.01
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from helpers.laser_walks import in_map
 from helpers.planted import box, cast
+from helpers.registration_worlds import cloud as single_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.lidar.clouds import CloudConfig, build, make_cloud
+from uwblite.lidar.clouds import CloudConfig, build
 from uwblite.odometry.attached import ScanPoints
 
 EVERYTHING = CloudConfig(voxel=0.1, normal_radius=0.3, min_neighbours=0)
@@ -133,13 +134,13 @@ def test_normals_point_to_the_viewpoint_in_any_frame():
     wall = np.stack([np.arange(0.0, 2.0, 0.04), rng.normal(0.0, 0.005, 50)], axis=-1)
     for side in (1.0, -1.0):
         pose = np.array([3.0, -2.0, 2.5])
-        cloud = make_cloud(se2.transform(pose, wall), se2.transform(pose, np.array([1.0, side])))
+        cloud = single_points(se2.transform(pose, wall), se2.transform(pose, np.array([1.0, side])))
         assert (se2.rotate(-pose[2], cloud.normals)[:, 1] * side > 0.9).all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_tiny_clouds_have_no_lines(n):
-    cloud = make_cloud(np.zeros((n, 2)))
+    cloud = single_points(np.arange(n)[:, None] * np.array([1.0, 0.0]))
     assert cloud.offsets.tolist() == [0, n]
     assert (cloud.normals == 0.0).all()
     assert (cloud.normal_variance == 0.0).all()

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
+from helpers.registration_worlds import CORRIDOR, ROOM, cloud, pair, wall_points
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize, surface_field
-from uwblite.lidar.clouds import joined, make_cloud
+from uwblite.lidar.clouds import joined
 from uwblite.lidar.correlative_matching import CorrelativeConfig, _peaks, score_grid, search
 from uwblite.lidar.scan_matching import align_pairs, pairs_of
 
@@ -78,7 +78,7 @@ def test_points_count_that_only_a_far_shift_brings_onto_a_long_field(axis):
 def test_the_field_is_the_likelihood_of_the_nearest_point():
     rng = np.random.default_rng(1)
     config = CorrelativeConfig(resolution=0.05, spread=0.1)
-    target = make_cloud(wall_points(ROOM, rng))
+    target = cloud(wall_points(ROOM, rng))
     field, origin = _field(target, config)
     rows, columns = np.indices(field.shape)
     centres = origin + (np.stack([columns, rows], axis=-1).reshape(-1, 2) + 0.5) * config.resolution
@@ -126,8 +126,8 @@ def test_equal_rooms_are_both_found():
     box = np.array([[0, 0, 3, 0], [3, 0, 3, 2], [3, 2, 0, 2], [0, 2, 0, 0]], dtype=float)
     rooms = [wall_points(box + np.array([x, 0.0, x, 0.0]), rng) for x in (0.0, 4.0)]
     inside = [np.tile([x + 1.5, 1.0], (len(room), 1)) for x, room in zip((0.0, 4.0), rooms, strict=True)]
-    target = make_cloud(np.vstack(rooms), np.vstack(inside))
-    source = make_cloud(wall_points(box, rng), np.array([1.5, 1.0]))
+    target = cloud(np.vstack(rooms), np.vstack(inside))
+    source = cloud(wall_points(box, rng), np.array([1.5, 1.0]))
     found = search(target, source, np.array([2.0, 0.0, 0.0]), (2.5, 1.0, 0.2))
     assert rivalry(found) > 0.9
     np.testing.assert_allclose(np.sort(found.poses[:2, 0]), [0.0, 4.0], atol=0.2)
@@ -136,8 +136,8 @@ def test_equal_rooms_are_both_found():
 def test_the_back_of_a_wall_does_not_match_its_front():
     rng = np.random.default_rng(4)
     wall = np.array([[0.0, 0.0, 5.0, 0.0], [2.0, 0.0, 2.0, 0.6]])
-    target = make_cloud(wall_points(wall, rng), np.array([3.0, 2.0]))
-    behind = make_cloud(wall_points(wall[:1], rng), np.array([3.0, -2.0]))
+    target = cloud(wall_points(wall, rng), np.array([3.0, 2.0]))
+    behind = cloud(wall_points(wall[:1], rng), np.array([3.0, -2.0]))
     found = search(target, behind, np.zeros(3), (0.3, 0.3, 0.1))
     assert found.scores.max(initial=0.0) < 0.05
 
@@ -145,7 +145,7 @@ def test_the_back_of_a_wall_does_not_match_its_front():
 @pytest.mark.parametrize("sizes", [(0, 50), (50, 0), (0, 0), (1, 1)])
 def test_clouds_that_fit_nowhere_give_no_candidates(sizes):
     rng = np.random.default_rng(5)
-    target, source = (make_cloud(rng.uniform(0.0, 2.0, (n, 2)) + k * 100.0) for k, n in enumerate(sizes))
+    target, source = (cloud(rng.uniform(0.0, 2.0, (n, 2)) + k * 100.0) for k, n in enumerate(sizes))
     found = search(target, source, np.zeros(3), (0.5, 0.5, 0.1))
     assert found.poses.shape == (0, 3)
 

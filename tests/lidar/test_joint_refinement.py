@@ -10,13 +10,13 @@ from helpers.planted import aligned_error, box
 from scipy import sparse
 
 from uwblite import se2
-from uwblite.arrays import rms_length
+from uwblite.arrays import chunks, rms_length
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.lidar import joint_refinement, overlap, scan_matching
+from uwblite.lidar import joint_refinement, scan_matching, visibility
 from uwblite.lidar.cloud_rasters import ScanClouds, rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
@@ -28,8 +28,8 @@ from uwblite.lidar.joint_refinement import (
     unmeasured,
     with_fewer_pairs,
 )
-from uwblite.lidar.overlap import surface_cells
 from uwblite.lidar.scan_matching import PairFactors, match, measured
+from uwblite.lidar.visibility import surface_cells
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -182,10 +182,10 @@ def test_neighbours_are_of_one_recording():
 def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
     truth, _, clouds = room(4)
     j = np.arange(len(clouds))[::-1]
-    whole, listed = overlap.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
-    monkeypatch.setattr(overlap, "_POINTS_AT_ONCE", 37)
-    monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
-    parts = overlap.surface_cells(clouds, truth)
+    whole, listed = visibility.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
+    monkeypatch.setattr(visibility, "chunks", lambda rows: chunks(rows, 37))
+    monkeypatch.setattr(scan_matching, "chunks", lambda rows, *_: chunks(rows, 3))
+    parts = visibility.surface_cells(clouds, truth)
     assert len(clouds.points) > 200
     assert parts.shape == whole.shape
     assert (parts != whole).nnz == 0

@@ -6,8 +6,7 @@ from helpers.laser_walks import CORRIDOR, HALL, scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.overlap import OverlapPolicy, directional_overlap, net_overlap
-from uwblite.lidar.visibility import free_around, seen_beyond
+from uwblite.lidar.visibility import OverlapPolicy, directional_overlap, free_around, net_overlap, seen_beyond
 
 GATE, SPACING = 0.15, 0.02
 FIRST, SECOND = np.array([0]), np.array([1])

@@ -22,7 +22,7 @@ def _distances(points):
     return np.sqrt(((points[:, None] - points[None, :]) ** 2).sum(axis=-1))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(clouds, st.integers(1, 8), st.floats(0.0, 3.0))
 def test_statistical_filter_equals_brute_force(points, neighbours, ratio):
     keep = statistical_outlier_filter(points, neighbours, ratio)
@@ -36,7 +36,7 @@ def test_statistical_filter_equals_brute_force(points, neighbours, ratio):
     np.testing.assert_array_equal(keep[clear], (mean <= threshold)[clear])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(clouds, st.floats(0.05, 3.0), st.integers(0, 5))
 def test_radius_filter_equals_brute_force(points, radius, least):
     distances = _distances(points)
@@ -45,7 +45,7 @@ def test_radius_filter_equals_brute_force(points, radius, least):
     np.testing.assert_array_equal(radius_outlier_filter(points, radius, least)[clear], (others >= least)[clear])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(clouds, st.floats(0.05, 3.0))
 def test_voxel_filter_equals_brute_force(points, size):
     squares = {}
@@ -86,7 +86,7 @@ def test_filters_take_a_lone_outlier_and_leave_the_wall():
         assert keep.tolist() == [True] * 61 + [False]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(clouds, st.floats(0.1, 3.0))
 def test_lines_equal_the_eigenvectors_of_each_neighbourhood(points, radius):
     lines = estimate_normals(points, make_tree(points), radius)

@@ -131,7 +131,7 @@ def test_fitness_is_the_mean_squared_distance_of_all_points():
     assert fitness_score(make_tree(points[:1]), points[:1] + np.array([0.3, 0.4]), np.zeros(3)) == pytest.approx(0.25)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     hnp.arrays(np.float64, st.tuples(st.integers(0, 30), st.just(2)), elements=st.floats(-2.0, 2.0)),
     hnp.arrays(np.float64, st.tuples(st.integers(0, 30), st.just(2)), elements=st.floats(-2.0, 2.0)),

@@ -7,6 +7,7 @@ import pytest
 from helpers.planted_rays import POSES, SURFACES, linearized, rays_that_end
 
 from uwblite import se2
+from uwblite.arrays import chunks
 from uwblite.lidar.ray_equations import noise_of, weighted_sums
 from uwblite.lidar.surface_rays import MeasuredSurfaces, RayNoise, SurfaceRays, Surfaces
 
@@ -104,7 +105,7 @@ def test_rays_some_at_a_time_say_what_they_say_at_once(monkeypatch):
     rays = rays_that_end(0.01).by_keyframe(SURFACES)
     found = MeasuredSurfaces(SURFACES, rays, RayNoise(1.0, np.ones(2)))
     whole, noise = weighted_sums(found, POSES, POSES, 3.0), noise_of(rays, SURFACES, POSES, POSES)
-    monkeypatch.setattr("uwblite.lidar.surface_rays._RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("uwblite.lidar.surface_rays.chunks", lambda rows: chunks(rows, 7))
     parts = weighted_sums(found, POSES, POSES, 3.0)
     assert len(parts.keyframe) > len(whole.keyframe)
     for name in ("poses", "pose_slope", "surfaces", "surface_slope", "across"):

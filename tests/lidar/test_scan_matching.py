@@ -187,7 +187,7 @@ def quadratic_form(rng, rank):
     return jacobian.T @ jacobian, jacobian.T @ rng.normal(0, 0.01, 40)
 
 
-@settings(max_examples=30)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_a_measurement_has_the_cost_of_its_factors(seed, rank):
     """For any pose T near the one matched at, |L e(T)|^2 differs from the quadratic form by a constant."""
@@ -204,7 +204,7 @@ def test_a_measurement_has_the_cost_of_its_factors(seed, rank):
     assert np.linalg.matrix_rank(root[0], tol=1e-6 * np.abs(root[0]).max()) == rank
 
 
-@settings(max_examples=30)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_what_scatter_adds_is_taken_off_and_never_more(seed):
     """0 <= information <= H, and a direction in which H is less than twice the spurious information is not moved."""

@@ -15,7 +15,7 @@ KEEP = SubmapConfig(epsilon=2.0, voxel=0.08, std_ratio=1e6, min_neighbours=0)
 """No filter but the voxels."""
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.integers(0, 1000), st.floats(0.05, 20.0), st.integers(1, 80))
 def test_pieces_are_no_longer_than_epsilon_and_of_one_recording(seed, epsilon, n):
     rng = np.random.default_rng(seed)

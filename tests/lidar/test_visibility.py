@@ -36,9 +36,10 @@ def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(hall):
 
 def test_visits_agree_where_every_pose_is_true(hall):
     truth, path, clouds = hall
-    share, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.intp))
+    share, within, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.intp))
     assert visits > 20
     assert share < 0.01
+    assert within < 0.01
 
 
 @pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
@@ -46,13 +47,14 @@ def test_visits_are_inconsistent_where_half_of_the_recording_lies_elsewhere(hall
     truth, path, clouds = hall
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])
-    share, _ = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
-    assert 0.05 < share < 1.0
+    share, within, _ = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
+    assert max(0.05, 3.0 * within) < share < 1.0
 
 
 def test_one_visit_has_nothing_to_compare_with(hall):
     truth, path, clouds = hall
-    assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.intp)) == (0.0, 0)
+    share, _, visits = free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.intp))
+    assert (share, visits) == (0.0, 0)
 
 
 def test_one_keyframe_compared_with_many_is_one_visit(hall):
@@ -64,7 +66,7 @@ def test_one_keyframe_compared_with_many_is_one_visit(hall):
     kept &= path < path[np.argmax(kept)] + 5.0
     kept[again] = True
     poses[kept] = truth[kept]
-    share, visits = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
+    share, _, visits = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.intp))
     assert visits == 1
     assert share < 0.05
 
@@ -76,7 +78,7 @@ def near(poses, k):
 def test_recordings_are_visits_of_their_own(hall):
     truth, path, clouds = hall
     recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.intp)
-    assert free_space_violation(clouds, truth, 0.01 * path, recording)[1] > 0
+    assert free_space_violation(clouds, truth, 0.01 * path, recording)[2] > 0
 
 
 def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(hall):
@@ -105,6 +107,12 @@ def with_a_walker(truth, clouds):
     points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
     owner = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
     return Clouds(np.concatenate([[0], np.cumsum(counts)]), points, normals, owner, np.zeros(len(points)))
+
+
+def test_people_violate_free_space_within_one_visit_as_they_do_between_two(hall):
+    truth, path, clouds = hall
+    share, within, _ = free_space_violation(with_a_walker(truth, clouds), truth, path, np.zeros(len(truth), dtype=np.intp))
+    assert 0.01 < share < 1.5 * within
 
 
 def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(hall):

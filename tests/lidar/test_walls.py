@@ -5,6 +5,7 @@ import pytest
 from helpers.wall_rays import seen
 
 from uwblite import se2
+from uwblite.arrays import chunks
 from uwblite.lidar import walls as walls_module
 from uwblite.lidar.walls import WallPolicy, find_walls, straight_pieces
 
@@ -124,8 +125,7 @@ def test_walls_found_strip_by_strip_are_those_found_at_once(monkeypatch):
     room = [[-3.0, -1.0, 9.0, -1.0], [9.0, -1.0, 9.0, 4.0], [9.0, 4.0, -3.0, 4.0], [-3.0, 4.0, -3.0, -1.0]]
     room += [[x, 1.0, x + 1.0, 1.0] for x in (0.0, 3.0, 6.0)] + [[x + 1.0, 1.3, x, 1.3] for x in (0.0, 3.0, 6.0)]
     whole = walls_from(poses, room)[0]
-    monkeypatch.setattr(walls_module, "_AT_ONCE", 7)
-    monkeypatch.setattr(walls_module, "_PAIRS_AT_ONCE", 50)
+    monkeypatch.setattr(walls_module, "chunks", lambda rows: chunks(rows, 7))
     parts = walls_from(poses, room)[0]
     assert len(whole.centre) >= 6
     for name in ("of_piece", "centre", "normal"):

@@ -6,13 +6,13 @@ import importlib.util
 import numpy as np
 import pytest
 from conftest import ROOT
+from helpers.localization_room import known_map
 
 from uwblite import se2
 from uwblite.constraints import Constraints
 from uwblite.errors import Cancelled, DataError
 from uwblite.io.carmen import read_log
 from uwblite.io.stored_result import StoredAnchor
-from uwblite.localization.known_map import known_map
 from uwblite.localization.localize import localize
 from uwblite.mapping import build_map
 
@@ -32,8 +32,8 @@ def map_of(result, grid=True, **moved):
     return known_map(stored, result.grid if grid is True else grid)
 
 
-def part(log, seconds=30.0):
-    """Half a minute of it: where they begin is not said, and their odometry starts elsewhere."""
+def part(log, seconds=20.0):
+    """Twenty seconds of it: where they begin is not said, and their odometry starts elsewhere."""
     start = float(log.odometry.stamps[0]) + 120.0
     later = log.crop(start, start + seconds)
     away = se2.compose(np.array([20.0, 7.0, -1.0]), later.odometry.poses)

@@ -43,14 +43,14 @@ def test_a_moved_anchor_among_others_takes_no_pose_away():
 def test_walls_that_fit_outweigh_ranges_that_jump():
     fit = after((0, CONTRADICTS), (1, CONTRADICTS))
     for k in range(20):
-        fit.add_scan(-0.05, True, 3.0 + 0.1 * k)
+        fit.add_scan(0.3, 3.0 + 0.1 * k)
     assert fit.jumped()
     assert not fit.ranges_contradict()
 
 
 def test_what_agrees_by_chance_after_a_jump_does_not_hide_its_beginning():
     fit = after((0, AGREES), (1, CONTRADICTS), (2, CONTRADICTS))
-    fit.add_scan(-0.1, True, 3.5)
+    fit.add_scan(0.25, 3.5)
     assert 1.0 <= fit.agreed() < 2.0
 
 
@@ -77,10 +77,10 @@ def test_a_pose_that_is_lost_is_not_lost_again_by_the_same_ranges():
 
 def test_a_range_that_agrees_by_chance_does_not_hide_since_when_in_doubt():
     fit = after((0, AGREES))
-    fit.add_scan(-0.1, True, 2.0)
+    fit.add_scan(0.25, 2.0)
     assert not fit.in_doubt()
     for k in range(20):
-        fit.add_scan(-0.5, True, 2.1 + 0.1 * k)
+        fit.add_scan(-0.15, 2.1 + 0.1 * k)
     fit.add_range(1, *AGREES, 4.0)
     assert fit.in_doubt()
     assert not fit.scans_contradict()

@@ -9,13 +9,13 @@ from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.loop_closure.chain_breaks import TiePolicy, jumps, moved_by, slid, steps_fixed, tied_parts, untied_breaks
+from uwblite.loop_closure.chain_breaks import TiePolicy, jumps, moved_by, slid, steps_fixed
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig
 from uwblite.loop_closure.verification import _tightened, reconcile
 from uwblite.map_result import LoopClosure
 from uwblite.odometry.wheels import OdometryNoiseConfig
 
-KEYFRAMES, SLIDE, BREAK = 60, 2.9, 30
+KEYFRAMES, SLIDE = 60, 2.9
 NOISE = np.array([0.02, 0.02, 0.01])
 
 
@@ -156,59 +156,3 @@ def test_what_scan_edges_fix_is_told_step_by_step(seed):
             fixed[a:b] = True
     assert 0 < fixing.sum() < agrees.sum() < size
     np.testing.assert_array_equal(steps_fixed(graph), fixed)
-    sound = rng.random(len(wheels)) < 0.3
-    part = np.arange(KEYFRAMES)
-    ties = [(int(w), int(v)) for w, v, s in zip(wheels.i, wheels.j, sound, strict=True) if s or fixed[w]]
-    ties += [(int(a), int(b)) for a, b, ok in zip(i, j, fixing, strict=True) if ok]
-    for _ in range(KEYFRAMES):
-        for a, b in ties:
-            part[[a, b]] = min(part[a], part[b])
-    found = tied_parts(wheels, graph, sound)
-    np.testing.assert_array_equal(found[:, None] == found, part[:, None] == part)
-
-
-def scan_edges(truth, steps):
-    """Return exact scan edges over some steps of the chain."""
-    none, root = np.zeros((len(steps), 3)), np.tile(np.diag([100.0, 100.0, 300.0]), (len(steps), 1, 1))
-    z = se2.between(truth[steps], truth[steps + 1])
-    return ScanEdges(steps, steps + 1, z, root, none, none, scan_indices(Calibration()))
-
-
-def one_edge(truth, i, j, root):
-    none = np.zeros((1, 3))
-    z = se2.between(truth[[i]], truth[[j]])
-    return ScanEdges(np.array([i]), np.array([j]), z, np.diag(root)[None], none, none, scan_indices(Calibration()))
-
-
-ALL, ALONG = (100.0, 100.0, 300.0), (5.0, 100.0, 300.0)
-"""What a match fixes, 1/m, 1/m, 1/rad: everything, or the way along a wall to 0.2 m only."""
-
-
-@pytest.mark.parametrize(
-    ("across", "found"),
-    [
-        ([], True),
-        ([(30, 31, ALONG)], True),
-        ([(30, 31, ALL)], False),
-        ([(28, 32, ALL)], False),
-        # Keyframes 3 m apart were laid onto each other where the chain had put them; another visit was searched for.
-        ([(27, 33, ALL)], True),
-        ([(5, 55, ALONG)], True),
-        ([(5, 55, ALL)], False),
-    ],
-)
-def test_a_break_is_tied_by_scans_that_leave_no_direction_free(across, found):
-    truth = np.column_stack([0.5 * np.arange(60.0), np.zeros((60, 2))])
-    wheels, measured = chained(truth, NOISE), np.arange(59) != BREAK
-    edges = [scan_edges(truth, np.flatnonzero(measured)), *(one_edge(truth, *edge) for edge in across)]
-    graph = Graph(truth).with_edges(wheels, *edges)
-    assert untied_breaks(wheels, graph, measured, truth[:, 0]).tolist() == ([BREAK] if found else [])
-
-
-def test_keyframes_between_two_breaks_are_no_part_and_a_few_at_the_ends_neither():
-    truth = np.column_stack([0.5 * np.arange(60.0), np.zeros((60, 2))])
-    wheels = chained(truth, NOISE)
-    for breaks, found in (([30, 32], [32]), ([2], []), ([30, 56], [30]), (np.arange(59), [])):
-        measured = ~np.isin(np.arange(59), breaks)
-        graph = Graph(truth).with_edges(wheels, scan_edges(truth, np.flatnonzero(measured)))
-        assert untied_breaks(wheels, graph, measured, truth[:, 0]).tolist() == found

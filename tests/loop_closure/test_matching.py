@@ -70,17 +70,17 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
         return SimpleNamespace(poses=np.tile(guess, (30, 1)))
 
     monkeypatch.setattr(matching, "search", search)
-    monkeypatch.setattr(matching, "_prepare", lambda clouds, k: k)
     monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
     spread, sigma = np.array([config.direct, 1.0, 2.0, 9.0]), np.array([1.0, 0.01, 0.1, 9.0])
     candidates = SimpleNamespace(
         spread=spread, covariance=np.eye(3) * sigma[:, None, None] ** 2, guess=np.arange(12.0).reshape(4, 3),
         target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
     )  # fmt: skip
+    numbers = SimpleNamespace(chosen=lambda which: int(which[0]))
     fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
     for candidates.long, places, step in ((False, config.places, fine), (True, matching.MatchingPolicy.many_places, coarse)):
         asked.clear(), steps.clear()
-        rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
+        rows, guesses = matching._guesses(matching._Batch(candidates, numbers, 0.1, None, config, CorrelativeConfig()))
         wide = (3, 7, 9.0, 9.0, config.search_angle)
         assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), wide]
         assert steps == [step] * 3

@@ -278,7 +278,7 @@ def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarr
     return Closures(RelativePoseEdges(i, j, pose, root), records), false
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_contradicting_closures_are_dropped_with_a_reason(seed):
     rng = np.random.default_rng(seed)
     truth, _, _ = walked(seed, metres=40.0)

@@ -11,13 +11,19 @@ from helpers.told import doubted
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.pose_edges import ScanEdges
+from uwblite.graph.work import Work
 from uwblite.lidar.cloud_rasters import ScanClouds
 from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline import lidar_stages, neighbour_matching
+from uwblite.pipeline import keyframe_data, lidar_stages, neighbour_matching, radio_stages
 from uwblite.pipeline.lidar_stages import check_map_consistency
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import gather
 
+NO_PAIRS = ScanEdges(
+    *(np.zeros(0, dtype=np.intp) for _ in range(2)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)),
+    np.full(4, -1),
+)
 
 @pytest.mark.parametrize(("keys", "fixed"), [
     (("laser_x", "odometry_scale"), [False, True]), (("sideways_per_turn", "laser_x"), [True, False]),
@@ -36,6 +42,33 @@ def test_clouds_are_made_and_the_laser_is_free_from_then_on(keys, fixed):
     assert [(s.name, s.figures) for s in task.stages.done] == [("clouds", {"points": points})]
     assert points > 50 * len(graph.poses)
     assert made.graph.fixed_calibration.tolist() == fixed
+
+
+def test_scans_between_keyframes_show_where_the_robot_was_when_stamps_of_the_odometry_jitter():
+    """The odometry's stamps are off by 50 ms; the poses at keyframes are right."""
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 20.0, speed=0.8, half_width=4.0)
+    off = np.clip(stamps + 0.05 * rng.standard_normal(len(stamps)), stamps[0], stamps[-1])
+    wheels = odometry(stamps, se2.interpolate_trajectory(stamps, truth, off))
+    log = recording(wheels, None, scans(stamps, truth, HALL, rate=5.0, range_max=8.0))
+    config = MappingConfig(keyframes=KeyframeConfig(scans=1))
+    task = task_of(gather([log], config.keyframes), config)
+    (one,) = task.recordings.each
+    reckoned = radio_stages.dead_reckoning(one, config)
+    graph = replace(reckoned.graph, poses=se2.interpolate_trajectory(stamps, truth, one.frames.stamps))
+    estimate = replace(reckoned, graph=graph, scans=keyframe_data.make(task.recordings, config, 0.0, Work()), joint=NO_PAIRS)
+    placed = lidar_stages.place_scans_between(estimate, task)
+    (after,) = placed.recordings.each
+    inside = log.scans.middles[(log.scans.middles > one.frames.stamps[0]) & (log.scans.middles < one.frames.stamps[-1])]
+    right = se2.interpolate_trajectory(stamps, truth, inside)
+    turned = [
+        np.abs(se2.between(right, r.dense_trajectory(graph.poses, inside))[:, 2]).mean() for r in (one, after)
+    ]
+    assert turned[1] < 0.6 * turned[0]
+    np.testing.assert_allclose(after.dense_trajectory(graph.poses, one.frames.stamps), graph.poses, atol=1e-9)
+    np.testing.assert_array_equal(after.trajectory_stamps, stamps)
+    thinner = replace(after, log=replace(log, odometry=log.odometry.rows(slice(None, None, 2))))
+    assert np.isin(after.between.frames.stamps, thinner.trajectory_stamps).all()
 
 
 @pytest.mark.parametrize("torn", [False, True])

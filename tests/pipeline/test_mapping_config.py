@@ -47,7 +47,7 @@ def test_the_paper_s_figures_are_in_its_preset():
 @pytest.fixture(scope="module")
 def result(log):
     # In a small room a sub-map of 9 m would be the whole of a lap.
-    return build_map(log.crop(0.0, 130.0), replace(preset("paper"), submaps=replace(preset("paper").submaps, epsilon=3.0)))
+    return build_map(log.crop(0.0, 100.0), replace(preset("paper"), submaps=replace(preset("paper").submaps, epsilon=3.0)))
 
 
 def test_the_paper_s_run_is_plain(result):

@@ -27,7 +27,7 @@ def drive(seed, places=PLACES, *, lidar=True, start=0.0, turn=0.0, length=22.0, 
     """A recording of the room and its truth; its odometry begins in a frame of its own."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, length)
-    seen = scans(stamps, truth, ROOM, beams=180, rng=rng, noise=0.01) if lidar else None
+    seen = scans(stamps, truth, ROOM, beams=120, rng=rng, noise=0.01) if lidar else None
     radio = ranges(rng, stamps, truth, places, sigma=0.04, tag=tuple(mounting.tag_position[:2].tolist()))
     wheels = odometry(stamps, truth, rng, noise=0.003, turn_noise=0.002)
     wheels = replace(wheels, poses=se2.compose(np.array([3.0, -2.0, turn]), wheels.poses))

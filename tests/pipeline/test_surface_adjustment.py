@@ -71,7 +71,7 @@ def test_rays_say_nothing_of_where_the_whole_map_is_and_how_it_is_turned(around)
     free = np.zeros(len(after.graph.poses), dtype=bool)
     graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint), fixed_poses=free)
     stated, rays = for_covariances(after.surfaces, graph, around["task"])
-    unknowns = filled(stated, subtrees=True).unknowns
+    unknowns = filled(stated, last=()).unknowns
     found, number = rays(unknowns), unknowns.number["poses"]
     for motion in np.eye(3):
         of_poses = np.tile(motion, (len(number), 1)) + motion[2] * np.column_stack(
@@ -111,7 +111,7 @@ def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(arou
     graph = with_free(replace(after.graph, edges=(*after.odometry_and_ranges, after.joint)), "laser_x")
     graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
     stated, rays = for_covariances(after.surfaces, graph, task)
-    unknowns = filled(stated, subtrees=True).unknowns
+    unknowns = filled(stated, last=()).unknowns
     found, moves, heading = rays(unknowns), np.zeros(unknowns.size + 1), graph.poses[:, 2]
     moves[unknowns.number["poses"]] = -np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
     moves[unknowns.number["calibration"][graph.calibration.index("laser_x")]] = 1.0

@@ -105,7 +105,7 @@ def test_places_keep_half_a_metre_from_walls_where_there_is_room():
     assert len(narrow.places) == 2
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_exchange_of_one_place_is_better(seed):
     rng = np.random.default_rng(seed)
     at, offered = rng.uniform(0, 10, (30, 2)), rng.uniform(0, 10, (25, 2))

@@ -168,8 +168,9 @@ def planted(seed, *, landmarks_only=False, wrong=0.0):
     return Graph(poses, np.zeros((0, 2)), (odometry, met)), chains, truth
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("ties", [{}, {"wrong": 0.1}, {"landmarks_only": True}], ids=["ranges", "wrong ranges", "landmarks"])
+@pytest.mark.parametrize(
+    ("seed", "ties"), [(0, {}), (1, {"wrong": 0.1}), (2, {"landmarks_only": True})], ids=["ranges", "wrong ranges", "landmarks"]
+)
 def test_chains_find_their_places(seed, ties):
     graph, chains, truth = planted(seed, **ties)
     errors = [np.hypot(*(g.poses[:, :2] - truth[:, :2]).T).max() for g in place_chains(graph, chains)]
@@ -178,9 +179,8 @@ def test_chains_find_their_places(seed, ties):
     assert len(place_chains(replace(graph, poses=truth), np.zeros(len(truth), dtype=np.intp))) == 1
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_optimize_is_as_good_as_from_the_truth(tmp_path, seed, capsys):
-    graph, chains, truth = planted(seed)
+def test_optimize_is_as_good_as_from_the_truth(tmp_path, capsys):
+    graph, chains, truth = planted(1)
     names = [f"{'ABC'[c]}{100 + k}" for k, c in enumerate(chains.tolist())]
     write_pyfg(tmp_path / "robots.pyfg", graph, pose_ids=names)
     words = ["--from-odometry", "--out", str(tmp_path / "out.pyfg"), "--json"]

@@ -56,7 +56,7 @@ def test_a_sound_radio_gets_narrow_priors(seed):
     assert CONFIG.range_bias_sound < found["bias:A00"] == found["bias:A03"] < 2.0 * CONFIG.range_bias_sound
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_radio_with_large_biases_gets_wide_ones(seed):
     graph, edges = solved(seed, bias=(0.9, 0.4, 1.3, 0.7))
     found = widths(select_priors(graph, (edges,), CONFIG))

@@ -41,7 +41,7 @@ def expected_sigma(path, anchor, sigma, outliers, samples):
     return sigma * np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal)[:2, :2])[-1])
 
 
-@settings(max_examples=30)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 0.4]), st.floats(-0.3, 1.5))
 def test_planted_anchors_are_found_among_false_ranges(seed, outliers, bias):
     rng = np.random.default_rng(seed)

@@ -14,7 +14,6 @@ from uwblite.screening.wheel_motion import (
     compare,
     disagreeing,
     factor,
-    ratios,
     replaced,
     standing,
     undiluted,
@@ -268,17 +267,15 @@ def test_a_robot_at_rest_whose_scans_differ_by_noise_stands(monkeypatch, moved, 
     assert len(wheel_motion.lost(log, compared)) == (not stands)
 
 
-def test_ratios_are_those_along_the_wheels_of_clear_motions():
+def test_the_factor_is_the_median_of_those_along_the_wheels_of_clear_motions():
     rng = np.random.default_rng(1)
     wheels, lidar = rng.normal(size=(50, 2)) * 0.1, rng.normal(size=(50, 2))
-    rows, ratio = ratios(wheels, lidar, 0.08)
-    expected = [k for k in range(50) if np.hypot(*wheels[k]) > 0.08]
-    assert rows.tolist() == expected
+    clear = np.flatnonzero(np.hypot(*wheels.T) > 0.08)
     # The factor by which the wheels' motion comes nearest to the lidar's.
-    np.testing.assert_allclose(ratio, [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in expected])
-    assert factor(wheels, lidar, 0.08) == np.median(ratio)
-    assert factor(wheels[expected][:12], lidar[expected][:12], 0.0) == np.median(ratio[:12])
-    assert (factor(wheels[:11], lidar[:11], 0.0), factor(wheels[:11], lidar[:11], 0.0, 7.0)) == (1.0, 7.0)
+    nearest = [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in clear]
+    assert factor(wheels, lidar, 0.08) == pytest.approx(np.median(nearest))
+    assert factor(wheels[clear][:12], lidar[clear][:12], 0.0) == pytest.approx(np.median(nearest[:12]))
+    assert np.isnan(factor(wheels[:11], lidar[:11], 0.0))
 
 
 def test_noise_of_turns_that_are_chosen_by_it_makes_no_factor():

@@ -236,13 +236,11 @@ def test_false_ranges_last_for_their_stretch_only():
 
 
 def test_same_seed_same_bytes_and_parts_do_not_disturb_each_other(room):
-    first, second = (b"".join(logfile.log_lines(simulate(SHORT))) for _ in range(2))
-    assert first == second
-    other = simulate(replace(SHORT, seed=4))
-    assert not np.allclose(other.truth[-1], simulate(SHORT).truth[-1])
-    heavy = simulate(replace(SHORT, nlos="heavy"))
-    np.testing.assert_array_equal(heavy.truth, simulate(SHORT).truth)
-    np.testing.assert_array_equal(heavy.scans, simulate(SHORT).scans)
+    one, same, other, heavy = map(simulate, (SHORT, SHORT, replace(SHORT, seed=4), replace(SHORT, nlos="heavy")))
+    assert b"".join(logfile.log_lines(one)) == b"".join(logfile.log_lines(same))
+    assert not np.allclose(other.truth[-1], one.truth[-1])
+    np.testing.assert_array_equal(heavy.truth, one.truth)
+    np.testing.assert_array_equal(heavy.scans, one.scans)
 
 
 def test_every_ray_is_cast_at_its_own_time():

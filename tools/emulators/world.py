@@ -4,7 +4,8 @@ import gzip
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from functools import lru_cache
+from itertools import count, islice
 from pathlib import Path
 
 FIRST_STEP, LAST_STEP, FRONT_STEP, RESOLUTION = 44, 725, 384, 1024
@@ -152,32 +153,21 @@ class RoomWorld:
 
     def scans(self) -> Iterator[Scan]:
         """Yield ten sweeps a second."""
-        turn, step_time = 2 * math.pi / RESOLUTION, 0.1 / RESOLUTION
-        k = 0
-        while True:
-            time = 0.1 * k
-            values = []
-            for i in range(STEPS):
-                pose = self.pose(time + i * step_time)
-                angle = pose.theta + (FIRST_STEP + i - FRONT_STEP) * turn
-                values.append(min(MAX_MM, round(1000 * self._distance(pose.x, pose.y, math.cos(angle), math.sin(angle)))))
-            yield Scan(time, [value if value < MAX_MM else 0 for value in values])
-            k += 1
+        for k in count():
+            yield Scan(0.1 * k, list(_sweep(k)))
 
     def look(self, times: list[float], bearings: list[float]) -> list[int]:
         """Return what a laser on the base sees at world times `times`, mm, at bearings in turns clockwise."""
         seen, rate = [], self.SPEED / self.RADIUS
+        left, bottom, right, top = self.WALLS
         for time, bearing in zip(times, bearings, strict=True):
             theta = max(0.0, time) * rate
-            x, y, angle = self.RADIUS * math.sin(theta), -self.RADIUS * math.cos(theta), theta - 2 * math.pi * bearing
-            seen.append(round(1000 * self._distance(x, y, math.cos(angle), math.sin(angle))))
+            angle = theta - 2 * math.pi * bearing
+            cos, sin = math.cos(angle), math.sin(angle)
+            along_x = ((right if cos > 0 else left) - self.RADIUS * math.sin(theta)) / cos if cos else math.inf
+            along_y = ((top if sin > 0 else bottom) + self.RADIUS * math.cos(theta)) / sin if sin else math.inf
+            seen.append(round(1000 * (along_x if along_x < along_y else along_y)))
         return seen
-
-    def _distance(self, x: float, y: float, cos: float, sin: float) -> float:
-        left, bottom, right, top = self.WALLS
-        along_x = ((right if cos > 0 else left) - x) / cos if cos else math.inf
-        along_y = ((top if sin > 0 else bottom) - y) / sin if sin else math.inf
-        return min(along_x, along_y)
 
     def epochs(self) -> Iterator[Epoch]:
         """Yield ten rounds a second."""
@@ -194,6 +184,14 @@ class RoomWorld:
         while True:
             yield self.pose(0.05 * k)
             k += 1
+
+
+@lru_cache(1200)
+def _sweep(k: int) -> tuple[int, ...]:
+    """Return a sweep of the room, mm, 0 = nothing: every emulated lidar sees the same."""
+    times = [0.1 * k + 0.1 * i / RESOLUTION for i in range(STEPS)]
+    values = RoomWorld().look(times, [(FRONT_STEP - FIRST_STEP - i) / RESOLUTION for i in range(STEPS)])
+    return tuple([value if value < MAX_MM else 0 for value in values])
 
 
 class Feed:

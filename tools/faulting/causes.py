@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 WHEELS = (
-    "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-steps", "odometry-unit", "drift",
+    "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-unit", "drift",
     "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
     "unusual-calibration", "scales", "laser-turned-over", "path-displaced", "wheels-against-ranges",
 )  # fmt: skip

@@ -34,8 +34,8 @@ _BY_RANGES = _of(
 )
 """What a map by ranges and wheels alone shows of a fault of either."""
 _BY_SCANS = _of(
-    "free-space-violation no-closure open-loops contradicting-closures loose-links odometry-steps turn-scale scales uncertain",
-    "poor-fit untied-parts turns-disagree turn-factor unusual-calibration mirrored",
+    "free-space-violation no-closure open-loops loose-links turn-scale scales uncertain",
+    "poor-fit untied-parts turns-disagree unusual-calibration mirrored",
 )
 """What a map shows of a fault of lidar or wheels."""
 _ALL = _of(_BY_RANGES, _BY_SCANS, "wheels-against-lidar carried wheels-stand-still")
@@ -46,7 +46,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
         "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
-        "exchanged-names": _of(_BY_RANGES, "worse-than-parts odometry-steps untied-parts"),
+        "exchanged-names": _of(_BY_RANGES, "worse-than-parts untied-parts"),
         "wheels-against-ranges": _BY_RANGES,
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
         "made-up-stamps": _TIMES,
@@ -60,11 +60,10 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "shared-name": _of(_PLACES, "spikes"),
         "repeated-ranges": _of("few-ranges anchor-unplaced no-anchor odometry-alone uncertain"),
         "repeated-scans": _of("odometry-alone untied-parts silences"),
-        "worse-than-parts": _of(_PLACES, "path-displaced odometry-steps free-space-violation"),
+        "worse-than-parts": _of(_PLACES, "path-displaced free-space-violation"),
         "wheels-against-lidar": _of(_BY_SCANS, _PLACES, "carried range-scatter path-displaced"),
         "scales": _of(_PLACES, "range-scatter poor-fit free-space-violation path-displaced unusual-calibration"),
         "carried": _BY_SCANS | _BY_RANGES,
-        "turn-factor": _of("unusual-calibration"),
         "mirrored": _of("unusual-calibration odometry-unit"),
         "loose-links": _of("free-space-violation no-closure untied-parts anchors-moved-together path-displaced"),
         "free-space-violation": _of(_PLACES, "range-scatter path-displaced"),
@@ -85,7 +84,7 @@ _SHOWN_BY: Mapping[str, frozenset[str]] = MappingProxyType(
             _TIMES,
             _BY_RANGES,
             "ranges-outside-odometry worse-than-parts range-scatter carried spikes few-in-reach few-ranges no-ranges",
-            "untied-parts odometry-alone odometry-steps",
+            "untied-parts odometry-alone",
         ),
         "lidar": _of(_TIMES, _BY_SCANS, _PLACES, "wheels-against-lidar carried no-lidar range-scatter path-displaced"),
     }

@@ -6,7 +6,7 @@ Most are a row of ``TEXTS``; a kind whose severity or words depend on its figure
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from string import Formatter
-from typing import Any
+from typing import Any, ClassVar
 
 from ..findings import DOUBT, WARNING, Fact, Finding, doubt, warning
 from ..screening.units import likely_unit
@@ -48,19 +48,23 @@ def spans(stretches: Sequence[tuple[float, float]]) -> str:
     return ", ".join(words) + more
 
 
-def shown(value: float, sigma: float) -> str:
-    """Return the factor 1 + value with its standard deviation."""
-    return f"{1.0 + value:.2f} \u00b1 {sigma:.2f}"
-
-
 class _Words(Formatter):
-    """Formats figures; beside Python's formats there are `times`, `spans` and `names` of lists, and `yes|no` of a truth."""
+    """Formats figures; beside Python's formats there are `times`, `spans`, `names` and `sectors` of lists, `factor` of what is
+    added to 1, and `yes|no` of a truth."""
+
+    FORMATS: ClassVar[Mapping[str, Callable[[Any], str]]] = {
+        "times": lambda times: listed(times, 1),
+        "spans": spans,
+        "names": lambda names: " and ".join(map(str, names)),
+        "sectors": lambda parts: ", ".join(f"{a:.0f} to {b:.0f}" for a, b in parts[:3]) + " ..." * (len(parts) > 3),
+        "factor": lambda value: f"{1.0 + value:.2f}",
+    }
 
     def format_field(self, value: Any, format_spec: str) -> Any:
-        lists = {"times": lambda times: listed(times, 1), "spans": spans, "names": " and ".join}
         if "|" in format_spec:
             return format_spec.split("|")[0 if value else 1]
-        return lists[format_spec](value) if format_spec in lists else super().format_field(value, format_spec)
+        known = self.FORMATS.get(format_spec)
+        return super().format_field(value, format_spec) if known is None else known(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,7 @@ class Text:
     text: str
     """For people, with the fact's figures in braces."""
     severity: str = WARNING
+    """As text; see Finding."""
     sensor: str = ""
     """As text; see Finding."""
     anchor: str = ""
@@ -79,8 +84,9 @@ class Text:
 
     def finding(self, kind: str, figures: Mapping[str, Any]) -> Finding:
         """Return the finding with the figures of a fact."""
-        text, sensor, anchor = (_Words().vformat(words, (), figures) for words in (self.text, self.sensor, self.anchor))
-        return Finding(kind, self.severity, text, sensor=sensor, anchor=anchor)
+        words = (self.text, self.severity, self.sensor, self.anchor)
+        text, severity, sensor, anchor = (_Words().vformat(each, (), figures) for each in words)
+        return Finding(kind, severity, text, sensor=sensor, anchor=anchor)
 
 
 TEXTS: Mapping[str, Text] = {
@@ -208,9 +214,43 @@ TEXTS: Mapping[str, Text] = {
         "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
     ),
     "free-space-violation": Text(
-        "Doubt a map in which points of one visit to a place stand in the free space of another visit.",
-        "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
-        "parts of the map are misplaced to each other; look at the closures in report.html",
+        "Doubt a map in which points of one visit to a place stand in the free space of another visit, by more than what moves "
+        "explains.",
+        "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space, and within one visit "
+        "only {moving:.0%}: parts of the map are misplaced to each other; look at the closures in report.html",
+        DOUBT,
+    ),
+    "wheels-stand-still": Text(
+        "Warn of wheels that count nothing while other sensors move, where scans replace them; doubt where ranges alone do.",
+        "the wheels count nothing from t = {begin:.0f} to {end:.0f} s while the robot moves: {by_scans:the motion between "
+        "scans is used instead|the trajectory there rests on ranges alone}",
+        "{by_scans:warning|doubt}",
+    ),
+    "own-body": Text(
+        "Warn of beams that see the robot itself: the same nearby at all places and headings.",
+        "{count} of {total} beams of the lidar (at {sectors:sectors} degrees) see the same nearby however the robot is "
+        "turned: the robot itself; they were left out",
+    ),
+    "new-anchor": Text(
+        "Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges.",
+        "anchor {anchor} has ranges only from recording {recording} on: recording {silent:names} drove within its reach "
+        "without hearing it, so it is new or was off",
+        anchor="{anchor}",
+    ),
+    "absent-anchor": Text(
+        "Warn of an anchor to which recordings after the last with ranges (1, 2, ...) should have ranges.",
+        "anchor {anchor} has no ranges after recording {recording}: recording {silent:names} drove within its reach without "
+        "hearing it, so it was taken away or is off",
+        anchor="{anchor}",
+    ),
+    "turn-scale": Text(
+        "Warn of a scale of turns that the lidar's steps contradict: single turns of the odometry are wrong.",
+        "from step to step the lidar turns {by_steps:factor} \u00b1 {sigma:.2f} times as much as the odometry, but the whole "
+        "fits best with {by_all:factor}: single turns of the odometry are wrong; the steps' scale is used",
+    ),
+    "scans-astray": Text(
+        "Doubt a map of which scans lie so far from the others that no grid can hold both.",
+        "{scans} scans are so far from the {used} others that no grid can hold both; they are not drawn",
         DOUBT,
     ),
     "open-loops": Text(
@@ -295,14 +335,6 @@ def carried(at: Sequence[float], silent: float = 0.0) -> Finding:
 
 
 @_rule
-def wheels_stand_still(begin: float, end: float, by_scans: bool) -> Finding:
-    """Warn of wheels that count nothing while other sensors move, where the scans replace them; doubt where ranges alone do."""
-    outcome = "the motion between scans is used instead" if by_scans else "the trajectory there rests on ranges alone"
-    text = f"the wheels count nothing from t = {begin:.0f} to {end:.0f} s while the robot moves: {outcome}"
-    return Finding("wheels-stand-still", WARNING if by_scans else DOUBT, text)
-
-
-@_rule
 def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "") -> Finding:
     """Say in which share of the odometry the heading is the gyro's, and its bias; or why it is not used."""
     how = "by the robot's rests" if rests else "against the wheels"
@@ -320,17 +352,6 @@ def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]])
         "is stuck, slips or has another scale there than elsewhere; cut that part off, or drive it again"
     )
     return Finding("wheels-against-lidar", DOUBT, text, stretches=tuple(stretches))
-
-
-@_rule
-def own_body(count: int, total: int, sectors: Sequence[tuple[float, float]]) -> Finding:
-    """Warn of beams that see the robot itself: the same nearby at all places and headings."""
-    parts = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in sectors[:3]) + " ..." * (len(sectors) > 3)
-    text = (
-        f"{count} of {total} beams of the lidar (at {parts} degrees) see the same nearby however the robot is "
-        "turned: the robot itself; they were left out"
-    )
-    return warning("own-body", text)
 
 
 @_rule
@@ -423,42 +444,6 @@ def worse_than_parts(recording: int, stretch: tuple[float, float], start: float,
     )
     figures = {"off": off, "turned": turned}
     return Finding("worse-than-parts", DOUBT, text, cure, "lidar", (stretch,), recording, figures=figures)
-
-
-@_rule
-def new_anchor(anchor: str, recording: int, silent: Sequence[int]) -> Finding:
-    """Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges."""
-    text = f"anchor {anchor} has ranges only from recording {recording} on: {_drove_there(silent)}, so it is new or was off"
-    return Finding("new-anchor", WARNING, text, anchor=anchor)
-
-
-@_rule
-def absent_anchor(anchor: str, recording: int, silent: Sequence[int]) -> Finding:
-    """Warn of an anchor to which recordings after the last with ranges (1, 2, ...) should have ranges."""
-    text = f"anchor {anchor} has no ranges after recording {recording}: {_drove_there(silent)}, so it was taken away or is off"
-    return Finding("absent-anchor", WARNING, text, anchor=anchor)
-
-
-def _drove_there(numbers: Sequence[int]) -> str:
-    which = ", ".join(map(str, numbers))
-    return f"recording{'s' if len(numbers) > 1 else ''} {which} drove within its reach without hearing it"
-
-
-@_rule
-def turn_scale(name: str, by_steps: float, sigma: float, by_all: float) -> Finding:
-    """Warn of a scale of turns that the lidar's steps contradict: single turns of the odometry are wrong."""
-    text = (
-        f"from step to step the lidar turns {shown(by_steps, sigma)} times as much as the odometry, but the whole fits best "
-        f"with {1.0 + by_all:.2f}: single turns of the odometry are wrong; the steps' scale is used"
-    )
-    return warning("turn-scale", text)
-
-
-@_rule
-def scans_astray(scans: int, used: int) -> Finding:
-    """Doubt a map of which scans lie so far from the others that no grid can hold both."""
-    text = f"{scans} of {scans + used} scans are so far from the others that no grid can hold both; they are not drawn"
-    return doubt("scans-astray", text)
 
 
 @_rule

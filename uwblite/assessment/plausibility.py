@@ -180,19 +180,11 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
 
 
 def check_closures(estimate: Estimate, grid: OccupancyGrid | None) -> Iterator[Finding]:
-    """Warn of a map without loop closures; doubt one that more closures contradict than support.
-
-    How far it has drifted without closures, its uncertainty says (see check_certainty).
-    """
+    """Warn of a map without loop closures: how far it has drifted, its uncertainty says (see check_certainty)."""
     candidates = estimate.closures.candidates
-    accepted = sum(c.accepted for c in candidates)
-    if grid is not None and candidates and accepted == 0:
+    if grid is not None and candidates and not any(c.accepted for c in candidates):
         text = "no loop closure was accepted: drift is not corrected; drive through places twice"
         yield warning("no-closure", text, candidates=len(candidates))
-    contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
-    if contradicted > max(accepted, 4):
-        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them"
-        yield doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
 def check_calibration(

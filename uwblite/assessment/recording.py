@@ -55,8 +55,6 @@ class RecordingView:
     """See Diagnosis."""
     turning: Turning | None
     """Turns by laser and wheels."""
-    turn_ratio: tuple[float, float]
-    """See Screening."""
 
 
 def diagnose(
@@ -75,8 +73,6 @@ def diagnose(
         repaired = repaired or screen(log)
     except DataError as error:
         refused = refused or str(error)
-    screening = None if repaired is None else repaired.screening
-    ratio = (float("nan"), float("nan")) if screening is None else screening.turn_ratio
     figures: dict[str, Any] = {"odometry": sensor_checks.odometry_figures(log.odometry)}
     turning = None
     if log.ranges is not None and len(log.ranges.stamps):
@@ -85,9 +81,9 @@ def diagnose(
         figures["radio calibration"] = sensor_checks.calibration_figures(*made)
     if log.scans is not None and len(log.scans.stamps):
         figures["lidar"] = sensor_checks.lidar_figures(log)
-        figures["lidar"]["turning"], turning = sensor_checks.turning_figures(log, ratio)
-    view = RecordingView(log, repaired, result, refused, figures, turning, ratio)
-    rules = (_check_notes, _check_map, _check_sensors, _check_each_sensor)
+        figures["lidar"]["turning"], turning = sensor_checks.turning_figures(log)
+    view = RecordingView(log, repaired, result, refused, figures, turning)
+    rules = (_check_notes, _check_map, _check_each_sensor)
     return Diagnosis(explained(ranked(finding for rule in rules for finding in rule(view))), figures)
 
 
@@ -118,6 +114,7 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
     if view.result is not None:
         yield from view.result.findings
         return
+    yield from _check_sensors(view)
     for finding in [] if view.repaired is None else check_recording(view.repaired):
         if finding.kind == WHEELS_AGAINST_LIDAR:
             cure = "a map is doubted for it, unless its ranges agree with the lidar there"
@@ -155,7 +152,7 @@ def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
     found = [*sensor_checks.check_odometry(view.log.odometry, figures["odometry"])]
     found += sensor_checks.check_radio(figures["uwb"]) if "uwb" in figures else ()
     found += sensor_checks.check_lidar(figures["lidar"]) if "lidar" in figures else ()
-    found += sensor_checks.check_turning(view.turning, view.turn_ratio) if show_motion(view.log.scans) else ()
+    found += sensor_checks.check_turning(view.turning) if show_motion(view.log.scans) else ()
     for finding in found:
         if view.log.notes.one_clock and finding.kind in ("silences", "slow-odometry") and finding.sensor != "radio":
             cure = "a program wrote a pose with each scan that it used; where the raw log is left, map that"

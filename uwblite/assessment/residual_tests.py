@@ -9,17 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, spread_about_median
+from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..loop_closure.chain_breaks import untied_breaks
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recordings
 from ..radio.line_of_sight import blocked
 from ..radio.range_noise import short_term_sigma
 from .facts import listed
+from .untied_parts import untied_steps
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Largest typical scatter of ranges about the map under multipath and NLOS, m, and relative to their scatter from one to the
@@ -28,13 +28,8 @@ _FREE, _EARLY = 0.1, 0.05
 """Least share of ranges in line of sight to represent all, and share that gross errors make too short."""
 NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
-_SLIP, _SLIP_ANGLE = 1.0, 0.2
-"""m and rad, by which wheels that slip are off in a step at most."""
-_SUDDEN, _JUMP, _CARRIED = 5.0, 20.0, 0.5
-"""Standard deviations that a step of faultless wheels hardly ever exceeds, and one of wheels on the floor never; and the size,
-m or rad, too large for slip."""
-_WINDOW, _MOST = 10, 0.6
-"""Steps in a row, and the share of them that must be off."""
+_JUMP, _CARRIED = 20.0, 0.5
+"""Standard deviations that a step of wheels on the floor never exceeds; and the size, m or rad, too large for slip."""
 _MEASURED = 0.15
 """Steps more uncertain than that, m, are no measurements."""
 _SCALE = 0.15
@@ -112,42 +107,23 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
 def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Find steps of the odometry that the map contradicts far beyond their noise, whatever that was estimated to be.
 
-    Where scans tie both sides of such steps, the wheels slipped and the map followed: good to know. Where ranges alone do, a
-    robust kernel lets one step absorb the errors of many, and the map looks as if the robot had been carried.
+    Where scans tie both sides of such steps, the wheels slipped and the map followed. Where ranges alone do, a robust kernel
+    lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
     wheels, recordings = estimate.odometry, task.recordings
-    if not len(wheels):
+    if recordings.have_scans:
+        at = recordings.stamps[wheels.i[untied_steps(estimate, recordings)]] - recordings.stamps[0]
+        if len(at):
+            text = (
+                f"at t = {listed(at.tolist())} s the odometry fails where the lidar cannot measure the travelled distance, as "
+                "along a bare wall, and neither loop closures nor ranges connect the parts before and after: they may be "
+                "misplaced to each other; drive through the first part once more"
+            )
+            yield doubt("loose-links", text, at=at.tolist())
         return
     whitened = wheels.residuals(estimate.graph)
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED
-    off = np.where(measured, np.abs(whitened).max(axis=1), 0.0)
-    far, stretch = np.flatnonzero(off > _JUMP), _stretch(off > _SUDDEN)
-    if stretch is not None:
-        lidar = recordings.have_scans
-        why = "the wheels slipped, and the map does not follow them" if lidar else "they slipped, or ranges or clocks are wrong"
-        span = int(wheels.i[stretch[0]]), int(wheels.j[stretch[1]])
-        start, end = (seconds(recordings, k) for k in span)
-        text = f"between t = {start:.0f} and {end:.0f} s most steps of the wheels contradict the map beyond their noise: {why}"
-        found = (warning if lidar else doubt)("odometry-steps", text, start=start, end=end)
-        yield between_keyframes(found, recordings, span)
-        measured[stretch[0] : stretch[1] + 1] &= off[stretch[0] : stretch[1] + 1] < _SUDDEN
-    if recordings.have_scans:
-        if not estimate.placed.any():
-            # Loops pull at steps that nothing else measures; a torn map is off by more than wheels slip.
-            way, turn = _error_of(wheels, far, whitened)
-            far = far[(way > _SLIP) | (turn > _SLIP_ANGLE)]
-        measured[far] = False
-        loose = untied_breaks(wheels, estimate.graph, measured, recordings.path)
-        far = np.intersect1d(far, loose)
-        at = (recordings.stamps[wheels.i[loose]] - recordings.stamps[0]).tolist()
-        if at and not estimate.placed.any():
-            # Along a bare wall scans leave a direction free, and nothing else connects the parts before and after.
-            text = (
-                f"at t = {listed(at)} s the odometry fails where the lidar cannot measure the travelled distance, as along a "
-                "bare wall, and no loop closure connects the parts before and after: they may be misplaced to each other; "
-                "drive through the first part once more"
-            )
-            yield doubt("loose-links", text, at=at)
+    far = np.flatnonzero(measured & (np.abs(whitened).max(axis=1, initial=0.0) > _JUMP))
     if estimate.placed.any() and len(far):
         yield _slips(far, whitened, wheels, recordings)
 
@@ -169,15 +145,6 @@ def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Record
     add = doubt if max(way, turn) > _CARRIED else warning
     spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
     return between_keyframes(add("odometry-slips", text, way=way, turn=turn), recordings, *spans)
-
-
-def _stretch(off: Bools) -> tuple[int, int] | None:
-    """Return the first and last step of a stretch in which most steps are off (e,); None where there is none."""
-    share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid") if len(off) >= _WINDOW else np.zeros(1)
-    if share.max() < _MOST:
-        return None
-    last = len(share) - 1 - int(np.argmax(share[::-1] >= _MOST)) + _WINDOW
-    return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
 
 
 def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:

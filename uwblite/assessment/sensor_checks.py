@@ -37,8 +37,6 @@ class CheckPolicy:
     """s; anchors within it are in reach at one time."""
     late: ClassVar[float] = 0.06
     """s; clock offsets below are not distinguished from the time that a sweep takes."""
-    turns: ClassVar[float] = 0.12
-    """Relative difference of turns by laser and wheels that slip does not explain."""
     sigmas: ClassVar[float] = 5.0
     """Standard deviations beyond which nothing is noise."""
 
@@ -259,8 +257,8 @@ def lidar_figures(log: SensorLog) -> Figures:
     return rhythm(scans.stamps, expected_gap=1.0) | {"beams": beams} | _rounded(figures)
 
 
-def turning_figures(log: SensorLog, turn_ratio: tuple[float, float]) -> tuple[Figures, Turning | None]:
-    """Return what laser and wheels measure of turns, as figures and as such; turn_ratio : see Screening."""
+def turning_figures(log: SensorLog) -> tuple[Figures, Turning | None]:
+    """Return what laser and wheels measure of turns, as figures and as such."""
     turning = compare(log) if show_motion(log.scans) else None
     if turning is None:
         return {}, None
@@ -269,8 +267,6 @@ def turning_figures(log: SensorLog, turn_ratio: tuple[float, float]) -> tuple[Fi
         "misfit if mounted the other way up rad": turning.other,
         "laser_delay s": turning.delay,
     }
-    if turn_ratio[0] > 0.0:
-        figures["turn by laser / turn by wheels"] = turn_ratio[0]
     return {"pairs": turning.pairs} | _rounded(figures), turning
 
 
@@ -287,8 +283,8 @@ def check_lidar(figures: Figures) -> Iterator[Finding]:
         yield Finding("error-codes", NOTE, f"{invalid:.0%} of the readings are error codes", cure, "lidar")
 
 
-def check_turning(turning: Turning | None, turn_ratio: tuple[float, float]) -> Iterator[Finding]:
-    """Say what the turns of laser and wheels show of clock, beam order and track width; turn_ratio : see Screening."""
+def check_turning(turning: Turning | None) -> Iterator[Finding]:
+    """Say what the turns of laser and wheels show of clock and beam order."""
     if turning is None:
         cure = "clock offset and mounting of the laser cannot be checked"
         yield Finding("no-turns", NOTE, "the robot hardly turns in place", cure, "lidar")
@@ -304,8 +300,3 @@ def check_turning(turning: Turning | None, turn_ratio: tuple[float, float]) -> I
         )
         cure = "a map measures it better and corrects small offsets; stamp both with one clock, each when its reading begins"
         yield Finding("laser-delay", WARNING, text, cure, "lidar")
-    ratio, sigma = turn_ratio
-    if ratio > 0.0 and abs(ratio - 1.0) > max(CheckPolicy.turns, CheckPolicy.sigmas * sigma):
-        text = f"the wheels measure about {1.0 / ratio:.2f} times the turns of the laser"
-        cure = "set the track width of the base; uwblite corrects it where the recording shows it"
-        yield Finding("turn-factor", WARNING, text, cure, "odometry")

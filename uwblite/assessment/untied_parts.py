@@ -1,8 +1,10 @@
 """Parts of a recording that only the odometry connects with the rest, without scans, closures or anchors.
 
-Where the lidar gives no scans while the robot drives, or where all anchors are replaced by others at once, only the odometry
-connects the later part of the map with the earlier one. Its errors meanwhile (wheels that stood still, a log that
-continues in another building) leave no residual. Where all other sensors end, the odometry alone determines the rest.
+Where the lidar gives no scans while the robot drives, where all anchors are replaced by others at once, or where the wheels
+slip along a bare wall, only the odometry connects the later part of the map with the earlier one, and its errors leave no
+residual. So its claim there is replaced by what wheels that slip can do: the marginal covariance of the relative pose of both
+sides, by everything else that was measured, shows whether they are connected all the same. Where all other sensors end, the
+odometry alone determines the rest.
 """
 
 from collections.abc import Iterator
@@ -10,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats, Ints
 from ..findings import Finding, doubt
-from ..graph.graph import Graph
-from ..graph.pose_edges import RelativePoseEdges, ScanEdges
+from ..graph.marginals import JointCovariance
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.recordings import Recording
+from ..pipeline.recordings import Recording, Recordings
 from ..sensor_log.sensors import radio_name
 
 _SILENT, _DRIVEN = 10.0, 3.0
@@ -24,12 +26,20 @@ _SILENT, _DRIVEN = 10.0, 3.0
 end, and others that all appear, within this time were not passed one after the other."""
 _PART = 6
 """Least number of keyframes of a part for a doubt."""
+_SLIP = np.array([1.0, 1.0, 0.2])
+"""m, m, rad, by which wheels that slip are off in a step at most."""
+_KNOWN = 0.5
+"""Share of it, in any direction, up to which the relative pose of two parts must be known."""
+_SUDDEN = 5.0
+"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
+_MOST = 64
+"""Runs of such steps that are tested, those with the largest errors."""
 _ANCHORS, _MEASURED = 2, 3
-"""Least number of anchors that connect two parts, or by which more agree than do not; and of ranges to each of them, also of
-constrained keyframes at an end of a recording."""
-_PER_METRE, _PER_SECOND = 0.02, 0.001
-"""rad/m, rad/s; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives
-straight on at 0.2 m/s exceeds the limit below after 7 m; one without other sensors for 10 s is off by some centimetres."""
+"""Least number of anchors that end or appear together, or by which more agree than do not; and of ranges to each of them, also
+of constrained keyframes at an end of a recording."""
+_PER_METRE = 0.02
+"""rad/m; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives straight
+on exceeds the limit below after 7 m."""
 _ASTRAY = 0.5
 """m; error of a place from which on the map counts as wrong there."""
 
@@ -46,7 +56,9 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             first = recording.rows.start + int(np.searchsorted(stamps, before, "right"))
             last = recording.rows.start + int(np.searchsorted(stamps, after))
             sizes = first - recording.rows.start, recording.rows.stop - last
-            if min(sizes) < _PART or _tied(estimate.graph, alive, first, last):
+            wheels = estimate.odometry
+            slips = ((wheels.i >= first - 1) & (wheels.j <= last))[:, None] * _SLIP
+            if min(sizes) < _PART or _tied(estimate, slips, np.array([first - 1]), np.array([last]))[0]:
                 continue
             what = "the lidar is silent" if recording.has_scans else "all anchors are replaced by others"
             yield doubt(
@@ -75,7 +87,8 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
         for word, edge, rows in (("until", "start", np.arange(first, -1, -1)), ("from", "end", np.arange(last, len(places)))):
             steps, (begin, end) = np.minimum(rows[1:], rows[:-1]), sorted(frames.stamps[rows[[0, -1]]].tolist())
             way, at = float(frames.path[steps].sum()), float(frames.stamps[rows[0]])
-            off = float(dead_reckoning_error(places[rows], frames.path[steps], frames.duration[steps]).max())
+            # A heading that drifts evenly moves the end of a straight path aside by half of the last turn.
+            off = 0.5 * _PER_METRE * way * float(np.hypot(*(places[rows] - places[rows[0]]).T).max())
             if off > _ASTRAY:
                 seconds = at - frames.stamps[0]
                 loose = doubt(
@@ -89,24 +102,6 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
                 )
                 cure = f"`{edge}={seconds:.0f}` leaves that part out"
                 yield replace(loose, recording=recording.number + 1, stretches=((begin, end),), cure=cure)
-
-
-def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
-    """Return the error (k,) of usual wheels at each place (k, 2) of a path, from its first on, m.
-
-    A wrong turn at one place moves each later one to the side by its distance from there; for a heading that drifts evenly
-    along the path these moves add up with their signs: a path around and back has a smaller error than a straight one.
-
-    Parameters
-    ----------
-    lengths, durations : (k-1,) m, s; from each place to the next.
-    """
-    middles = (places[1:] + places[:-1]) / 2.0
-    moved = np.zeros((2, len(places)))
-    for row, turns in zip(moved, (_PER_METRE * lengths, _PER_SECOND * durations), strict=True):
-        arms = np.cumsum(turns)[:, None] * places[1:] - np.cumsum(turns[:, None] * middles, axis=0)
-        row[1:] = np.hypot(arms[:, 0], arms[:, 1])
-    return np.asarray(np.hypot(*moved))
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
@@ -146,18 +141,39 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     ]
 
 
-def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> bool:
-    """Return whether scans, closures or enough anchors connect keyframes before the first with those from the last on."""
-    for edges in graph.edges:
-        if isinstance(edges, ScanEdges | RelativePoseEdges):
-            low, high = np.minimum(edges.i, edges.j), np.maximum(edges.i, edges.j)
-            if np.any((low < first) & (high >= last)):
-                return True
-    if ranges is None:
-        return False
-    parts = ranges.pose < first, ranges.pose >= last
-    counts = [np.bincount(ranges.anchor[part], minlength=len(graph.anchors)) for part in parts]
-    return int(np.sum(np.minimum(*counts) >= _MEASURED)) >= _ANCHORS
+def _tied(estimate: Estimate, slips: Floats, i: Ints, j: Ints) -> Bools:
+    """Return whether keyframes i (m,) are known from j (m,) by all measurements, where steps may slip by (e, 3), m, m, rad."""
+    steps, root = np.flatnonzero(slips.any(axis=1)), estimate.odometry.sqrt_information.copy()
+    covariance = np.linalg.inv(np.swapaxes(root[steps], 1, 2) @ root[steps]) + slips[steps, :, None] ** 2 * np.eye(3)
+    root[steps] = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
+    others = [edges for edges in estimate.graph.edges if not isinstance(edges, OdometryEdges)]
+    graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
+    relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
+    return np.asarray(np.linalg.eigvalsh(relative / np.outer(_SLIP, _SLIP))[:, -1] < _KNOWN**2)
+
+
+def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
+    """Return the steps (s,) of the odometry that the map contradicts and whose sides nothing else connects.
+
+    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known
+    slips, is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end
+    of a recording are no part.
+    """
+    wheels = estimate.odometry
+    noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
+    off = np.abs(wheels.residuals(estimate.graph)).max(axis=1, initial=0.0)
+    slips = np.where((off > _SUDDEN)[:, None], np.minimum(off[:, None] * noise, _SLIP), 0.0)
+    steps = np.flatnonzero(slips.any(axis=1))
+    new = np.append(True, np.diff(wheels.i[steps]) >= _PART)[: len(steps)]
+    first, last = steps[new], steps[np.append(new[1:], True)[: len(steps)]]
+    rows = [recordings.each[n].rows for n in recordings.of_keyframe[wheels.i[first]].tolist()]
+    sizes = [min(i + 1 - own.start, own.stop - j) for own, i, j in zip(rows, wheels.i[first], wheels.j[last], strict=True)]
+    runs = np.flatnonzero(np.array(sizes) >= _PART)
+    largest = np.array([slips[a : b + 1].max() for a, b in zip(first[runs], last[runs], strict=True)])
+    runs = np.sort(runs[np.argsort(-largest, kind="stable")[:_MOST]])
+    if not len(runs):
+        return runs
+    return first[runs[~_tied(estimate, slips, wheels.i[first[runs]], wheels.j[last[runs]])]]
 
 
 def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""`uwblite evaluate`: a result against true poses, relations, anchors, columns and walls."""
+"""`uwblite evaluate`: a result against true poses, relations, anchors and columns."""
 
 import argparse
 import dataclasses
@@ -13,11 +13,9 @@ from ..errors import ConfigError, FormatError, UsageError
 from ..evaluation.map import (
     LandmarkErrors,
     Landmarks,
-    WallErrors,
     find_columns,
     landmark_errors,
     landmark_errors_along,
-    wall_errors,
 )
 from ..evaluation.relations import FAR, RelationErrors, Relations, evaluate_relations
 from ..evaluation.trajectory import (
@@ -31,8 +29,7 @@ from ..evaluation.trajectory import (
 )
 from ..io.csv_table import read_csv
 from ..io.map_server import read_map
-from ..io.results import repair_result
-from ..io.stored_result import read_result
+from ..io.stored_result import read_result, repair_result
 from ..io.tum import read_relations, read_tum
 from . import console
 
@@ -47,8 +44,8 @@ DEFAULT_RADIUS = 0.3
 def run(args: argparse.Namespace) -> int:
     if not args.truth and not args.relations:
         raise UsageError("give --truth, --relations, or both")
-    if not args.truth and (args.anchors or args.landmarks or args.walls):
-        raise UsageError("--anchors, --landmarks and --walls need --truth, which lays the map over them")
+    if not args.truth and (args.anchors or args.landmarks):
+        raise UsageError("--anchors and --landmarks need --truth, which lays the map over them")
     if args.recording and len(args.truth or ()) > 1:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
     console.report(args.json, *compare(args))
@@ -84,33 +81,28 @@ def _comparisons(args: argparse.Namespace, folder: Path) -> Iterator[tuple[str, 
         yield "recordings", [figures for figures, _ in shown], [line for _, lines in shown for line in lines]
     if args.anchors:
         yield "anchors", *_shown_anchors(_anchors(folder / "anchors.csv", args.anchors, trajectory))
-    if args.landmarks or args.walls:
-        yield from _surfaces(args, folder, together, trajectory)
+    if args.landmarks:
+        yield from _columns(args, folder, together, trajectory)
 
 
-def _surfaces(
+def _columns(
     args: argparse.Namespace, folder: Path, paired: Paired, trajectory: TrajectoryErrors
 ) -> Iterator[tuple[str, Any, list[str]]]:
-    """Compare columns and walls with the map, and columns with where the trajectory draws them."""
+    """Compare columns with the map, and with where the trajectory draws them."""
     path = folder / "map.yaml"
     grid = read_map(path) if path.exists() else None
     occupied = None if grid is None else trajectory.in_truth(grid.occupied_points())
     estimate, true_poses = paired.compared(trajectory)
-    truth, pairs = read_landmarks(args.landmarks) if args.landmarks else (None, None)
-    if truth is not None:
-        if grid is not None and occupied is not None:
-            columns = find_columns(occupied, truth, search_radius=args.search_radius, cell=grid.geometry.resolution)
-            yield "landmarks", *_shown_landmarks(landmark_errors(columns, truth, pairs), "columns in the map")
-        if trajectory.heading is not None:
-            drawn = landmark_errors_along(truth, true_poses, estimate, pairs)
-            figures, lines = _shown_landmarks(drawn, "columns as the trajectory draws them")
-            yield "landmarks_along_trajectory", figures, lines[:1]
-    if args.walls and occupied is not None:
-        posts = np.empty((0, 3)) if truth is None else np.column_stack([truth.positions, truth.radii])
-        walls = read_csv(args.walls).numbers("x1", "y1", "x2", "y2")
-        yield "walls", *_shown_walls(wall_errors(occupied, walls, posts, true_poses[:, :2], tolerance=args.tolerance))
+    truth, pairs = read_landmarks(args.landmarks)
+    if grid is not None and occupied is not None:
+        columns = find_columns(occupied, truth, search_radius=args.search_radius, cell=grid.geometry.resolution)
+        yield "landmarks", *_shown_landmarks(landmark_errors(columns, truth, pairs), "columns in the map")
+    if trajectory.heading is not None:
+        drawn = landmark_errors_along(truth, true_poses, estimate, pairs)
+        figures, lines = _shown_landmarks(drawn, "columns as the trajectory draws them")
+        yield "landmarks_along_trajectory", figures, lines[:1]
     if occupied is None:
-        yield "", None, ["no map.yaml in the folder: columns and walls are not judged"]
+        yield "", None, ["no map.yaml in the folder: columns are not judged"]
 
 
 def _relations(folder: Path, path: str, number: int) -> Shown:
@@ -197,13 +189,6 @@ def _shown_landmarks(e: LandmarkErrors, title: str) -> Shown:
     lines += [row.format(f"{p['a']} - {p['b']}", **p) for p in pairs]
     lines += [f"  not found: {', '.join(e.missing)}"] if e.missing else []
     return {"mean": e.mean if pairs else None, "pairs": pairs, "missing": list(e.missing)}, lines
-
-
-def _shown_walls(walls: WallErrors) -> Shown:
-    return _plain(walls), [
-        f"walls: {100 * walls.precision:.1f} % of the occupied cells lie within {walls.tolerance:g} m of a true surface, "
-        f"{100 * walls.recall:.1f} % of the visible walls is drawn"
-    ]
 
 
 def _plain(figures: Any) -> dict[str, Any]:

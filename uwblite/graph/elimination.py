@@ -21,7 +21,6 @@ from scipy.sparse.linalg import spilu
 
 from ..arrays import WIDE, Ints
 from .graph import WIDTHS
-from .schwarz_cg import expected_work
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +31,11 @@ class EliminationPolicy:
     """Distance in the band, poses, up to which the banded factorisation wins."""
     widest_border: ClassVar[int] = 48
     """Scalars in a border; more of them stay in the sparse matrix."""
-    many: ClassVar[int] = 500
-    tied: ClassVar[int] = 4
-    """From so many poses on, with so many neighbours each, iteration may take less work than factorisation: in one hall all
-    poses are connected, in the rooms of a site or the streets of a town only those nearby."""
-    most_work: ClassVar[float] = 4e9
-    """Multiplications of a factorisation of others, about a second; a hundred times the paper's graph takes 2.4e9."""
     little_work: ClassVar[float] = 4e8
-    """Multiplications in the envelope of a band up to which those of a sparser order are not counted."""
+    """Multiplications of a factorisation that always pay, a tenth of a second; so many in a band's envelope are not counted."""
+    per_pose: ClassVar[float] = 1e5
+    """Multiplications for each pose beyond which iteration takes less time. In one hall all poses are connected; a hundred
+    times the paper's graph takes a third of that."""
     per_complex: ClassVar[int] = 4
     """Multiplications in one of complex numbers."""
     alone: ClassVar[float] = 6.0
@@ -104,6 +100,11 @@ def is_full(reach: Ints) -> bool:
     factorisation for all others.
     """
     return len(reach) > EliminationPolicy.small and float(np.mean(reach)) > EliminationPolicy.wide * len(reach)
+
+
+def fills_up(multiplications: float, poses: int) -> bool:
+    """Return whether a factorisation takes longer than iteration."""
+    return multiplications > max(EliminationPolicy.little_work, EliminationPolicy.per_pose * poses)
 
 
 def minimum_degree(pattern: sparse.csc_matrix) -> Ints:
@@ -248,33 +249,33 @@ class Ordering:
     """Multiplications of a factorisation, where they are many enough to be counted; more than there are, where they are few."""
 
 
-def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = None) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
     ----------
     pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
     width : (n,) scalars of each node.
-    subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
+    last : keep to the sparse form, for the inverse: these poses come after the others, whose subtrees are contiguous.
     """
     policy, each = EliminationPolicy, np.arange(poses)
     if poses < 2:
         return Ordering(each)
     among = pairs.take(np.flatnonzero(np.maximum(pairs[:, 0], pairs[:, 1]) < poses), axis=0)
+    if last is not None:
+        # What remains when all others are eliminated is full.
+        among = np.concatenate([among, last[np.stack(np.triu_indices(len(last), 1), axis=1)]])
+        walk = contiguous(among, minimum_degree(adjacency(among, poses)))[0]
+        return Ordering(walk[np.argsort(np.isin(walk, last), kind="stable")])
     pattern = adjacency(among, poses)
-    if subtrees:
-        return Ordering(contiguous(among, minimum_degree(pattern))[0])
-    others = int(width[poses:].sum())
-    bordered = others <= policy.widest_border
-    tied = poses >= policy.many and len(among) - poses > policy.tied * poses
-    if bordered or tied:
-        order, reach = narrow_order(pattern)
-        if bordered and reach.max() <= policy.widest_band:
-            return Ordering(order, bordered=True, banded=True)
-        if tied and is_full(reach):
-            return Ordering(each, iterative=True)
+    bordered = int(width[poses:].sum()) <= policy.widest_border
+    order, reach = narrow_order(pattern)
+    if bordered and reach.max() <= policy.widest_band:
+        return Ordering(order, bordered=True, banded=True)
+    if is_full(reach):
+        return Ordering(each, iterative=True)
     order = minimum_degree(pattern)
-    if bordered and not tied:
+    if bordered:
         most = WIDTHS["poses"] * float(np.sum((WIDTHS["poses"] * (reach + 1.0)) ** 2))
         if most <= policy.little_work:
             return Ordering(order, bordered=True, work=most)
@@ -284,7 +285,6 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
     else:
         every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
         multiplications = work(pairs, every, width, parent)
-    entries = 2 * int(np.prod(width[pairs], axis=1, dtype=WIDE).sum())
-    if multiplications > (expected_work(poses, others, entries) if tied else policy.most_work):
+    if fills_up(multiplications, poses):
         return Ordering(each, iterative=True)
     return Ordering(order, bordered, work=multiplications)

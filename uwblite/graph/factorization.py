@@ -16,7 +16,7 @@ from ..arrays import WIDE, Floats, Ints, Table
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
 from .graph import POSE, WIDTHS
-from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
+from .schwarz_cg import Pieces, TwoLevelFactor
 from .work import ENTRIES, FACTORISATIONS, Work
 
 
@@ -69,13 +69,6 @@ class BandedFactor:
         """Solve for right-hand sides (n,) or (n, m)."""
         return lapack.dpbtrs(self._factor, right, lower=1)[0].reshape(right.shape)
 
-    def half(self, right: Floats, transposed: bool = False) -> Floats:
-        """Solve with Cholesky's L, or with L^T, for right-hand sides (n,) or (n, m)."""
-        # scipy's binding writes beyond an empty array.
-        if not right.size:
-            return right
-        return lapack.dtbtrs(self._factor, right, uplo="L", trans="T" if transposed else "N")[0].reshape(right.shape)
-
     @property
     def nnz(self) -> int:
         """Entries of the factor."""
@@ -83,18 +76,14 @@ class BandedFactor:
 
 
 class BorderedFactor:
-    """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T.
-
-    Where A = L L^T is a band, S = C - V^T V with V = L^-1 B^T, in a quarter of the time.
-    """
+    """Factor of H = [[A, B^T], [B, C]] with few rows of B: that of A, and Cholesky's of S = C - B A^-1 B^T."""
 
     def __init__(self, inside: Factor, border: Floats) -> None:
         """Complete a factorisation of A by the rows (m, n + m) of [B, C], of C the lower triangle."""
         n = border.shape[1] - len(border)
         self._inside, self._rows = inside, border[:, :n]
-        self._solved = inside.half(self._rows.T) if isinstance(inside, BandedFactor) else inside.solve(self._rows.T)
-        product = (self._solved.T if isinstance(inside, BandedFactor) else self._rows) @ self._solved
-        self._corner, failed = lapack.dpotrf(border[:, n:] - np.tril(product), lower=1)
+        self._solved = inside.solve(self._rows.T)
+        self._corner, failed = lapack.dpotrf(border[:, n:] - np.tril(self._rows @ self._solved), lower=1)
         if failed:
             raise SolverError(SINGULAR)
 
@@ -103,10 +92,7 @@ class BorderedFactor:
         n = self._rows.shape[1]
         inner = self._inside.solve(right[:n])
         outer = lapack.dpotrs(self._corner, right[n:] - self._rows @ inner, lower=1)[0].reshape(right[n:].shape)
-        further = self._solved @ outer
-        if isinstance(self._inside, BandedFactor):
-            further = self._inside.half(further, transposed=True)
-        return np.concatenate([inner - further, outer])
+        return np.concatenate([inner - self._solved @ outer, outer])
 
     @property
     def nnz(self) -> int:
@@ -153,12 +139,9 @@ class Blocks(Table):
 
     def entries(self) -> tuple[Ints, Ints, Ints]:
         """Return row, column and place of every value in the lower triangle."""
-        found = []
-        for i, j in np.ndindex(POSE * 2):
-            has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
-            found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
-        rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
-        return rows, columns, places
+        i, j = np.indices(POSE * 2)[..., None]
+        i, j, block = np.nonzero((i < self.height) & (j < self.width) & (self.row + i >= self.column + j))
+        return self.row[block] + i, self.column[block] + j, self.start[block] + i * self.width[block] + j
 
 
 def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
@@ -210,16 +193,14 @@ class SparseLayout:
 
 
 class IterativeLayout:
-    """Both triangles in compressed columns, and the places of their pieces."""
+    """Both triangles in compressed columns, and pieces of the chain."""
 
     def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
-        """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
         self._sparse, self._pieces = SparseLayout(blocks), pieces
-        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.places)), pieces)
 
     def factor(self, values: Floats) -> TwoLevelFactor:
         """Prepare to solve with these values, up to the next call."""
-        return TwoLevelFactor(self._sparse.matrix(values), self._pieces, self._local)
+        return TwoLevelFactor(self._sparse.matrix(values), self._pieces)
 
 
 class BandedLayout:

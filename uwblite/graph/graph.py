@@ -9,7 +9,9 @@ chart of g2o, e = Z^-1 (Xi^-1 Xj). What a MapResult states about ranges is measu
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
+from itertools import compress
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -208,16 +210,21 @@ class Graph:
             return np.zeros(index.shape[1], dtype=bool)
         return np.any(np.append(~self.fixed_calibration, False)[index], axis=0)
 
+    def by_calibration(self, index: Ints, columns: Sequence[Floats]) -> list[Block]:
+        """Return the blocks by the calibration values of indices (e, k), -1 = none, that are free, of derivatives (d, e)."""
+        used = compress(zip(index.T, columns, strict=False), self.has_free(index))
+        return [("calibration", np.maximum(i, 0), np.where(i >= 0, column, 0.0).T[..., None]) for i, column in used]
+
     def with_edges(self, *edges: Edges) -> "Graph":
         """Return the graph with further edges; empty ones are left out."""
         return replace(self, edges=self.edges + tuple(e for e in edges if len(e)))
 
     def updated(self, poses: Floats, anchors: Floats, calibration: Floats) -> "Graph":
-        """Return the graph with new estimates."""
-        values = replace(self.calibration, values=calibration)
-        new = replace(self, poses=poses, anchors=anchors, calibration=values, edges=())
-        # There are as many unknowns as before, which is all that is required of edges.
-        object.__setattr__(new, "edges", self.edges)
+        """Return the graph with new estimates, of as many unknowns: what was checked stays so."""
+        new = copy(self)
+        values = {"poses": poses, "anchors": anchors, "calibration": replace(self.calibration, values=calibration)}
+        for name, value in values.items():
+            object.__setattr__(new, name, value)
         return new
 
     def with_estimates_of(self, solved: "Graph") -> "Graph":

@@ -11,6 +11,7 @@ from typing import ClassVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
+from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
 from .. import se2
@@ -215,7 +216,7 @@ def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns],
     among : poses (k,) whose joint covariance is wanted.
     further : gives measurements beside the graph's edges by the numbers of its unknowns, see graph/eliminated.py.
     """
-    normal = filled(graph, subtrees=True)
+    normal = filled(graph, last=())
     return Marginals(graph, normal, among, None if further is None else further(normal.unknowns))
 
 
@@ -223,8 +224,8 @@ class JointCovariance:
     """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
 
     def __init__(self, graph: Graph, poses: Ints) -> None:
-        found = marginals(graph)
-        whole = found.among(found.unknowns.number["poses"][poses].ravel())
+        normal = filled(graph, last=poses)
+        whole = _end_of_inverse(cast(SuperLU, _factor(normal, None)), normal.unknowns.number["poses"][poses].ravel())
         self._graph, self._row = graph, np.full(len(graph.poses), -1)
         self._row[poses] = np.arange(len(poses))
         self._blocks = whole.reshape(len(poses), *POSE, len(poses), *POSE).swapaxes(1, 2)
@@ -241,6 +242,19 @@ class JointCovariance:
             own = by_a @ self._blocks[a, a] @ by_a.transpose(0, 2, 1) + by_b @ self._blocks[b, b] @ by_b.transpose(0, 2, 1)
             found[part] = own + mixed + mixed.transpose(0, 2, 1)
         return found
+
+
+def _end_of_inverse(factor: SuperLU, numbers: Ints) -> Floats:
+    """Return the inverse (m, m) at numbers (m,), 0 at fixed scalars (-1), from the end of H = L D L^T behind the first."""
+    first = np.min(numbers, initial=len(factor.perm_c), where=numbers >= 0)
+    end = np.sort(factor.perm_c[first:]).astype(np.intp)
+    root, row = factor.L[:, end][end].toarray(order="F"), np.searchsorted(end, factor.perm_c[numbers])
+    if len(end):
+        root = lapack.dtrtri(root, lower=1, unitdiag=1, overwrite_c=1)[0]
+    root /= np.sqrt(factor.U.diagonal()[end])[:, None]
+    found = np.pad(root.T @ root, (0, 1))[np.ix_(row, row)]
+    found[numbers < 0] = found[:, numbers < 0] = 0.0
+    return np.asarray(found)
 
 
 def calibration_covariance(graph: Graph) -> Floats:

@@ -8,10 +8,9 @@ need no permutation.
 
 from collections.abc import Iterator, Sequence
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from ..arrays import WIDE, Floats, Ints
@@ -22,35 +21,24 @@ from .schwarz_cg import cut
 from .unknowns import Unknowns, free_unknowns, linked_poses
 from .work import PRODUCTS
 
-_AT_ONCE = 1 << 15
-"""Edges whose products are in memory at once; a bound on the memory."""
-_NONE = np.zeros(0, dtype=np.intp)
 _Small = NDArray[np.int32]
+_NONE, _NOWHERE = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.int32)
 _Touched = tuple[Ints, bool]
 """Node (e,) touched by each edge, -1 = fixed; and whether it is a calibration value."""
 _Block = tuple[str, Ints, tuple[int, ...]]
 """Name, unknown (e,) touched by each edge, and shape of an edge's Jacobian."""
 
 
-class _Places(NamedTuple):
-    """Of some edges of one kind: places of all products of two Jacobian columns among the values, which of them count twice,
-    and rows of the gradient of the products with the residual."""
-
-    products: _Small
-    twice: Ints
-    rows: _Small
-
-
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], last: ArrayLike | None = None) -> None:
         """Number the unknowns and find the place of every product.
 
         Parameters
         ----------
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
-        subtrees : order for the selected inverse, not for speed.
+        last : order for the inverse, not for speed: these poses are eliminated after the others.
         """
         self.spent = graph.work
         """Counts what is done with these equations."""
@@ -68,7 +56,8 @@ class NormalEquations:
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
-        ordering = choose_ordering(pairs, counts[0], width, subtrees)
+        at_end = None if last is None else node["poses"][np.asarray(last, dtype=np.intp)]
+        ordering = choose_ordering(pairs, counts[0], width, None if at_end is None else np.unique(at_end[at_end >= 0]))
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
@@ -143,43 +132,33 @@ class NormalEquations:
     def _place_products(
         self, linearized: Sequence[Linearization], touched: list[list[_Touched]], which: list[Ints], corner: Ints
     ) -> None:
-        """Find the place of every product of two Jacobian columns of one edge.
+        """Find the place of every product of two Jacobian columns of one edge, and of every one with the residual.
 
         That of column i of node a and column j of node b lands at a start plus i and j times a step in their block. Where a and
         b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
         following, first = iter(which), corner.astype(np.int32)
-        self._places: list[list[_Places]] = []
+        products, twice, rows = [_NOWHERE], [_NONE], [_NOWHERE]
+        count = 0
         for lin, nodes, free in zip(linearized, touched, self._free, strict=True):
             widths = [jac.shape[2] for _, _, jac in compress(lin.blocks, free)]
-            blocks = [[*(np.where(a == b, a, next(following)) for b, _ in nodes[:p]), a] for p, (a, _) in enumerate(nodes)]
-            self._places.append(
-                [
-                    self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], first)
-                    for part in (_parts(len(lin.residuals)) if nodes else ())
-                ]
-            )
-
-    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: _Small) -> _Places:
-        """Find the places of some edges' products; the block of nodes p and q is blocks[p][q] (e,)."""
-        rows: list[_Small] = []
-        products: list[_Small] = []
-        twice, count = [_NONE], 0
-        for p, a in enumerate(nodes):
-            steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes[: p + 1], blocks[p], strict=True)]
-            equal = [np.flatnonzero((a == b) & (a >= 0)) for b in nodes[:p]] + [_NONE]
-            for i in range(widths[p]):
-                rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size))
-                for q, ((start, by_a, by_b), same) in enumerate(zip(steps, equal, strict=True)):
-                    for j in range(widths[q] if q < p else i + 1):
-                        place = start + i * by_a + j * by_b
-                        if len(same) and i < j:
-                            place[same] = (start + j * by_a + i * by_b)[same]
-                        if len(same) and i == j:
-                            twice.append(same + count)
-                        products.append(place)
-                        count += len(place)
-        return _Places(np.concatenate(products), np.concatenate(twice), np.concatenate(rows))
+            for p, (a, _) in enumerate(nodes):
+                others = [b for b, _ in nodes[: p + 1]]
+                blocks = [*(np.where(a == b, a, next(following)) for b in others[:p]), a]
+                steps = [self._steps(first[a], first[b], block) for b, block in zip(others, blocks, strict=True)]
+                equal = [np.flatnonzero((a == b) & (a >= 0)) for b in others[:p]] + [_NONE]
+                for i in range(widths[p]):
+                    rows.append(np.where(a >= 0, first[a] + i, self.unknowns.size))
+                    for q, ((start, by_a, by_b), same) in enumerate(zip(steps, equal, strict=True)):
+                        for j in range(widths[q] if q < p else i + 1):
+                            place = start + i * by_a + j * by_b
+                            if len(same) and i < j:
+                                place[same] = (start + j * by_a + i * by_b)[same]
+                            if len(same) and i == j:
+                                twice.append(same + count)
+                            products.append(place)
+                            count += len(place)
+        self._places, self._twice, self._rows = (np.concatenate(each) for each in (products, twice, rows))
 
     def _steps(self, a: _Small, b: _Small, block: Ints) -> tuple[_Small, _Small, _Small]:
         """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
@@ -190,32 +169,27 @@ class NormalEquations:
 
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None], again: bool = True) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge; g alone, where H is not wanted again."""
-        self.gradient = np.zeros(self.unknowns.size)
+        slopes, products = np.empty(len(self._rows)), np.empty(len(self._places) if again else 0)
+        row = place = 0
+        for lin, weight, free in zip(linearized, weights, self._free, strict=True):
+            jacobians = [jac.transpose(1, 2, 0) for _, _, jac in compress(lin.blocks, free)]
+            if not jacobians:
+                continue
+            # The edges, over which everything runs, come last.
+            jacobian = np.ascontiguousarray(np.concatenate(jacobians, axis=1))
+            weighted = jacobian if weight is None else jacobian * weight
+            _, k, e = jacobian.shape
+            _contract(weighted, lin.residuals.T[:, None], slopes[row : row + k * e].reshape(k, e))
+            row += k * e
+            for column in range(1, k + 1) if again else ():
+                block = products[place : place + column * e].reshape(column, e)
+                _contract(weighted[:, column - 1 : column], jacobian[:, :column], block)
+                place += column * e
+        self.gradient = np.bincount(self._rows, slopes, self.unknowns.size + 1)[:-1].astype(np.float64, copy=False)
         if again:
-            self.values = np.zeros(self._trash + 1)
-            self.spent[PRODUCTS] += sum(len(some.products) for places in self._places for some in places)
-        for lin, weight, places, free in zip(linearized, weights, self._places, self._free, strict=True):
-            jacobians = [jac for _, _, jac in compress(lin.blocks, free)]
-            for part, place in zip(_parts(len(lin.residuals)) if jacobians else (), places, strict=True):
-                jacobian, factor = _stacked(jacobians, part), None if weight is None else weight[part]
-                weighted = jacobian if factor is None else jacobian * factor
-                self._add_slopes(weighted, lin.residuals[part], place)
-                if again:
-                    self._add_products(weighted, jacobian, place)
-
-    def _add_slopes(self, weighted: Floats, residuals: Floats, places: _Places) -> None:
-        slopes = np.empty(weighted.shape[1:])
-        _contract(weighted, residuals.T[:, None], slopes)
-        self.gradient += np.bincount(places.rows, slopes.reshape(-1), self.unknowns.size + 1)[:-1]
-
-    def _add_products(self, weighted: Floats, jacobian: Floats, places: _Places) -> None:
-        products, at, (_, k, e) = np.empty(len(places.products)), 0, jacobian.shape
-        for row in range(k):
-            block = products[at : at + (row + 1) * e].reshape(row + 1, e)
-            _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
-            at += (row + 1) * e
-        products[places.twice] *= 2.0
-        self.values += np.bincount(places.products, products, self._trash + 1)
+            products[self._twice] *= 2.0
+            self.values = np.bincount(self._places, products, self._trash + 1).astype(np.float64, copy=False)
+            self.spent[PRODUCTS] += len(products)
 
     @property
     def diagonal(self) -> Floats:
@@ -224,7 +198,7 @@ class NormalEquations:
 
     @property
     def matrix(self) -> sparse.csc_matrix:
-        """H, where the order is that of the selected inverse."""
+        """H, where the order is that for the inverse."""
         assert isinstance(self._layout, SparseLayout)
         return self._layout.matrix(self.values)
 
@@ -251,7 +225,7 @@ def _same(one: list[_Block], other: list[_Block]) -> bool:
     )
 
 
-def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = None) -> NormalEquations:
+def filled(graph: Graph, last: ArrayLike | None = None, like: NormalEquations | None = None) -> NormalEquations:
     """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations.
 
     Parameters
@@ -259,7 +233,7 @@ def filled(graph: Graph, subtrees: bool = False, like: NormalEquations | None = 
     like : normal equations of a graph with the same unknowns and edges, if there are any: they are filled again.
     """
     linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees) if like is None else like
+    normal = NormalEquations(graph, linearized, last) if like is None else like
     normal.fill(linearized, [kernel_weights(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
     return normal
 
@@ -270,17 +244,6 @@ def _meetings(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]
         for p, (a, a_value) in enumerate(nodes):
             for b, b_value in nodes[:p]:
                 yield np.minimum(a, b), np.maximum(a, b), a_value or b_value
-
-
-def _parts(edges: int) -> list[slice]:
-    return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
-
-
-def _stacked(jacobians: Sequence[Floats], part: slice) -> Floats:
-    """Return Jacobians (e, d, k) of some edges side by side, (d, k, e): the edges, over which everything runs, come last."""
-    parts = [jac[part].transpose(1, 2, 0) for jac in jacobians]
-    stacked = np.empty((parts[0].shape[0], sum(p.shape[1] for p in parts), parts[0].shape[2]))
-    return np.concatenate(parts, axis=1, out=stacked)
 
 
 def _contract(a: Floats, b: Floats, out: Floats) -> None:

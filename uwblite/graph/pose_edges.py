@@ -5,7 +5,6 @@ Residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import compress
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
 from .calibration import LASER, WHEELS
-from .graph import POSE, Block, Edges, Graph, Linearization, whiten
+from .graph import POSE, Block, Edges, Graph, Linearization
 
 _LEAST_SCALE = 0.1
 """Least scale that errors are divided by: odometry is not ten times too long."""
@@ -163,12 +162,6 @@ class OdometryEdges(Edges):
         p = np.append(graph.calibration.values, 0.0)[self.calibration[:, 4]]
         return np.stack([-p, np.zeros_like(p), np.zeros_like(p)], axis=1)
 
-    def residuals(self, graph: Graph) -> Floats:
-        """Return whitened residuals (e, 3)."""
-        turning = self._turning_point(graph)
-        d = se2.between(se2.compose(graph.poses[self.i], turning), se2.compose(graph.poses[self.j], turning))
-        return whiten(self.end_sqrt_information, se2.between(self._corrected(graph)[0], d) / self.own_scale(graph))
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration that is free."""
         xi, xj = _columns(graph.poses, self.i), _columns(graph.poses, self.j)
@@ -198,8 +191,7 @@ class OdometryEdges(Edges):
                 left, ahead = (1.0 + s) * self._ways()
                 to_left, to_ahead = axes[0] * sin - axes[1] * cos, -axes[0] * cos - axes[1] * sin
                 columns += [to_left * left, to_left * ahead, to_ahead * left]
-            for index, column in compress(zip(self.calibration.T, columns, strict=False), used):
-                blocks.append(("calibration", np.maximum(index, 0), _by(np.where(index >= 0, column, 0.0))))
+            blocks += graph.by_calibration(self.calibration, columns)
         return Linearization(error.residuals.T, tuple(blocks))
 
 
@@ -269,8 +261,7 @@ class ScanEdges(Edges):
         si, sj = from_pose.T, to_pose.T
         error = _Relative(self.T_i_j, self.sqrt_information, si, sj)
         blocks: list[Block] = [*error.by_poses(self.i, self.j, xi, xj)]
-        used = graph.has_free(self.calibration[None])
-        if used.any():
+        if graph.has_free(self.calibration[None]).any():
             c, s = (to - at for at, to in zip(heading_i, heading_j, strict=True))
             by_turn = error.axes[2] + error.turned_about(si)
             x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
@@ -282,6 +273,5 @@ class ScanEdges(Edges):
 
             by_delay = by_time(heading_j, self.twist_j) - by_time(heading_i, self.twist_i) + by_turn * self.twist_i[:, 2]
             columns = (error.along(c, s), error.along(-s, c), by_turn, by_delay)
-            for index, column in compress(zip(self.calibration, columns, strict=True), used):
-                blocks.append(("calibration", np.full(len(self), index), _by(column)))
+            blocks += graph.by_calibration(np.broadcast_to(self.calibration, (len(self), len(columns))), columns)
         return Linearization(error.residuals.T, tuple(blocks))

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import compress
 from typing import ClassVar
 
 import numpy as np
@@ -111,12 +110,10 @@ class RangeEdges(Edges):
         by_theta = direction[1] * arm[0] - direction[0] * arm[1]
         by_pose = np.stack([direction[0], direction[1], by_theta])[None].transpose(2, 0, 1)
         blocks: list[Block] = [("poses", self.pose, by_pose), ("anchors", self.anchor, -direction[None].transpose(2, 0, 1))]
-        used = graph.has_free(self.calibration)
         columns = [distance / self.sigma, 1.0 / self.sigma, scale / (2.0 * reach[1])]
-        if used[3:].any():
+        if graph.has_free(self.calibration[:, 3:]).any():
             columns += self._by_tag_and_delay(graph, direction)
-        for index, column in compress(zip(self.calibration.T, columns, strict=False), used):
-            blocks.append(("calibration", np.maximum(index, 0), np.where(index >= 0, column, 0.0)[:, None, None]))
+        blocks += graph.by_calibration(self.calibration, [column[None] for column in columns])
         residuals = (((1.0 + cal[0]) * distance + cal[1] - self.corrected) / self.sigma)[:, None]
         return Linearization(residuals, tuple(blocks))
 

@@ -15,7 +15,6 @@ from scipy.linalg import lapack
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SINGULAR, SolverError
-from .graph import WIDTHS
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +31,6 @@ class SchwarzPolicy:
     """Number of unknowns other than poses up to which each is in the coarse level."""
     per_product: ClassVar[int] = 4
     """Multiplications of a factorisation in the time of one of a matrix-vector product, which memory access limits."""
-    usual: ClassVar[int] = 60
-    """Expected iterations, from halls, sites and warehouses of 1,000 to 15,000 poses."""
     columns_at_once: ClassVar[int] = 256
     """Of the coarse matrix; a bound on the memory."""
 
@@ -50,28 +47,9 @@ class Pieces:
     def work(self, steps: float = 0.0, entries: int = 0) -> float:
         """Return the work, in multiplications of a factorisation, of the inverses of the pieces and the factor of the coarse
         matrix, and of iterations with a matrix of so many entries."""
-        return _work((*self.number.shape, int(self.basis.shape[1])), steps, entries)
-
-
-def _work(shape: tuple[int, int, int], steps: float, entries: int) -> float:
-    """Return the same of pieces of so many unknowns and a coarse matrix of so many rows."""
-    pieces, wide, coarse = map(float, shape)
-    step = SchwarzPolicy.per_product * (entries + pieces * wide**2 + coarse**2)
-    return pieces * wide**3 + coarse**3 / 3.0 + steps * step
-
-
-def expected_work(poses: int, others: int, entries: int) -> float:
-    """Return the work of a solution to be expected, in multiplications of a factorisation.
-
-    Parameters
-    ----------
-    poses : in one chain or a few. others : scalars that are no poses. entries : of the matrix.
-    """
-    motions = WIDTHS["poses"]
-    pieces, wide = -(-poses // SchwarzPolicy.piece), motions * SchwarzPolicy.piece
-    apart = others > SchwarzPolicy.most_coarse
-    shape = pieces + (-(-others // wide) if apart else 0), wide, motions * pieces + (0 if apart else others)
-    return _work(shape, SchwarzPolicy.usual, entries)
+        pieces, wide, coarse = map(float, (*self.number.shape, self.basis.shape[1]))
+        step = SchwarzPolicy.per_product * (entries + pieces * wide**2 + coarse**2)
+        return pieces * wide**3 + coarse**3 / 3.0 + steps * step
 
 
 def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
@@ -112,35 +90,24 @@ def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     return Pieces(places, sparse.csr_matrix((values, (rows, columns)), shape=(size, motions * pieces + len(other))))
 
 
-class LocalPlaces:
-    """Where the entries of a sparse matrix stand in the dense blocks of the pieces."""
-
-    def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces) -> None:
-        """Find the entries whose row and column belong to one piece."""
-        count, self._width = pieces.number.shape
-        owner, within = np.full(matrix.shape[0] + 1, -1), np.zeros(matrix.shape[0] + 1, dtype=np.intp)
-        owner[pieces.number] = np.arange(count)[:, None]
-        within[pieces.number] = np.arange(self._width)
-        owner[-1] = -1
-        column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
-        self._source = np.flatnonzero((owner[column] >= 0) & (owner[matrix.indices] == owner[column]))
-        row, column = matrix.indices[self._source], column[self._source]
-        self._target = (owner[row] * self._width + within[row]) * self._width + within[column]
-        self._nobody = pieces.number == matrix.shape[0]
-
-    def blocks(self, data: Floats) -> Floats:
-        """Return the blocks (p, w, w) by the matrix's data; 1 on the diagonal where a piece has no unknown."""
-        flat = np.bincount(self._target, data[self._source], self._nobody.size * self._width)
-        found = flat.astype(np.float64, copy=False).reshape(len(self._nobody), self._width, self._width)
-        each = np.arange(self._width)
-        found[:, each, each] += self._nobody
-        return found
+def local_blocks(matrix: sparse.csc_matrix, number: Ints) -> Floats:
+    """Return the dense blocks (p, w, w) of a matrix at the unknowns (p, w) of pieces; 1 on the diagonal where one has no
+    unknown."""
+    size, (count, wide) = matrix.shape[0], number.shape
+    place = np.full(size + 1, -1)
+    place[number] = np.arange(number.size).reshape(number.shape)
+    column, row = np.repeat(place[:-1], np.diff(matrix.indptr)), place[matrix.indices]
+    inside = np.flatnonzero((column >= 0) & (row // wide == column // wide))
+    flat = np.bincount(row[inside] * wide + column[inside] % wide, matrix.data[inside], count * wide * wide)
+    blocks = flat.astype(np.float64, copy=False).reshape(count, wide, wide)
+    blocks[:, np.arange(wide), np.arange(wide)] += number == size
+    return blocks
 
 
 class TwoLevelFactor:
     """Solves with a symmetric, positive definite matrix by conjugate gradients."""
 
-    def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces, local: LocalPlaces) -> None:
+    def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces) -> None:
         """Invert the pieces' blocks and factorise the coarse matrix.
 
         Raises
@@ -151,7 +118,7 @@ class TwoLevelFactor:
         self.work = 0.0
         """Work of all iterations so far, in multiplications of a factorisation."""
         try:
-            self._local = np.linalg.inv(local.blocks(matrix.data))
+            self._local = np.linalg.inv(local_blocks(matrix, pieces.number))
         except np.linalg.LinAlgError as problem:
             raise SolverError(f"{SINGULAR} ({problem})") from None
         # Pairs of clouds without weight left zeros. The matrix is symmetric: its columns are used as rows, which multiply

@@ -10,43 +10,27 @@ computed already (K. Takahashi, J. Fagan, M.-S. Chin, Formation of a sparse bus 
 short circuit study, 1973). Ranges of a few dozen columns make the work one of dense products.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
+from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
+from .eliminated import WithBlocks
 
 _WIDEST, _OVERHEAD = 64, 1e4
 """Columns of a range at most, and the fixed cost of one, in entries: calls of library functions take time."""
 
 
-class SymmetricFactor(Protocol):
-    """A matrix factorised by SuperLU in symmetric mode, possibly with further unknowns after its own."""
-
-    @property
-    def L(self) -> sparse.csc_matrix: ...
-    @property
-    def U(self) -> sparse.csc_matrix: ...
-    @property
-    def perm_r(self) -> NDArray[np.int32]: ...
-    @property
-    def perm_c(self) -> NDArray[np.int32]: ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Front:
+class _Front(NamedTuple):
     """A range of columns and the rows below that they touch."""
 
     rows: Ints
     """The columns themselves, then R; ascending."""
     width: int
-    parent: int
-    """The range that holds the first row of R; -1 = none."""
 
     def panel(self, lower: sparse.csc_matrix) -> Floats:
         """Return (rows, width) of L."""
@@ -58,7 +42,7 @@ class _Front:
         return panel
 
 
-def selected_inverse(factor: SymmetricFactor, rows: Ints, columns: Ints) -> Floats:
+def selected_inverse(factor: SuperLU | WithBlocks, rows: Ints, columns: Ints) -> Floats:
     """Return entries (k,) of the inverse of a symmetric matrix, at rows and columns (k,) where the matrix itself is not empty.
 
     0 where it holds a zero that its factor need not fill.
@@ -75,35 +59,31 @@ def selected_inverse(factor: SymmetricFactor, rows: Ints, columns: Ints) -> Floa
     found = np.empty(len(rows))
     lower, pivots = factor.L, factor.U.diagonal()
     lower.sort_indices()
-    fronts = _fronts(lower)
+    fronts = [_Front(np.append(np.arange(start, end), below), end - start) for start, end, below in _ranges(lower)]
     starts = np.array([front.rows[0] for front in fronts])
+    # A front needs the one, its parent, that holds the first row of its R.
+    above = [int(np.searchsorted(starts, f.rows[f.width], "right")) - 1 if len(f.rows) > f.width else -1 for f in fronts]
     bounds = np.append(np.searchsorted(first[order], starts), len(order))
-    waiting = np.bincount([f.parent for f in fronts if f.parent >= 0], minlength=len(fronts))
+    waiting = np.bincount([parent for parent in above if parent >= 0], minlength=len(fronts))
     inverses: dict[int, Floats] = {}
     for s in range(len(fronts) - 1, -1, -1):
-        front = fronts[s]
-        inverse = _front_inverse(front, front.panel(lower), pivots[front.rows[: front.width]], fronts, inverses)
+        front, parent = fronts[s], above[s]
+        below = None
+        if parent >= 0:
+            at = np.searchsorted(fronts[parent].rows, front.rows[front.width :])
+            below = inverses[parent][np.ix_(at, at)]
+        inverse = _front_inverse(front.panel(lower), pivots[front.rows[: front.width]], below)
         if waiting[s]:
             inverses[s] = inverse
-        if front.parent >= 0:
-            waiting[front.parent] -= 1
-            if not waiting[front.parent]:
-                del inverses[front.parent]
+        if parent >= 0:
+            waiting[parent] -= 1
+            if not waiting[parent]:
+                del inverses[parent]
         here = order[bounds[s] : bounds[s + 1]]
         column = np.minimum(np.searchsorted(front.rows, second[here]), len(front.rows) - 1)
         present = front.rows[column] == second[here]
         found[here] = np.where(present, inverse[first[here] - starts[s], column], 0.0)
     return found
-
-
-def _fronts(lower: sparse.csc_matrix) -> list[_Front]:
-    """Cut L into ranges; R of a range is what its columns touch and what the ranges before it hand on."""
-    ranges = _ranges(lower)
-    owner = np.repeat(np.arange(len(ranges)), [end - start for start, end, _ in ranges])
-    return [
-        _Front(np.append(np.arange(start, end), below), end - start, int(owner[below[0]]) if len(below) else -1)
-        for start, end, below in ranges
-    ]
 
 
 def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
@@ -149,18 +129,13 @@ def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
     return cuts[::-1]
 
 
-def _front_inverse(front: _Front, panel: Floats, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]) -> Floats:
-    """Return Z over the rows of a front."""
-    w = front.width
-    unit = lapack.dtrtri(panel[:w], lower=1, unitdiag=1)[0]
-    unit = np.tril(unit, -1) + np.eye(w)
+def _front_inverse(panel: Floats, pivots: Floats, below: Floats | None) -> Floats:
+    """Return Z over the rows of a front from its columns of L; below : Z_RR, None = there is no R."""
+    w = panel.shape[1]
+    unit = np.tril(lapack.dtrtri(panel[:w], lower=1, unitdiag=1)[0], -1) + np.eye(w)
     corner = (unit.T / pivots) @ unit
-    if front.parent < 0:
+    if below is None:
         return corner
-    at = np.searchsorted(fronts[front.parent].rows, front.rows[w:])
-    below = inverses[front.parent][np.ix_(at, at)]
     y = panel[w:] @ unit
     side = -(below @ y)
-    inverse = np.empty((len(front.rows), len(front.rows)))
-    inverse[:w, :w], inverse[w:, :w], inverse[:w, w:], inverse[w:, w:] = corner - y.T @ side, side, side.T, below
-    return inverse
+    return np.block([[corner - y.T @ side, side.T], [side, below]])

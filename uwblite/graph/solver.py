@@ -155,8 +155,6 @@ class DescentPolicy:
     """chi2 that never matters, and its share that the rounding of thousands of residuals hides."""
     little: ClassVar[float] = 1e-4
     """Share of chi2 above which a predicted decrease that was not reached is no sign of a minimum, even in a coarse search."""
-    old: ClassVar[float] = 1e-3
-    """The same of a decrease that an old factor predicts, as a share of what counts with a new one."""
     free: ClassVar[float] = 1e-2
     """lambda up to which small steps indicate a minimum and not only strong damping."""
     patience: ClassVar[int] = 8
@@ -168,10 +166,9 @@ class DescentPolicy:
     """Share of the predicted decrease from which on the other way of moving has little to gain."""
     quadratic: ClassVar[float] = 0.5
     """Share of the predicted decrease below which the cost is not quadratic along a step, and predicts no later ones."""
-    least: ClassVar[float] = 1e-14
     first: ClassVar[float] = 1e-5
     most: ClassVar[float] = 1e12
-    """lambda at least, at least after a step that failed, and at most."""
+    """lambda at least after a step that failed, and at most."""
 
 
 class _Descent:
@@ -251,18 +248,17 @@ class _Descent:
         near = not reused and decrease <= DescentPolicy.near * self.chi2 and self.damping <= DescentPolicy.nearly_free
         self.factor = self.factor if near else None
         self.graph, self.linearized, self.last_decrease, self.chi2 = graph, linearized, decrease, chi2
-        self.damping, self.raised_by = max(self.damping * relaxed(decrease / promised), DescentPolicy.least), 2.0
+        self.damping, self.raised_by = self.damping * relaxed(decrease / promised), 2.0
         return over
 
     def _refuse(self, promised: float, negligible: float, reused: bool) -> bool:
-        """Reject the step, with more damping unless it used an old factor; return whether its predicted decrease was
-        negligible."""
+        """Reject the step, with more damping unless it used an old factor; return whether its decrease was to be negligible."""
         self.factor = None
-        little = (DescentPolicy.old if reused else 1.0) * min(negligible, DescentPolicy.little * self.chi2)
-        if 0 < promised <= little and self.damping <= DescentPolicy.free:
+        if reused:
+            return False
+        if 0 < promised <= min(negligible, DescentPolicy.little * self.chi2) and self.damping <= DescentPolicy.free:
             return True
-        if not reused:
-            self.damping, self.raised_by = max(self.damping * self.raised_by, DescentPolicy.first), self.raised_by * 2.0
+        self.damping, self.raised_by = max(self.damping * self.raised_by, DescentPolicy.first), self.raised_by * 2.0
         return False
 
 

@@ -6,9 +6,7 @@ A result is replaced as a whole, see folders.py. report.json holds the hash of e
 import hashlib
 import json
 import os
-import re
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from ..report.picture import draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
 from .files import sha256_of, write_text
-from .folders import check_free, mend, refuse_foreign, replacing_folder
+from .folders import check_free, refuse_foreign, replacing_folder
 from .g2o import write_g2o
 from .graph_file import plain_edges
 from .map_server import trinary_image, write_map
@@ -39,23 +37,8 @@ from .result_text import (
     stamps_csv,
     summary,
 )
+from .stored_result import is_of_result, repair_result
 from .tum import write_tum
-
-_CONTRACT = re.compile(
-    r"trajectory(_\d+)?\.tum|trajectory_covariance\.csv|anchors\.csv|range_errors\.csv|map\.(pgm|yaml|png)|map_scale\.(png|yaml)"
-    r"|graph\.(g2o|pyfg)|graph_stamps\.csv|config\.toml|report\.(html|json)"
-)
-
-
-def is_of_result(name: str) -> bool:
-    """Return whether a file's name is one of those that a result may hold."""
-    return _CONTRACT.fullmatch(name) is not None
-
-
-def repair_result(folder: str | os.PathLike[str]) -> None:
-    """Finish a replacement of a result that a crash has interrupted, where there is one and it may be finished."""
-    with suppress(OSError):
-        mend(folder, is_of_result)
 
 
 def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:

@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,25 @@ from ..errors import ConfigError, FormatError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..sensor_log import MOST_ANCHORS
 from .csv_table import read_csv
+from .folders import mend
 from .map_server import read_map
-from .results import repair_result
 from .tum import read_tum
+
+_CONTRACT = re.compile(
+    r"trajectory(_\d+)?\.tum|trajectory_covariance\.csv|anchors\.csv|range_errors\.csv|map\.(pgm|yaml|png)|map_scale\.(png|yaml)"
+    r"|graph\.(g2o|pyfg)|graph_stamps\.csv|config\.toml|report\.(html|json)"
+)
+
+
+def is_of_result(name: str) -> bool:
+    """Return whether a file's name is one of those that a result may hold."""
+    return _CONTRACT.fullmatch(name) is not None
+
+
+def repair_result(folder: str | os.PathLike[str]) -> None:
+    """Finish a replacement of a result that a crash has interrupted, where there is one and it may be finished."""
+    with suppress(OSError):
+        mend(folder, is_of_result)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,18 +1,16 @@
 """A raster for every cloud in which each cell names the nearest point: a look-up of a million points needs no tree."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import WIDE, Floats, Ints
+from ..arrays import CHUNK, WIDE, Floats, Ints, chunks
 from ..graph.work import LOOK_UPS
-from .clouds import Clouds
+from .clouds import CLOUDS_AT_ONCE, Clouds
 
-_CLOUDS_AT_ONCE = 64
-"""Clouds whose rasters are made at once; a bound on the memory."""
+_MOST_NARROW = np.iinfo(np.int16).max
 _RUN_BITS = 4
 _RUN = 1 << _RUN_BITS
 """Cells in y that are kept together: a wall and the cells within reach of it are about as wide."""
@@ -29,7 +27,7 @@ class CloudRasters:
     """m."""
     origin: Floats
     """(k, 2) lower corner of each cloud's raster in its own frame, m."""
-    shape: Ints
+    shape: NDArray[np.int32]
     """(k, 2) cells in x and y; the outermost ones name no point."""
     start: NDArray[np.int32]
     """(k,) first run of each raster in `run`; those in y follow each other."""
@@ -59,80 +57,70 @@ class ScanClouds:
     """Offset of the lidar's clock with which the clouds were made, s."""
 
 
-def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
-    """Build rasters with cells of a size, m: each point with a normal writes its number into those within reach, m, the nearest
-    last."""
-    low, high = _boxes(clouds)
-    filled = np.isfinite(low[:, :1])
-    margin = reach + cell
-    low = np.where(filled, low - margin, 0.0)
-    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.intp) + filled
-    runs = shape[:, 0] * -(-shape[:, 1] // _RUN)
-    start = (np.concatenate([[0], np.cumsum(runs)]) + 1).astype(np.int32)
-    narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
-    kind = np.dtype(np.int16 if narrow else np.int32)
-    offsets = _offsets(reach / cell)
-    run, kept, count = np.zeros(start[-1], dtype=np.int32), [np.full((1, _RUN), NOBODY, dtype=kind)], 1
-    for some in _blocks(clouds):
-        rows = slice(start[some.start], start[some.stop])
-        block = np.full((rows.stop - rows.start, _RUN), NOBODY, dtype=kind)
-        usable, owner, x, y = _usable(clouds, some)
-        number = (usable - clouds.offsets[owner]).astype(kind)
-        stride = -(-shape[owner, 1] // _RUN) * _RUN
-        cx, cy = ((x - low[owner, 0]) / cell).astype(np.intp), ((y - low[owner, 1]) / cell).astype(np.intp)
-        _claim_cells(block.reshape(-1), (start[owner] - rows.start) * _RUN + cx * stride + cy, stride, number, offsets)
+def rasterize(clouds: Clouds, cell: float, reach: float, targets: Ints | None = None) -> CloudRasters:
+    """Build rasters with cells of a size, m, of all clouds or of targets alone: each point with a normal writes its number into
+    those within reach, m, the nearest last."""
+    many, margin, offsets = len(clouds), reach + cell, _offsets(reach / cell)
+    kind = np.dtype(np.int16 if clouds.counts.max(initial=0) <= _MOST_NARROW else np.int32)
+    writes = clouds.lines
+    if targets is not None:
+        wanted = np.zeros(many, dtype=bool)
+        wanted[targets] = True
+        writes &= wanted.take(clouds.owner)
+    origin, shape, start = np.zeros((many, 2)), np.zeros((many, 2), dtype=np.int32), np.empty(many, dtype=np.int32)
+    run, kept = [np.zeros(1, dtype=np.int32)], [np.full((1, _RUN), NOBODY, dtype=kind)]
+    runs = named_runs = 1
+    for some in chunks(many, CLOUDS_AT_ONCE):
+        begin, end = clouds.offsets[some.start], clouds.offsets[some.stop]
+        usable = begin + np.flatnonzero(writes[begin:end])
+        owner, place = clouds.owner[usable], clouds.points.T.take(usable, axis=1).astype(np.float64)
+        count = np.bincount(owner - some.start, minlength=some.stop - some.start)
+        begins = (np.cumsum(count) - count)[count > 0]
+        if len(begins):
+            shown = owner[begins]
+            origin[shown] = np.minimum.reduceat(place, begins, axis=1).T - margin
+            high = np.maximum.reduceat(place, begins, axis=1).T
+            shape[shown] = np.ceil((high + margin - origin[shown]) / cell).astype(np.int32) + 1
+        wide, tall = shape[some, 0].astype(np.intp), -(-shape[some, 1].astype(np.intp) // _RUN)
+        ends = np.cumsum(wide * tall)
+        start[some] = runs + ends - wide * tall
+        block = np.full((int(ends[-1]), _RUN), NOBODY, dtype=kind)
+        stride = (tall * _RUN)[owner - some.start]
+        cx, cy = ((place - origin.T.take(owner, axis=1)) / cell).astype(np.intp)
+        base = (start[owner].astype(np.intp) - runs) * _RUN + cx * stride + cy
+        _claim_cells(block.reshape(-1), base, stride, (usable - clouds.offsets[owner]).astype(kind), offsets)
         # All bits of -1 are set: the words of a run that names no point are -1 together, too.
         named = np.flatnonzero(reduce(np.bitwise_and, block.view(WIDE).T) != NOBODY)
-        run[rows][named] = (count + np.arange(len(named))) * _RUN
+        cells = np.zeros(len(block), dtype=np.int32)
+        cells[named] = (named_runs + np.arange(len(named))) * _RUN
+        run.append(cells)
         kept.append(block[named])
-        count += len(named)
-    return CloudRasters(clouds, cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1))
+        runs, named_runs = runs + len(block), named_runs + len(named)
+    return CloudRasters(clouds, cell, origin, shape, start, np.concatenate(run), np.concatenate(kept).reshape(-1))
 
 
-def _offsets(reach: float) -> list[tuple[int, int]]:
-    """Return the cells within reach of one, cells, the farthest first."""
-    steps = np.arange(-int(reach), int(reach) + 1)
-    dx, dy = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
-    square = dx * dx + dy * dy
+@cache
+def _offsets(reach: float) -> Ints:
+    """Return the cells (m, 2) within reach of one, cells, the farthest first."""
+    cells = np.argwhere(np.ones((2 * int(reach) + 1,) * 2)) - int(reach)
+    square = np.sum(cells**2, axis=1)
     order = np.argsort(-square, kind="stable")
-    return [*zip(*(axis[order][square[order] <= reach * reach].tolist() for axis in (dx, dy)), strict=True)]
-
-
-def _blocks(clouds: Clouds) -> Iterator[slice]:
-    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
-        yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
+    return cells[order][square[order] <= reach * reach]
 
 
 def _claim_cells(
     cells: NDArray[np.signedinteger], base: Ints, stride: Ints, number: NDArray[np.signedinteger],
-    offsets: list[tuple[int, int]],
+    offsets: Ints,
 ) -> None:
     """Write the numbers of points into the cells at offsets from their own, base; later offsets overwrite earlier ones."""
     cells[base] = number
     last = cells[base] == number
     base, stride, number = base[last], stride[last], number[last]
-    for dx, dy in offsets:
-        cells[base + (dx * stride + dy)] = number
-
-
-def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return rows, clouds and coordinates (p,) of the points with a normal of some clouds."""
-    first, end = clouds.offsets[some.start], clouds.offsets[some.stop]
-    usable = first + np.flatnonzero(np.any(clouds.normals[first:end] != 0.0, axis=1))
-    x, y = clouds.points[usable].T.astype(np.float64)
-    return usable, clouds.owner[usable], x, y
-
-
-def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
-    """Return the corners (k, 2) of a box around the points with a normal of each cloud; inf where it has none."""
-    low, high = np.full((len(clouds), 2), np.inf), np.full((len(clouds), 2), -np.inf)
-    for some in _blocks(clouds):
-        _, owner, x, y = _usable(clouds, some)
-        if len(owner):
-            begins = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
-            low[owner[begins]] = np.minimum.reduceat(np.stack([x, y]), begins, axis=1).T
-            high[owner[begins]] = np.maximum.reduceat(np.stack([x, y]), begins, axis=1).T
-    return low, high
+    # Of few points many cells are claimed by one call.
+    for some in chunks(len(offsets), max(CHUNK // max(len(base), 1), 1)):
+        dx, dy = offsets[some].T[:, :, None]
+        place = dx * stride + dy + base
+        cells[place.ravel()] = np.broadcast_to(number, place.shape).ravel()
 
 
 def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
@@ -142,9 +130,9 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.s
     # Truncation puts coordinates up to a cell below the raster into its rim, which names no point.
     cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
     cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
-    wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)
-    inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
-    run = cx * (-(-raster.shape[i, 1:] // _RUN)).astype(np.int32)
+    shape = raster.shape[i]
+    inside = (cx.view(np.uint32) < shape[:, :1].view(np.uint32)) & (cy.view(np.uint32) < shape[:, 1:].view(np.uint32))
+    run = cx * -(-shape[:, 1:] // _RUN)
     run += cy >> _RUN_BITS
     run += raster.start[i, None]
     run *= inside

@@ -20,10 +20,8 @@ from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_b
 
 _TURN = 8.0
 """rad; more than all bearings differ by."""
-_BLOCK = 32
-"""Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
-_STRAIGHT = 0.6
-"""Least linearity of a line through single points."""
+CLOUDS_AT_ONCE = 64
+"""Clouds that are processed together; bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +67,12 @@ class Clouds:
     @property
     def counts(self) -> Ints:
         """(k,) points of each cloud."""
-        return np.diff(self.offsets)
+        return np.asarray(self.offsets[1:] - self.offsets[:-1])
+
+    @property
+    def lines(self) -> Bools:
+        """(p,) whether each point has a normal."""
+        return np.asarray((self.normals[:, 0] != 0.0) | (self.normals[:, 1] != 0.0))
 
     def cloud(self, k: int) -> tuple[Floats, Floats]:
         """Return points and normals of one cloud, in double precision."""
@@ -101,21 +104,22 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     bearing."""
     rays = filled(rays)
     cell = cell_number(rays.keyframe, rays.points, config.voxel)
-    one, mean = mean_by_key(cell, np.concatenate([rays.points, rays.origins], axis=1))
+    one, mean = mean_by_key(cell, rays.points)
     # Points come by owner: to sort one number in runs takes a tenth of the time of two keys.
-    order = np.argsort(_TURN * rays.keyframe[one] + se2.bearing(mean[:, :2]), kind="stable")
-    owner, points, origins = rays.keyframe[one[order]], mean[order, :2], mean[order, 2:]
+    order = np.argsort(_TURN * rays.keyframe[one] + se2.bearing(mean), kind="stable")
+    one, points = one[order], mean.take(order, axis=0)
+    owner, origins = rays.keyframe[one], rays.origins.take(one, axis=0)
     lines = _lines(owner, points, config)
     straight = (lines.linearity >= config.linearity)[:, None]
-    kept = lines.neighbours > config.min_neighbours
-    normals = np.where(straight, facing(lines.normals, origins - points), 0.0)[kept]
-    centres, owner = np.where(straight, lines.centers, points)[kept], owner[kept]
+    kept = np.flatnonzero(lines.neighbours > config.min_neighbours)
+    normals = np.where(straight, facing(lines.normals, origins - points), 0.0).take(kept, axis=0)
+    centres, owner = np.where(straight, lines.centers, points).take(kept, axis=0), owner.take(kept)
     return Clouds(
         np.searchsorted(owner, np.arange(keyframes + 1)).astype(np.intp),
         centres.astype(np.float32, order="F"),
         normals.astype(np.float32, order="F"),
         owner.astype(np.int32),
-        lines.normal_variance[kept].astype(np.float32),
+        lines.normal_variance.take(kept).astype(np.float32),
     )
 
 
@@ -127,7 +131,7 @@ def facing(normals: Floats, way: Floats) -> Floats:
 def _lines(owner: Ints, points: Floats, config: CloudConfig) -> Lines:
     """Fit lines to all neighbourhoods; a block of clouds shares one tree, in which they lie side by side."""
     parts = []
-    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + CLOUDS_AT_ONCE, CLOUDS_AT_ONCE))
     width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
     for first, last in pairwise(blocks):
         block = points[first:last]
@@ -150,29 +154,6 @@ def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clo
         whole.points[rows], whole.normals[rows], whole.normal_variance[rows] = part.points, part.normals, part.normal_variance
         whole.owner[rows] = part.owner + first
     return whole
-
-
-def make_cloud(
-    points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25, work: Work | None = None
-) -> Clouds:
-    """Return one cloud of single points: a line is fitted to the surroundings of each.
-
-    Parameters
-    ----------
-    points : (n, 2), m; of an even density.
-    viewpoints : (n, 2) or (2,), where the sensor stood when it saw each point, m, same frame, towards which normals are
-        turned. None: not known; the side to which a normal points then means nothing.
-    normal_radius : neighbourhood of the lines, m; a few times the distance between points.
-    """
-    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-    lines = estimate_normals(points, make_tree(points), normal_radius)
-    straight = lines.linearity >= _STRAIGHT
-    normals = np.where(straight[:, None], lines.normals, 0.0)
-    if viewpoints is not None:
-        normals = facing(normals, viewpoints - points)
-    variance = np.where(straight, lines.normal_variance, 0.0)
-    arrays = (lines.centers, normals, np.zeros(len(points), dtype=np.int32), variance)
-    return Clouds(np.array([0, len(points)]), *arrays, Work() if work is None else work)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +184,8 @@ class GapPolicy:
 def filled(rays: ScanPoints) -> ScanPoints:
     """Return the points of scans with further ones in the gaps between beams that hit one straight surface."""
     first = _on_one_line(rays)
+    if not len(first):
+        return rays
     step = rays.points[first + 1] - rays.points[first]
     parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / GapPolicy.spacing).astype(np.intp)
     own = np.repeat(np.arange(len(first)), parts - 1)
@@ -221,9 +204,12 @@ def filled(rays: ScanPoints) -> ScanPoints:
 
 def _on_one_line(rays: ScanPoints) -> Ints:
     """Return the hits behind which there is a gap to be filled: to the next beam's, on a line with the one before or behind."""
+    beside = np.zeros(len(rays.ray), dtype=bool)
+    beside[:-1] = (rays.scan[1:] == rays.scan[:-1]) & (rays.ray[1:] - rays.ray[:-1] == 1)
+    if not beside.any():
+        return np.zeros(0, dtype=np.intp)
     step = np.diff(rays.points, axis=0, append=np.nan)
     gap = np.hypot(step[:, 0], step[:, 1])
-    beside = np.append((np.diff(rays.scan) == 0) & (np.diff(rays.ray) == 1), False)
     short = beside & (gap < GapPolicy.widest)
     wide = np.flatnonzero(short & (gap > GapPolicy.spacing))
     beam = rays.points[wide] - rays.origins[wide]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import TINY, Floats, Ints
 from ..config import setting
 from ..graph.work import SCORES
 from .cloud_rasters import rasterize, surface_field
@@ -34,8 +34,6 @@ _NEIGHBOURS = np.array([offset for offset in np.ndindex(3, 3, 3) if offset != (1
 """(26, 3) of a cell in the middle of three by three by three."""
 _TRANSFORM = 10
 """Scores of single points that take as long as the transforms of one cell of an image."""
-_ROUNDING = 1e-9
-"""Share of a step by which a grid may fall short of its window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +83,7 @@ def score_grid(
 ) -> tuple[Singles, Floats, Ints, Ints]:
     """Return the scores (h, r, c) of a grid by heading, y and x, headings (h,), rad, and shifts in x (c,) and y (r,), cells."""
     steps = np.array([config.resolution, config.resolution, config.angle_step])
-    wide, tall, turns = np.ceil(np.array(window) / steps - _ROUNDING).astype(np.intp).tolist()
+    wide, tall, turns = np.ceil(np.array(window) / steps - TINY).astype(np.intp).tolist()
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step
     shift_x, shift_y = np.arange(-wide, wide + 1), np.arange(-tall, tall + 1)
     scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)

@@ -13,20 +13,17 @@ import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, chunks, run_starts
 from ..config import setting
 from ..graph.calibration import scan_indices
-from ..graph.graph import Graph
+from ..graph.graph import POSE, Graph
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from .cloud_rasters import ScanClouds
-from .clouds import Clouds
-from .overlap import surface_cells
+from .clouds import CLOUDS_AT_ONCE, Clouds
 from .scan_matching import CloudPairs, PairFactors, match, measured, pairs_of
-
-_CLOUDS_AT_ONCE = 128
-"""Clouds whose overlaps with all others are in memory at once; a bound on the memory."""
+from .visibility import surface_cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,18 +132,18 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: 
     visits = int(visit.max(initial=0)) + 1
     across, found = seen.T.tocsr(), []
     partners = min(config.partners, max(2, config.most // seen.shape[0]))
-    for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
-        common = seen[first : first + _CLOUDS_AT_ONCE] @ across
+    for some in chunks(seen.shape[0], CLOUDS_AT_ONCE):
+        common = seen[some] @ across
         common.sort_indices()
         common = common.tocoo()
-        i, j = common.row.astype(np.intp) + first, common.col.astype(np.intp)
+        i, j = common.row.astype(np.intp) + some.start, common.col.astype(np.intp)
         share = common.data / np.minimum(size[i], size[j])
         kept = (np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= config.common)
         i, j, share = i[kept], j[kept], share[kept]
         own = i * visits + visit[j]
         # Numbers of which the whole part comes first, then the larger share, then the earlier cloud.
         order = np.argsort(own - 0.5 * share, kind="stable")
-        order = order[np.diff(own[order], prepend=-1) != 0]
+        order = order[run_starts(own[order])]
         order = order[np.argsort(i[order] - 0.5 * share[order], kind="stable")]
         i, j = i[order], j[order]
         best = np.arange(len(i)) - np.searchsorted(i, i) < partners
@@ -161,7 +158,7 @@ def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> S
     # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
-    none, names = np.broadcast_to(0.0, (len(i), 3, 3)), scan_indices(graph.calibration)
+    none, names = np.broadcast_to(0.0, (len(i), *POSE, *POSE)), scan_indices(graph.calibration)
     return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, kernel=RefinementConfig.kernel)
 
 

@@ -19,10 +19,11 @@ import numpy as np
 from scipy.special import expit
 
 from ..arrays import Floats, Ints, concatenated
+from ..graph.graph import POSE
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
-from .visibility import free_ranges, in_free_space, nearest_by_bearing
+from .visibility import free_space, in_free_space, nearest_by_bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +82,8 @@ class ObjectLikelihood:
     @classmethod
     def of(cls, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
         """Return that of a raster's clouds, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
-        free = free_ranges(nearest_by_bearing(raster.clouds))
+        nearest = nearest_by_bearing(raster.clouds)
+        free = free_space(np.zeros((len(nearest), *POSE)), nearest).ranges
         return cls(raster, sigma, matched_by_chance(raster, pairs, poses), free, *objects(raster.clouds, ObjectPolicy.gap))
 
     @property

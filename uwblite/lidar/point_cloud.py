@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from ..arrays import WIDE, Bools, Floats, Ints, Wides, as_array, require_finite, require_shape
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, as_array, require_finite, require_shape, run_starts, stable_order
 
 
 def make_tree(points: Floats) -> cKDTree:
@@ -68,8 +68,8 @@ def cell_number(owner: Ints, points: Floats, size: float) -> Wides:
 
 def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
     """Return one row of each key (m,), by key, and the means (m, v) of the values (p, v) that share a key (p,)."""
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    order = stable_order(key)
+    first = run_starts(key[order])
     if not len(first):
         return first, values
     count = np.diff(np.append(first, len(key)))[:, None]

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, spread
+from ..arrays import Bools, Floats, Ints, run_starts, spread
 from .surface_rays import MeasuredSurfaces, RayNoise, ShapePolicy, SurfaceRays, Surfaces, to_circle
 
 
@@ -148,7 +148,7 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
     of_poses, of_surfaces = np.zeros((k, end + 1, end + 1)), np.zeros((s, end + 1, end + 1))
     across, where = [np.zeros((0, end + 1, end + 1))], [np.zeros((2, 0), dtype=np.intp)]
     for rays in found.rays.in_parts(found.surfaces):
-        first = _groups(rays)
+        first = run_starts(rays.keyframe, rays.surface)
         pair = np.stack([rays.keyframe[first], rays.surface[first]]).astype(np.intp)
         lines = linearized(rays, first, found.surfaces, sensors, poses)
         share, narrow = found.noise.weights(bool(found.surfaces.round[rays.surface[0]]), kernel)
@@ -165,16 +165,11 @@ def weighted_sums(found: MeasuredSurfaces, sensors: Floats, poses: Floats, kerne
     )
 
 
-def _groups(rays: SurfaceRays) -> Ints:
-    """Return the first ray (g,) of each keyframe on each surface."""
-    return np.flatnonzero(np.diff(np.stack([rays.keyframe, rays.surface]), axis=1, prepend=-1).any(axis=0))
-
-
 def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayNoise:
     """Learn the noise of rays from their residuals; for the parameters see linearized."""
     residual, place = [np.zeros(0, dtype=np.float32)], [np.zeros(0, dtype=np.int32)]
     for some in rays.in_parts(surfaces):
-        lines = linearized(some, _groups(some), surfaces, sensors, poses)
+        lines = linearized(some, run_starts(some.keyframe, some.surface), surfaces, sensors, poses)
         residual.append((lines.figures[-1] * np.sqrt(lines.information)).astype(np.float32))
         place.append(np.floor(lines.place).astype(np.int32))
     return learnt_noise(np.concatenate(residual), np.concatenate(place), rays.surface, surfaces.round)

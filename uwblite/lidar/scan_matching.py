@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, concatenated
+from ..arrays import CHUNK, TINY, Bools, Floats, Ints, Table, chunks, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 
@@ -42,7 +42,7 @@ class PairPolicy:
     """Least cosine between the normals of two matched points."""
     measured: ClassVar[float] = 2.0
     """Multiple of the spurious information that a direction must exceed to have been measured."""
-    farthest: ClassVar[tuple[float, float]] = (0.3, 0.15)
+    farthest: ClassVar[tuple[float, float]] = (2.0 * gate, gate)
     """Longest step of one iteration, m and rad."""
     shrink: ClassVar[float] = 0.8
     """Gate of an iteration as a share of the one before, at most."""
@@ -53,14 +53,11 @@ class PairPolicy:
     iterations: ClassVar[int] = 20
 
 
-_AT_ONCE = 1 << 14
-"""Points looked up at once, so that they fit into the processor's cache; it also bounds the memory."""
-_PAIRS_AT_ONCE = 1 << 12
-"""Pairs whose points are listed at once; a bound on the memory."""
-_TINY = float(np.finfo(np.float32).tiny)
-SINGULAR = 1e-9
+_LEAST = float(np.finfo(np.float32).tiny)
+SINGULAR = TINY
 """Share of the largest information below which a direction has none."""
 _FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+_ONE = np.eye(len(_FLOOR))
 """N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
 and y, whatever the frame."""
 
@@ -112,15 +109,14 @@ class PairFactors(Table):
 
 def pairs_of(clouds: Clouds, i: Ints, j: Ints, limit: int = PairPolicy.points) -> CloudPairs:
     """Return pairs of targets i (e,) and sources j (e,), with up to `limit` evenly spread points with a normal of each."""
-    usable = np.any(clouds.normals != 0.0, axis=1)
+    usable = clouds.lines
     ranks = np.concatenate([[0], np.cumsum(usable)])
     rows = np.append(np.flatnonzero(usable), NOBODY).astype(np.int32)
     begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
     take = np.minimum(end - begin, limit)
     rank = np.arange(take.max(initial=0))
     points = np.empty((len(j), len(rank)), dtype=np.int32)
-    for first in range(0, len(j), _PAIRS_AT_ONCE):
-        part = slice(first, first + _PAIRS_AT_ONCE)
+    for part in chunks(len(j)):
         number, taken = (end - begin)[part, None], take[part, None]
         picked = begin[part, None] + (rank * number) // np.maximum(taken, 1)
         points[part] = rows[np.where(rank < taken, picked, len(rows) - 1)]
@@ -145,7 +141,7 @@ def match(
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
     root = None if weight is None else np.sqrt(weight)
-    scale = np.broadcast_to(scale, len(pairs))
+    scale = np.full(len(pairs), scale)
     found = correspondences(raster, pairs, T_i_j, gate)
     return concatenated(
         [
@@ -181,10 +177,8 @@ def correspondences(
     """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
     # Each coordinate of points and normals in one piece.
     surface = [np.ascontiguousarray(column) for column in (*raster.clouds.points.T, *raster.clouds.normals.T)]
-    at_once = max(_AT_ONCE // max(pairs.points.shape[1], 1), 1)
-    gate = np.broadcast_to(gate, len(pairs))
-    for first in range(0, max(len(pairs), 1), at_once):
-        part = slice(first, first + at_once)
+    gate = np.full(len(pairs), gate)
+    for part in chunks(max(len(pairs), 1), max(CHUNK // max(pairs.points.shape[1], 1), 1)):
         yield _looked_up(surface, raster, part, pairs.rows(part), T_i_j[part], gate[part])
 
 
@@ -241,11 +235,16 @@ def condensed(
 
 def _relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floats, Floats]:
     """Return (..., 3, 3) B V, its inverse, and the eigenvalues (..., 3) of B^-1 H B^-T, N kept from vanishing."""
-    floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _TINY
-    basis = np.asarray(np.linalg.cholesky(spurious + floor[..., None] * np.eye(len(_FLOOR))), dtype=np.float64)
+    basis = np.asarray(np.linalg.cholesky(_floored(information, spurious)), dtype=np.float64)
     inverse = _inverse(basis)
     values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
     return basis @ vectors, np.swapaxes(vectors, -1, -2) @ inverse, values
+
+
+def _floored(information: Floats, spurious: Floats) -> Floats:
+    """Return spurious information (..., 3, 3) that does not vanish."""
+    floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _LEAST
+    return np.asarray(spurious + floor[..., None] * _ONE)
 
 
 def _inverse(lower: Floats) -> Floats:
@@ -262,7 +261,7 @@ def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tu
     """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added: a
     direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m."""
     basis, inverse, values = _relative_eigen(information, spurious)
-    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _TINY), 0.0)
+    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _LEAST), 0.0)
     share = (basis * kept[..., None, :]) @ inverse
     return share @ information, (share @ gradient[..., None])[..., 0]
 
@@ -275,6 +274,18 @@ def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     divisor = np.where(kept > 0.0, values, np.inf)
     step = -np.einsum("eji,ej->ei", inverse, np.einsum("eij,ej->ei", inverse, factors.gradient) / divisor)
     return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis, 1, 2)
+
+
+def _step(factors: PairFactors) -> Floats:
+    """Return the step of nondegenerate_step: where every direction was measured, as mostly, that of Gauss and Newton."""
+    step, spurious = np.empty_like(factors.gradient), _floored(factors.hessian, factors.spurious)
+    excess = factors.hessian - PairPolicy.measured * spurious
+    (a, b), c = excess[:, 0, :2].T, excess[:, 1, 1]
+    whole = (a > 0.0) & (a * c > b * b) & (np.linalg.det(excess) > 0.0)
+    step[whole] = -np.linalg.solve(factors.hessian[whole], factors.gradient[whole, :, None])[..., 0]
+    if not whole.all():
+        step[~whole] = nondegenerate_step(factors.rows(~whole))[0]
+    return step
 
 
 def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -311,7 +322,7 @@ class Aligned:
     @property
     def rms(self) -> Floats:
         """(e,) root mean square distance of the matches, m."""
-        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, _TINY))
+        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, _LEAST))
 
 
 def limited(step: Floats) -> Floats:
@@ -336,19 +347,19 @@ def align_pairs(
     c, pose, gate, moving = PairPolicy, guess.copy(), np.full(len(guess), first_gate), np.arange(len(guess))
     finished: list[tuple[Ints, PairFactors]] = []
     for _ in range(iterations):
-        factors = match(raster, pairs.rows(moving), pose[moving], gate, gate / 2.0)
-        step = nondegenerate_step(factors)[0]
+        factors = match(raster, pairs, pose[moving], gate, gate / 2.0)
+        step = _step(factors)
         length = np.abs(step).max(axis=1)
         pose[moving] += limited(step)
         left = (length >= c.converged) | (gate > last_gate)
+        gate = np.maximum(np.minimum(c.shrink * gate, c.gate_per_step * length), last_gate)
         if not left.all():
             finished.append((moving[~left], _after(factors.rows(~left), step[~left])))
-        gate = np.maximum(np.minimum(c.shrink * gate, c.gate_per_step * length), last_gate)[left]
-        moving = moving[left]
+            moving, gate, pairs = moving[left], gate[left], pairs.rows(left)
         if not len(moving):
             break
     if len(moving) or not finished:
-        finished.append((moving, match(raster, pairs.rows(moving), pose[moving], last_gate, last_gate / 2.0)))
+        finished.append((moving, match(raster, pairs, pose[moving], last_gate, last_gate / 2.0)))
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     order = np.argsort(np.concatenate([which for which, _ in finished]))
     return Aligned(pose, concatenated([factors for _, factors in finished]).rows(order))

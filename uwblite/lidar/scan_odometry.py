@@ -10,16 +10,15 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, renumbered
+from ..arrays import Bools, Floats, Ints, chunks, renumbered
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import clouds, scan_matching
 from .cloud_rasters import CloudRasters, rasterize
-from .clouds import CloudConfig, Clouds, make_cloud
+from .clouds import CLOUDS_AT_ONCE, CloudConfig, Clouds
 from .correlative_matching import search
-from .overlap import directional_overlap
 from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
-from .visibility import free_around, violates_free_space
+from .visibility import directional_overlap, free_around, violates_free_space
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +29,8 @@ class ScanStepPolicy:
     """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
     gate: ClassVar[float] = 0.12
     """The same at its end: single scans are thinner than clouds of keyframes, and more often match what they do not show."""
-    search: ClassVar[tuple[float, float, float]] = (0.6, 0.6, 0.6)
-    """Half-widths of the search, m, m, rad."""
-    at_once: ClassVar[int] = 128
-    """Pairs of scans whose rasters are in memory at once."""
+    search: ClassVar[float] = 0.6
+    """Half-width of the search, m and rad."""
     well_seen: ClassVar[float] = 0.9
     """Quantile of a scan's readings up to which it sees whatever is there."""
     least_in_sight: ClassVar[float] = 0.5
@@ -56,17 +53,16 @@ def scan_steps(
     -------
     Motions T_first_second (e, 3) and the share of points that match (e,), 0..1; 0 where there are too few.
     """
-    steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
-    for low in range(0, len(first), ScanStepPolicy.at_once):
-        rows = slice(low, low + ScanStepPolicy.at_once)
-        raster, pairs = _pairs(scans, mounting, first[rows], second[rows])
+    steps, shares = [np.zeros_like(guess[:0])], [np.zeros(0)]
+    for rows in chunks(len(first), CLOUDS_AT_ONCE):
+        raster, pairs = _pairs(*_clouds(scans, mounting, first[rows], second[rows]))
         aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, ScanStepPolicy.gate)
         enough = aligned.factors.asked >= PairPolicy.fewest
         pose, share = aligned.pose, np.where(enough, aligned.share, 0.0)
         poor = np.flatnonzero((share < PairPolicy.good_share) & enough)
-        allowed = -(-searches * ScanStepPolicy.at_once // len(first))
+        allowed = -(-searches * CLOUDS_AT_ONCE // len(first))
         for row in poor[np.argsort(share[poor], kind="stable")][:allowed].tolist():
-            found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[low + row])
+            found = _searched(raster, pairs.rows(slice(row, row + 1)), guess[rows.start + row])
             if found[1] > share[row]:
                 pose[row], share[row] = found
         steps.append(pose)
@@ -79,7 +75,7 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
 
     Points without a match count as one at the gate, unless the first scan could not see there, as along a bare corridor.
     """
-    raster, pairs = _pairs(scans, mounting, first, second)
+    raster, pairs = _pairs(*_clouds(scans, mounting, first, second))
     pairs = _in_sight(raster.clouds, pairs, motion, scans, mounting)
     gate = ScanStepPolicy.reach
     found = scan_matching.match(raster, pairs, motion, gate, gate)
@@ -102,31 +98,36 @@ def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScan
 
 def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of two scans that matches at a motion (e, 3), in the direction with the fewest matches, 0..1."""
-    raster, pairs = _pairs(scans, mounting, first, second)
-    return directional_overlap(raster, pairs.i, pairs.j, motion, ScanStepPolicy.gate)
+    built, i, j = _clouds(scans, mounting, first, second)
+    raster = rasterize(built, CloudConfig.raster, ScanStepPolicy.reach)
+    return directional_overlap(raster, i, j, motion, ScanStepPolicy.gate)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return the share (e,) of either of two scans that stands in the free space of the other, for motions (e, 3), 0..1."""
-    raster, pairs = _pairs(scans, mounting, first, second)
-    free, seen = free_around(raster.clouds), [raster.clouds.cloud(k)[0] for k in range(len(raster.clouds))]
-    steps = zip(pairs.i.tolist(), pairs.j.tolist(), motion, strict=True)
+    built, i, j = _clouds(scans, mounting, first, second)
+    free, seen = free_around(built), [built.cloud(k)[0] for k in range(len(built))]
+    steps = zip(i.tolist(), j.tolist(), motion, strict=True)
     return np.array([violates_free_space(free[a], seen[a], free[b], seen[b], step) for a, b, step in steps])
 
 
-def _pairs(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints) -> tuple[CloudRasters, CloudPairs]:
-    """Return the rasters of the clouds of pairs of scans, and the pairs of clouds (e)."""
+def _clouds(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints) -> tuple[Clouds, Ints, Ints]:
+    """Return the clouds of pairs of scans, and the targets and sources (e,) of the pairs among them."""
     config = CloudConfig()
     chosen, i, j = renumbered(first, second)
-    built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = rasterize(built, config.raster, ScanStepPolicy.reach)
-    return raster, pairs_of(built, i, j)
+    return clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config), i, j
+
+
+def _pairs(built: Clouds, i: Ints, j: Ints) -> tuple[CloudRasters, CloudPairs]:
+    """Return the rasters of the targets, and the pairs of clouds (e)."""
+    return rasterize(built, CloudConfig.raster, ScanStepPolicy.reach, i), pairs_of(built, i, j)
 
 
 def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Floats, float]:
     """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
-    target, source = (make_cloud(p, p + n) for p, n in (raster.clouds.cloud(int(k)) for k in (pair.i[0], pair.j[0])))
-    places = search(target, source, guess, ScanStepPolicy.search).poses
+    target, source = (raster.clouds.chosen(of) for of in (pair.i, pair.j))
+    half = ScanStepPolicy.search
+    places = search(target, source, guess, (half, half, half)).poses
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))

@@ -10,13 +10,11 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, rms_length
+from ..arrays import Floats, Ints, chunks, rms_length
 from ..config import setting
-from .clouds import Clouds, joined
+from .clouds import CLOUDS_AT_ONCE, Clouds, joined
 from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statistical_outlier_filter
 
-_AT_ONCE = 32
-"""Sub-maps merged at once; a bound on the memory."""
 _FACINGS = 4
 
 
@@ -89,7 +87,7 @@ def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference:
     keyframes (s,), and filter them: voxel, statistical, radius."""
     parts = [
         _built(clouds, poses, first[some], last[some], reference[some], config)
-        for some in (slice(k, k + _AT_ONCE) for k in range(0, len(first), _AT_ONCE))
+        for some in chunks(len(first), CLOUDS_AT_ONCE)
     ]
     return Submaps(first, last, reference, replace(joined(parts), work=clouds.work), config.voxel)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Table, dots
+from ..arrays import TINY, WIDE, Bools, Floats, Ints, Table, chunks, dots, run_starts
 from ..odometry.attached import ScanPoints
 
 
@@ -48,12 +48,8 @@ class ShapePolicy:
     """Design effect of rays until one is learnt (as of matches of clouds: RefinementConfig.correlation)."""
 
 
-_TINY = 1e-9
-"""Least length of a ray, m."""
 _MOST_RAYS = 1 << 14
 """Most rays of a scan."""
-_RAYS_AT_ONCE = 1 << 14
-"""Rays that are processed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,10 +130,10 @@ class SurfaceRays(Table):
 
     def in_parts(self, surfaces: Surfaces) -> Iterator["SurfaceRays"]:
         """Yield rays in this order some at a time, all on walls or all on columns, so that arrays stay in the cache."""
-        walls, last = int(np.count_nonzero(~surfaces.round[self.surface])), len(self.keyframe)
-        for first, end in ((0, walls), (walls, last)):
-            for begin in range(first, end, _RAYS_AT_ONCE):
-                yield self.rows(slice(begin, min(begin + _RAYS_AT_ONCE, end)))
+        walls = int(np.count_nonzero(~surfaces.round[self.surface]))
+        for kind in (self.rows(slice(walls)), self.rows(slice(walls, None))):
+            for some in chunks(len(kind.keyframe)):
+                yield kind.rows(some)
 
     def renumbered(self, number: Ints) -> "SurfaceRays":
         """Return the rays with surface k as number[k]; without those where that is -1."""
@@ -153,7 +149,7 @@ class SurfaceRays(Table):
     def bundled(self) -> "SurfaceRays":
         """Return the mean of neighbouring rays of one scan on one surface, with the weight of all of them; the rays of a
         scan are in order."""
-        first = np.flatnonzero(np.diff(np.stack([self.bundle, self.surface]), axis=1, prepend=-1).any(axis=0))
+        first = run_starts(self.bundle, self.surface)
         if not len(first):
             return self
         count = np.diff(np.append(first, len(self.bundle)))[:, None]
@@ -166,7 +162,7 @@ class SurfaceRays(Table):
 def as_rays(rays: ScanPoints) -> SurfaceRays:
     """Return rays of which it is not known yet on which surface they end."""
     way = rays.points - rays.origins
-    reach = np.maximum(np.hypot(*way.T), _TINY)
+    reach = np.maximum(np.hypot(*way.T), TINY)
     bundle = (rays.scan * _MOST_RAYS + rays.ray) // ShapePolicy.bundle
     return SurfaceRays(rays.keyframe, np.full(len(reach), -1), rays.points, way / reach[:, None], range_sigma(reach), bundle)
 

@@ -1,21 +1,47 @@
-"""Visibility between clouds: free space of one, and surfaces of others that stand in it.
+"""What two clouds show of each other: surface that they have in common, and surfaces of one in the free space of the other.
+
+In corridors the walls match at any shift along them: of two similar places most points match, but not the few surfaces that
+face along the corridor. So only the direction with the least matching surface counts: with the normals n of points and weights
+w, a direction u has the sum u^T (sum w n n^T) u, and eigenvalues give the least of all directions.
 
 Seen from one place, the space is free in every direction as far as the nearest surface. A point of another cloud well in front
 of it contradicts their relative pose; one behind it was hidden. If the pose is right, people, glass and doors cause a few per
-cent of such points; if it is wrong, half of the surfaces do.
+cent of such points, within one visit to a place as between two; if it is wrong, half of the surfaces do.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, chunks
+from .cloud_rasters import CloudRasters
 from .clouds import Clouds
+from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_of
 from .submaps import Submaps
+
+
+@dataclass(frozen=True, slots=True)
+class OverlapPolicy:
+    """Surface that two clouds have in common."""
+
+    noise: ClassVar[float] = 0.005
+    """Share of the points added in every direction: fewer points that face it, as along a bare wall, are noise of normals."""
+    against: ClassVar[float] = 2.0
+    """Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true
+    place five of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) /
+    (1/2)) = 2.2."""
+    points: ClassVar[int] = 1000
+    """Most points of either cloud that are looked up."""
+    surface_cell: ClassVar[float] = 0.5
+    """Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
+    facings: ClassVar[int] = 8
+    """Directions in which such a cell may face."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +78,6 @@ class FreeSpace:
     """(v, b) m, distance up to which each of b equal parts of the circle was free, from -pi on; 0 where nothing is known."""
 
 
-def free_ranges(nearest: Floats) -> Floats:
-    """Return the ranges of FreeSpace (v, b) by those to the nearest surface, see free_space."""
-    reach = np.where(np.isfinite(nearest), nearest, 0.0)
-    free = reach.copy()
-    free[:, 1:] = np.minimum(free[:, 1:], reach[:, :-1])
-    free[:, :-1] = np.minimum(free[:, :-1], reach[:, 1:])
-    return free
-
-
 def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
     """Make the free space of v places; a bearing is free only as far as its neighbours, because rays graze walls and edges.
 
@@ -69,7 +86,11 @@ def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
     poses : (v, 3) T_cloud_base of each; m, m, rad.
     nearest : (v, b) m, distance of the nearest surface in each part of the circle, from -pi on; inf = nothing is known.
     """
-    return FreeSpace(poses, free_ranges(nearest))
+    reach = np.where(np.isfinite(nearest), nearest, 0.0)
+    free = reach.copy()
+    free[:, 1:] = np.minimum(free[:, 1:], reach[:, :-1])
+    free[:, :-1] = np.minimum(free[:, :-1], reach[:, 1:])
+    return FreeSpace(poses, free)
 
 
 def nearest_by_bearing(clouds: Clouds) -> Floats:
@@ -166,36 +187,134 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
     return float(np.quantile(shares, VisibilityPolicy.usual)) if shares else 0.0
 
 
-def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
+def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, float, int]:
     """Return the share, 0..1, of points of one visit that stand in the free space of another visit to the same place, of those
-    that it could see, and the number of different keyframes on the smaller side of the comparisons, earlier or later.
+    that it could see; the same within one visit; and the number of different keyframes on the smaller side of the comparisons
+    between visits, earlier or later.
 
     Parameters
     ----------
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. recording : (k,) recording.
     """
-    i, j = _revisits(poses, path, recording)
-    free = free_around(clouds)
-    through, seen, compared = 0.0, 0.0, []
-    for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
-        points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(free[a], points)
-        if visible * len(points) >= VisibilityPolicy.common:
-            through += share * visible * len(points)
-            seen += visible * len(points)
-            compared.append((min(a, b), max(a, b)))
-    visits = min((len(set(side)) for side in zip(*compared, strict=True)), default=0)
-    return through / max(seen, 1.0), visits
+    free, shares, visits = free_around(clouds), [], 0
+    for again in (False, True):
+        i, j = _together(poses, path, recording, again)
+        through, seen, compared = 0.0, 0.0, []
+        for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
+            points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
+            share, visible = contradiction(free[a], points)
+            if visible * len(points) >= VisibilityPolicy.common:
+                through += share * visible * len(points)
+                seen += visible * len(points)
+                compared.append((min(a, b), max(a, b)))
+        shares.append(through / max(seen, 1.0))
+        visits = min((len(set(side)) for side in zip(*compared, strict=True)), default=0)
+    return shares[1], shares[0], visits
 
 
-def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]:
-    """Return pairs (p,), (p,) of keyframes that lie together but were not driven one after the other."""
+def _together(poses: Floats, path: Floats, recording: Ints, again: bool) -> tuple[Ints, Ints]:
+    """Return pairs (p,), (p,) of keyframes at one place: the nearest of different visits, or the farthest of one visit."""
     c = VisibilityPolicy
     nearest = range(1, min(c.neighbours, len(poses)) + 1)
     distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=nearest, distance_upper_bound=c.revisit)
     other = np.minimum(other, len(poses) - 1)
-    again = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
-    again &= np.isfinite(distance)
-    i = np.flatnonzero(again.any(axis=1))
+    apart = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
+    paired = (apart == again) & np.isfinite(distance) & (other != np.arange(len(poses))[:, None])
+    i = np.flatnonzero(paired.any(axis=1))
     i = i[np.unique(np.linspace(0, len(i) - 1, min(c.revisits, len(i))).round().astype(np.intp))]
-    return i, other[i, np.argmax(again[i], axis=1)].astype(np.intp)
+    chosen = np.argmax(paired[i], axis=1) if again else len(nearest) - 1 - np.argmax(paired[i, ::-1], axis=1)
+    return i, other[i, chosen].astype(np.intp)
+
+
+Weights = Callable[[Correspondences, CloudPairs, Floats], Floats]
+"""Gives the weights (e, n) of points of sources that were looked up in their targets at poses (e, 3)."""
+
+
+def directional_overlap(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, gate: float) -> Floats:
+    """Return the least share (e,) over all directions of clouds i and j (e,) that matches when laid at poses (e, 3).
+
+    With A = sum n n^T over the points looked up and M the same sum over those that match, the share that matches in a
+    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u. No match is beyond the gate, m.
+    """
+    asked, matched = _both_ways(
+        raster, i, j, T_i_j, gate, lambda found, *_: (found.row >= 0).astype(float), lambda found, *_: found.good.astype(float)
+    )
+    noise = OverlapPolicy.noise * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
+    root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))
+    return np.asarray(np.linalg.eigvalsh(root @ matched @ np.swapaxes(root, 1, 2))[:, 0])
+
+
+def net_overlap(
+    raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, gate: float
+) -> Floats:
+    """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), counted both ways.
+
+    Of two stretches of a recording, the share of all points that match shows how long they overlap, not whether the place is
+    right. Each point with a match counts for the place, each in view without a match against it, and others do not count.
+
+    Parameters
+    ----------
+    free : observed free space of each cloud; None = all points count as in view. gate : farthest match, m.
+    """
+
+    def weight(found: Correspondences, pairs: CloudPairs, T_i_j: Floats) -> Floats:
+        missed = (found.row >= 0) & ~found.good
+        if free is not None:
+            missed &= _in_view(raster.clouds, free, pairs.i, T_i_j, found)
+        # The points looked up stand for those left out.
+        asked = np.maximum((found.row >= 0).sum(axis=1), 1)
+        return np.asarray((found.good - OverlapPolicy.against * missed) * (raster.clouds.counts[pairs.j] / asked)[:, None])
+
+    (both,) = _both_ways(raster, i, j, T_i_j, gate, weight)
+    return np.asarray(np.linalg.eigvalsh(both)[:, 0])
+
+
+def _both_ways(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, gate: float, *weights: Weights) -> Floats:
+    """Return for each kind of weights the sums w n n^T (k, e, 2, 2), in the frames of i, over the points of both clouds."""
+
+    def one_way(i: Ints, j: Ints, T_i_j: Floats) -> Floats:
+        sums, pairs = np.zeros((len(weights), len(i), 2, 2)), pairs_of(raster.clouds, i, j, OverlapPolicy.points)
+        for found in correspondences(raster, pairs, T_i_j, gate):
+            some = found.pairs
+            normals = se2.rotate(T_i_j[some, 2, None], raster.clouds.normals[found.row])
+            for own, weight in zip(sums, weights, strict=True):
+                own[some] = np.einsum("en,enk,enl->ekl", weight(found, pairs.rows(some), T_i_j[some]), normals, normals)
+        return sums
+
+    turn = se2.rotation(T_i_j[:, 2])[:, :2, :2]
+    return np.asarray(one_way(i, j, T_i_j) + turn @ one_way(j, i, se2.inverse(T_i_j)) @ np.swapaxes(turn, 1, 2))
+
+
+def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, found: Correspondences) -> Bools:
+    """Return which points (e, n) were in view from the places at which clouds i (e,) were seen."""
+    points = se2.transform(T_i_j[:, None, :], clouds.points[found.row])
+    return np.array([seen_beyond(free[k], p)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
+
+
+def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
+    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of some facings."""
+    usable, many = np.flatnonzero(clouds.lines), OverlapPolicy.facings
+    cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
+    for part in chunks(len(usable)):
+        rows, owner = usable[part], clouds.owner[usable[part]]
+        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[rows]) / OverlapPolicy.surface_cell)
+        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[rows]))
+        facing[part] = np.floor(bearing * (many / (2.0 * np.pi)) + 0.5).astype(np.intp) % many
+    cell -= cell.min(axis=0, initial=0)
+    wide = int(cell[:, 1].max(initial=0)) + 1
+    row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
+    _, column = np.unique(key, return_inverse=True)
+    shape = (len(clouds), int(column.max(initial=-1)) + 1)
+    seen = sparse.csr_matrix((np.ones(len(column)), (row, column)), shape=shape)
+    seen.data[:] = 1.0
+    return seen
+
+
+def _seen_cells(
+    owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
+) -> Iterator[tuple[Wides, Wides]]:
+    """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
+    for part in chunks(max(len(owner), 1)):
+        key = (cell[part, 0].astype(WIDE) * wide + cell[part, 1]) * OverlapPolicy.facings + facing[part]
+        many = int(key.max(initial=0)) + 1
+        yield np.divmod(np.unique(owner[part].astype(WIDE) * many + key), many)

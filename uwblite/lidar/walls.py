@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, connected, dots, spread, unique_rows
+from ..arrays import TINY, Bools, Floats, Ints, Table, chunks, connected, dots, spread, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
 from .columns import surroundings
@@ -46,15 +46,8 @@ class WallPolicy:
     """Least number of keyframes that see a wall."""
 
 
-_TINY = 1e-9
-_AT_ONCE = 1 << 13
-"""Places of a strip; bounds the memory."""
-_PAIRS_AT_ONCE = 1 << 15
-"""Pairs that are processed together, so that they fit into the processor's cache."""
 _SOME = 16
 """One in so many pairs is tested first."""
-_POINTS_AT_ONCE = 1 << 16
-"""Points of clouds that are processed together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +110,7 @@ def straight_pieces(rays: ScanPoints) -> tuple[Pieces, SurfaceRays]:
     begin, end = (dots(rays.points[rows] - centre, tangent) for rows in (first, last - 1))
     middle, length = centre + 0.5 * (begin + end)[:, None] * tangent, np.abs(end - begin)
     # Of a line through evenly spread points.
-    deviation = across * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, _TINY)
+    deviation = across * np.sqrt(12.0 / np.maximum(last - first, 1)) / np.maximum(length, TINY)
     good = (np.abs(incidence) > c.incidence) & (deviation < c.vague)
     first, last = first[good], last[good]
     found = Pieces(rays.keyframe[first], middle[good], normal[good], length[good], deviation[good])
@@ -235,7 +228,7 @@ class _Lines:
             return np.asarray(np.bincount(number, values, many))
 
         centre, facing = mean(at, np.ones(len(at))), mean(normal, weight)
-        facing /= np.maximum(np.hypot(*facing.T), _TINY)[:, None]
+        facing /= np.maximum(np.hypot(*facing.T), TINY)[:, None]
         away, own = at - centre[number], facing[number]
         across, along = dots(away, own), _across(away, own)
         known = total((along / off) ** 2 + weight)
@@ -276,9 +269,8 @@ def _strips(at: Floats) -> Iterator[Ints]:
     """Yield rows of places (m, 2), a bounded number at a time: strips of the map that overlap by the reach."""
     order = np.argsort(at[:, 0], kind="stable")
     x = at[order, 0]
-    for first in range(0, len(x), _AT_ONCE):
-        last = min(first + _AT_ONCE, len(x))
-        yield order[first : np.searchsorted(x, x[last - 1] + WallPolicy.reach, "right")]
+    for some in chunks(len(x)):
+        yield order[some.start : np.searchsorted(x, x[some.stop - 1] + WallPolicy.reach, "right")]
 
 
 def _together(places: _Places) -> Ints:
@@ -289,8 +281,8 @@ def _together(places: _Places) -> Ints:
     # Some of the pairs link most of the places, and few others remain to be tested.
     for tested in (pairs[::_SOME], pairs):
         links = [np.stack([each, first])]
-        for begin in range(0, len(tested), _PAIRS_AT_ONCE):
-            one, other = tested[begin : begin + _PAIRS_AT_ONCE].T
+        for some in chunks(len(tested)):
+            one, other = tested[some].T
             apart = np.flatnonzero(first.take(one) != first.take(other))
             one, other = one[apart], other[apart]
             links.append(np.stack([one, other])[:, _on_one_line(one, other, columns)])
@@ -356,8 +348,7 @@ def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArr
     shown, on = _shown_walls(found, sensors), ShapePolicy.on
     columns = surfaces.rows(surfaces.round)
     near = surroundings(np.column_stack([columns.place, columns.radius]), on)
-    for first in range(0, len(kind), _POINTS_AT_ONCE):
-        part = slice(first, first + _POINTS_AT_ONCE)
+    for part in chunks(len(kind)):
         at = se2.transform_each(sensors, clouds.owner[part], clouds.points[part].astype(np.float64))
         kind[part][np.isfinite(shown.query(at, distance_upper_bound=on)[0])] = 0
         kind[part][near.on_rim(at, on)] = 1

@@ -19,6 +19,8 @@ LOOK_BACK, _SEARCH_LOOKS = 4.0, 2.5
 """m driven; places are compared by the scans of the first distance, and the search makes one cloud of those of the second."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
+_FLAT = 3.0
+"""Variances by ranges alone over what the curvature of their kernel says: with detours their likelihood is flat."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; limit of the area of the robot in a map without a grid."""
 
@@ -33,17 +35,15 @@ class Comparison:
     """No equally good place was left out."""
     weight: Floats
     """Log-likelihood."""
-    fit: Floats
-    """Mean log-likelihood of the rays that do not end in unknown space."""
+    scans: Floats
+    """By the rays alone, against a place elsewhere."""
     known: Floats
     """Rays' ends in known space."""
     rays: Rays
     """Of the last metres, in the present frame of the base."""
-    looks: int
-    """Number of their scans."""
-    ranges: Ranges
     independent: float
-    """Rays that count as independent."""
+    """How many of them count as independent."""
+    ranges: Ranges
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -121,21 +121,22 @@ class PlaceSearch:
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
-        weight, fit, known = np.zeros(len(poses)), np.zeros(len(poses)), np.zeros(len(poses))
+        weight, scans, known = np.zeros((3, len(poses)))
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for part in search.units(len(poses), PER_RAY * len(rays.hit)):
                 agreement = self.walls.agreement(poses[part], rays)
-                weight[part], fit[part], known[part] = independent * agreement.log_likelihood, agreement.fit, agreement.known
+                weight[part], scans[part] = independent * agreement.log_likelihood, independent * agreement.odds
+                known[part] = agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
         errors, each = self._anchors.errors, (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(ranges)
         for part in search.units(len(poses), each):
             expected = range_model.expected_errors(poses[part], ranges, errors) if errors else None
             weight[part] += range_model.range_likelihood(poses[part], ranges, expected=expected)
             yield each * len(poses[part])
-        new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
+        new = _no_repetition(poses, weight, before)
         places = started.rows(new[before:])
-        return Comparison(places, found.complete, weight[new], fit[new], known[new], rays, looks, ranges, independent)
+        return Comparison(places, found.complete, weight[new], scans[new], known[new], rays, independent, ranges)
 
     def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:
         """Return a comparison in the present frame of the robot, with the present hypotheses as they are now first."""
@@ -151,10 +152,10 @@ class PlaceSearch:
         walls = self.walls if few.hit.sum() >= verdict.FEW_BESIDE else None
         poses = hypotheses.refined(poses, ranges, walls, few)
         hessian, _ = range_model.range_factors(poses, ranges)
+        hessian /= _FLAT if walls is None else 1.0
         covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
         effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
-        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma)
-        fresh = hypotheses.placed(fresh, np.arange(len(poses)), poses, covariances, effect)
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import Bools, Floats, Table
 from ..lidar.scan_matching import measured_part
 from ..odometry.wheels import OdometryNoiseConfig
 from ..radio.range_errors import HARMONICS, PATTERN_SIGMA, pattern_waves
@@ -41,8 +41,6 @@ SAME = (0.5, 0.3)
 """m and rad; hypotheses that are closer are one."""
 PER_MOVE, PER_UPDATE = 4, 8
 """Operations on elements of a covariance in a step of the odometry, for each unknown, and in a correction by a range."""
-_UNUSED = 1e-3
-"""Weight up to which a range moves nothing."""
 
 POSE = slice(0, len(POOR))
 """Of the state: x, y, theta."""
@@ -88,35 +86,27 @@ def none(anchors: int) -> Hypotheses:
     return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
-def started(poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA) -> Hypotheses:
+def started(
+    poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA, effect: Floats | None = None
+) -> Hypotheses:
     """Return hypotheses at poses (h, 3) with covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
     biases : (a,) standard deviations of each anchor's range error that stays, m. slow : of the one that fades, m.
+    effect : (h, 3, a) by how much the poses move with the error that the ranges to an anchor have in common.
     """
     n = FIRST_ANCHOR + 2 * len(biases)
-    mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
-    mean[:, POSE], covariance[:, POSE, POSE] = poses, covariances
+    mean, whole = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
+    mean[:, POSE], whole[:, POSE, POSE] = poses, covariances
     prior = [*WHEEL_SIGMA, *np.full(2 * HARMONICS, PATTERN_SIGMA), LASER_SIGMA, *np.full(len(biases), slow), *biases]
     rest = np.arange(WHEELS.start, n)
-    covariance[:, rest, rest] = np.square(prior)
-    return Hypotheses(mean, covariance, np.zeros(len(poses)))
-
-
-def placed(bank: Hypotheses, which: Ints, poses: Floats, covariances: Floats, effect: Floats) -> Hypotheses:
-    """Return the hypotheses with the poses (w, 3) and covariances (w, 3, 3) that ranges give to some of them (w,).
-
-    Poses move by effect (w, 3, a) with the error that the ranges to an anchor have in common.
-    """
-    mean, whole = bank.mean.copy(), bank.covariance.copy()
-    mean[which, POSE] = poses
-    whole[which, POSE, :] = whole[which, :, POSE] = 0.0
-    bias = slice((FIRST_ANCHOR + mean.shape[1]) // 2, None)
-    shared = -effect @ whole[which, bias, bias]
-    whole[which, POSE, bias], whole[which, bias, POSE] = shared, shared.transpose(0, 2, 1)
-    whole[which, POSE, POSE] = covariances - shared @ effect.transpose(0, 2, 1)
-    return Hypotheses(mean, whole, bank.log_weight)
+    whole[:, rest, rest] = np.square(prior)
+    if effect is not None:
+        stays, shared = slice(n - len(biases), n), -effect * np.square(biases)
+        whole[:, POSE, stays], whole[:, stays, POSE] = shared, shared.transpose(0, 2, 1)
+        whole[:, POSE, POSE] -= shared @ effect.transpose(0, 2, 1)
+    return Hypotheses(mean, whole, np.zeros(len(poses)))
 
 
 def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float = SLOW_SIGMA) -> Hypotheses:
@@ -245,8 +235,7 @@ def ranged(
     sigma = np.sqrt(own + noise**2)
     core, density = mixture(error, sigma)
     weight = core / density
-    gain = spread / (own + noise**2 / (share * np.maximum(weight, _UNUSED)))[:, None]
-    gain *= (weight > _UNUSED)[:, None]
+    gain = spread * (share * weight / (share * weight * own + noise**2))[:, None]
     mean = bank.mean + gain * error[:, None]
     mean[:, 2] = se2.wrap_angle(mean[:, 2])
     covariance = symmetric(bank.covariance - gain[:, :, None] * spread[:, None, :])

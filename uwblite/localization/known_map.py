@@ -7,7 +7,6 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import DataError
-from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult
 from ..radio.range_errors import range_errors
 from ..sensor_log.sensors import last_places
@@ -16,9 +15,8 @@ from .walls import UNIFORM_VARIANCE, Walls, walls_of
 
 _DRAWN = np.diag(np.square((0.014, 0.014, 0.003)))
 """m^2, rad^2; variance of a wall, and of a robot's laser upon it, in cells of 0.05 m: lidars measure a surface by its colour to
-0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
-_UNSTATED = np.diag(np.square((0.015, 0.015, 0.004)))
-"""m^2, rad^2; shape of a map of a room or two that does not say how far it is bent."""
+0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell. A map of a room or two that
+does not say how far it is bent is bent by as much."""
 _UNBENT = np.zeros((0, 2)), np.zeros((0, *_DRAWN.shape))
 """Shape of a map that does not say it."""
 _SIGMA, _LEAST_SIGMA = 0.1, 0.05
@@ -45,7 +43,7 @@ class KnownMap:
         drawn = _DRAWN + np.diag((cells, cells, 0.0))
         where, bent = self.shape
         if not len(where):
-            return np.broadcast_to(drawn + _UNSTATED, (*places.shape[:-1], *drawn.shape))
+            return np.broadcast_to(drawn + _DRAWN, (*places.shape[:-1], *drawn.shape))
         away = np.square(places[..., None, :] - where).sum(axis=-1)
         return np.asarray(drawn + bent[np.argmin(away, axis=-1)])
 
@@ -67,11 +65,6 @@ def from_result(result: StoredResult) -> KnownMap:
     missing = _number(stated.get("missing_share")) if isinstance(stated := report.get("map"), dict) else np.nan
     walls = None if result.grid is None else walls_of(replace(result.grid, missing_share=missing))
     return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0), _shape(report))
-
-
-def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
-    """Return a map of anchors and a grid alone, with the laser's mounting from recordings."""
-    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(len(_DRAWN)))
 
 
 def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:

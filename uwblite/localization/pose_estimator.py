@@ -16,12 +16,12 @@ from ..arrays import Floats
 from ..config import documented
 from ..odometry.odometer import Odometer
 from . import hypotheses, verdict
-from .comparison import LOOK_BACK, Comparison, PlaceSearch
+from .comparison import Comparison, PlaceSearch
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
-from .range_model import MOMENTS, bias_effect, range_moments, repeated
-from .running_fit import FIT_LOST, FIT_SOUND, SUPPORT, full_agreement
-from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
+from .range_model import repeated
+from .running_fit import SUPPORT, full_agreement
+from .walls import ELSEWHERE, INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 _FRESH_WAY = _UNFELT = 0.1
@@ -33,10 +33,6 @@ _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
-_UNIT_WAY = 1.0
-"""m driven between two comparisons of the map's unit with the sensors'."""
-_PROVEN = 3
-"""Comparisons of the unit that a tracked pose must have passed, two metres of driving, for the map to count as right."""
 _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
 """Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
@@ -99,15 +95,13 @@ class PoseEstimator:
         self._window = Window()
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
-        self._way = self._scan_way = self._search_way = self._unit_way = 0.0
+        self._way = self._scan_way = self._search_way = 0.0
         self._noise = anchors.noise
         self._range_way = np.full(len(anchors.ids), -np.inf)
         """(a,) m, odometer at the last range to each anchor."""
         self._search_stamp = -np.inf
         self._confirmed: tuple[float, Floats] | None = None
         """Odometer and T_map_odom at the first of the searches that agree."""
-        self._compared = 0
-        """Comparisons of the unit that the map has passed, one after the other."""
         self._running = full_agreement(len(anchors.ids))
         self._reason = "nothing has been measured yet"
 
@@ -158,10 +152,10 @@ class PoseEstimator:
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
             pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)
-            if there.fit[0] > max(FIT_SOUND, found.fit[0] + verdict.CERTAIN / INDEPENDENT_RAYS):
+            if there.odds[0] > max(0.0, found.odds[0] + verdict.CERTAIN / hypotheses.INDEPENDENT):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
-        if self.tracks and (found.fit[0] < FIT_LOST or found.known[0] < 0.5 * int(some.hit.sum())):
+        if self.tracks and (found.odds[0] < ELSEWHERE or found.known[0] < 0.5 * int(some.hit.sum())):
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
@@ -169,14 +163,14 @@ class PoseEstimator:
         best = int(np.argmax(self._bank.log_weight))
         if self.tracks:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
-        self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), odometer.stamp)
+        self._running.add_scan(float(found.odds[best]), odometer.stamp)
 
     def search_or_check(self, *, free: bool) -> None:
         """Look whether the pose still holds; do some units of a search, or begin one where it is time for it.
 
-        Free: no scan was used in this step, and there is time to search and to compare units. Every scan brings a free step.
+        Free: no scan was used in this step, and there is time to search. Every scan brings a free step.
         """
-        if self.tracks and (why := self._doubted(free)):
+        if self.tracks and (why := self._doubted()):
             self._lose(why, self._running.agreed())
         elif not self.tracks and self._running.jumped():
             self._lose("the ranges do not fit what was measured before; was the robot carried?", self._running.agreed())
@@ -216,7 +210,7 @@ class PoseEstimator:
         order = np.argsort(-bank.log_weight, kind="stable")
         best = int(order[0])
         share, covariance = hypotheses.mixed(bank, best)
-        fit = np.exp(running.fit - FIT_SOUND) if self._window.looks else running.ranges / SUPPORT
+        fit = np.exp(running.scans) if self._window.looks else running.ranges / SUPPORT
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self.tracks else 0.5)
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         reason = verdict.vague(covariance) if self.tracks else self._reason
@@ -231,19 +225,11 @@ class PoseEstimator:
         self.work += len(bank) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
         return bank, walls.agreement(bank.poses, some)
 
-    def _doubted(self, free: bool) -> str:
+    def _doubted(self) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
         A pose that ranges support is rejected only where another place explains the later measurements better.
         """
-        odom, way = self._odometer.pose, self._way
-        if free and way - self._unit_way >= _UNIT_WAY:
-            self._unit_way, self._compared = way, self._compared + 1
-            rays, ago = self._window.seen(odom, way, LOOK_BACK)
-            ranges, looks = self._window.ranges_since(self.known.anchors, odom, way), len(np.unique(ago))
-            if why := verdict.other_unit(self.known.walls, self._bank.poses[0], rays, looks, ranges, False):
-                self._compared = 0
-                return why
         if self._window.looks and self._running.scans_contradict():
             return "" if self._running.ranges_vouch(self._odometer.stamp) else _SCANS_DIFFER
         return "the ranges do not fit the anchors any more" if self._running.ranges_contradict() else ""
@@ -262,38 +248,26 @@ class PoseEstimator:
             self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
             return
         self._bank = found.hypotheses
-        best, proven = int(np.argmax(self._bank.log_weight)), self._compared >= _PROVEN
-        known, ranges = float(found.known[best]), found.ranges
-        fitting = verdict.agreeing(self._bank.poses[best], ranges)
-        if known < (verdict.FEW_BESIDE if proven and fitting.anchors > 2 else verdict.FEW_ENDS) and len(ranges):
-            self.work += MOMENTS
-            pose, covariance = range_moments(self._bank.poses[best], ranges)
-            effect = bias_effect(pose[None], ranges, len(self.known.anchors.ids))
-            self._bank = hypotheses.placed(self._bank, np.array([best]), pose[None], covariance[None], effect)
-            fitting = verdict.agreeing(self._bank.poses[best], ranges)
-        pose = self._bank.poses[best].copy()
-        certain = verdict.needed(fitting, proven)
-        undecided = verdict.undecided(self._bank, best, found.complete, certain)
+        best = int(np.argmax(self._bank.log_weight))
+        ranges, pose = found.ranges, self._bank.poses[best].copy()
+        undecided = verdict.undecided(self._bank, best, found.complete)
         # Agreement from before the part that is used speaks of a place from which the robot was carried away.
         agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
-        # Rays that end beyond the map say nothing about it.
-        rays = found.independent * known / max(int(found.rays.hit.sum()), 1)
-        odds = verdict.map_odds(float(found.fit[best]), known, rays, fitting, agreed)
-        nowhere = verdict.nowhere(odds, fitting)
+        odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed)
         self._reason = (
             undecided
             or verdict.imprecise(self._bank.pose_covariances[best])
-            or nowhere
-            or verdict.other_unit(self.known.walls, pose, found.rays, found.looks, ranges, not proven)
+            or odds.nowhere
+            or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
         )
         # That the robot was carried within the window is as unlikely as what counts as certain.
-        if not self._reason and odds.total < certain + verdict.CERTAIN * (self._parts > 1):
+        if not self._reason and odds.total < verdict.CERTAIN * (1 + (self._parts > 1)):
             self._reason = "found; a little more driving will confirm it"
         # Measurements that fit nowhere may be of two places, before and after the robot was carried: their newest half is
         # tried, then their newest quarter. Once such a part is enough by itself, the rest is removed.
         if self._parts > 1 and not self._reason:
             self._window = self._searched
-        self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
+        self._parts = 2 * self._parts if odds.nowhere and self._parts < _MOST_PARTS else 1
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
             self.tracks = True

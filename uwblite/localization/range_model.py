@@ -11,7 +11,6 @@ from .. import se2
 from ..arrays import Floats, Ints, Table
 from ..radio.range_errors import RangeErrors
 from ..radio.range_noise import RangeNoiseConfig
-from .walls import UNIFORM_VARIANCE
 
 PER_RANGE, PER_EXPECTED = 35, 50
 """Operations on elements of arrays for the likelihood of a range at a pose, and for the error of the map's own ranges there."""
@@ -257,31 +256,3 @@ def bias_effect(poses: Floats, ranges: Ranges, anchors: int) -> Floats:
 
 POOR = np.diag(np.square([0.1, 0.1, 0.3]))
 """Information of a pose of which nothing is known within 10 m and 3 rad."""
-_REACH, _STEPS = np.array([1.5, 1.5, 0.6]), (17, 17, 9)
-"""m, m, rad about a pose, several times what a start may be off by, and poses along each axis of the lattice."""
-_AT_ONCE = 512
-"""Poses of the lattice whose ranges fit into the processor's cache."""
-MOMENTS = PER_RANGE * FEW * int(np.prod(_STEPS))
-"""Operations for the moments."""
-
-
-def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
-
-    With NLOS the likelihood is flat where its curvature would give a sharp peak: they are sums over a lattice of poses.
-    """
-    axes = [np.linspace(-reach, reach, count) for reach, count in zip(_REACH, _STEPS, strict=True)]
-    off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-    some, parts = ranges.spread(), np.array_split(pose + off, len(off) // _AT_ONCE)
-    # Errors that change with the direction of driving neither last nor are drawn anew: each range counts with its share.
-    weight = np.concatenate([shared_likelihood(part, some) for part in parts])
-    weight *= series(ranges).share.sum() / series(some).share.sum()
-    weight = np.exp(weight - weight.max())
-    weight /= weight.sum()
-    mean = weight @ off
-    off -= mean
-    # Each point of the lattice represents a cell: the variance within the cell is added.
-    cell = np.array([axis[1] - axis[0] for axis in axes])
-    covariance = (off * weight[:, None]).T @ off + np.diag(cell**2 * UNIFORM_VARIANCE)
-    mean = pose + mean
-    return np.append(mean[:2], se2.wrap_angle(mean[2])), covariance

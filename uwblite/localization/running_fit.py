@@ -6,11 +6,9 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .sensing import LEAD
-from .verdict import CERTAIN, LIKELY, RAY_ELSEWHERE
+from .verdict import CERTAIN, LIKELY
+from .walls import ELSEWHERE
 
-FIT_SOUND, FIT_LOST = RAY_ELSEWHERE, 2.0 * RAY_ELSEWHERE
-"""Mean log-likelihoods of the last scans' rays: above the first, which other buildings do not reach, they support the pose; it
-is lost below the second."""
 SUPPORT, _CONTRADICTION = 0.5, 0.25
 """Weights of a range, and mean weights of the last ones, that support the pose, being more likely than not, and that contradict
 it. The search for a lost robot begins with the measurements after the last one that supported the pose. A pose that ranges
@@ -30,10 +28,8 @@ class RunningFit:
     """(a, 2) of each anchor: mean weight of its ranges, and how many there were."""
     against: Floats
     """(a,) log-likelihood of each anchor's last range at the pose against one from anywhere, since the sum was above 0."""
-    fit: float = 0.0
-    """Mean log-likelihood of the rays of scans that met known space."""
-    seen: float = 0.0
-    """Share of scans that met known space."""
+    scans: float = 0.0
+    """Mean odds of the rays against rays elsewhere: above 0 they support the pose."""
     ranges: float = 1.0
     """Mean weight of ranges."""
     before: float = 1.0
@@ -49,7 +45,7 @@ class RunningFit:
 
     def restart(self, sees: bool) -> None:
         """Begin with full agreement: the pose was found now."""
-        self.fit, self.seen, self.ranges, self.before = 0.0, 1.0 if sees else 0.0, 1.0, 1.0
+        self.scans, self.ranges, self.before = -ELSEWHERE if sees else 0.0, 1.0, 1.0
         self.forget_anchors()
 
     def forget_anchors(self) -> None:
@@ -72,25 +68,23 @@ class RunningFit:
         if weight > SUPPORT:
             self.sound = max(self.sound, stamp)
 
-    def add_scan(self, fit: float, informative: bool, stamp: float) -> None:
-        """Take the mean log-likelihood of a scan's rays at the pose; informative: enough of them met known space."""
-        self.seen += _FORGETTING * (informative - self.seen)
-        if informative:
-            self.fit += _FORGETTING * (fit - self.fit)
-            if fit > FIT_SOUND:
-                self.sound, self.matched = max(self.sound, stamp), max(self.matched, stamp)
+    def add_scan(self, odds: float, stamp: float) -> None:
+        """Take the mean odds of a scan's rays at the pose."""
+        self.scans += _FORGETTING * (odds - self.scans)
+        if odds > 0.0:
+            self.sound, self.matched = max(self.sound, stamp), max(self.matched, stamp)
 
     def in_doubt(self) -> bool:
         """Return whether measurements fit worse than they should: people may be near, or the robot is elsewhere."""
-        return self.fit < FIT_SOUND or self._jump() > LIKELY
+        return self.scans < 0.0 or self._jump() > LIKELY
 
     def scans_contradict(self) -> bool:
         """Return whether scans fit so badly that the robot is elsewhere."""
-        return self.fit < FIT_LOST
+        return self.scans < ELSEWHERE
 
     def ranges_contradict(self) -> bool:
-        """Return whether the ranges contradict the pose, and no scans support it."""
-        return (self.ranges < _CONTRADICTION or self.jumped()) and not (self.seen > SUPPORT and self.fit > FIT_SOUND)
+        """Return whether the ranges contradict the pose, and the scans do not support it half as well as they might."""
+        return (self.ranges < _CONTRADICTION or self.jumped()) and self.scans < -SUPPORT * ELSEWHERE
 
     def jumped(self) -> bool:
         """Return whether the ranges, which agreed, now contradict the pose all at once."""

@@ -41,6 +41,8 @@ _ON_WALL, _FINE = 0.1, GridConfig().resolution
 """m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
 STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
+ELSEWHERE = -0.35
+"""Log-likelihood of a ray at the best place of a building that is not the map's: rooms are alike in part."""
 INDEPENDENT_RAYS = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
 _LOOKS, _BEFORE = np.linspace(0.0, 1.0, 11)[1:], 0.3
@@ -73,15 +75,13 @@ class Agreement:
     """How scans agree with the map at poses (h,)."""
 
     log_likelihood: Floats
-    """Mean over the rays; 0 = all agree with the map."""
-    fit: Floats
-    """The same over the rays that do not end in unknown space."""
+    """Mean over the rays, by which places of the map are compared; 0 = all agree with the map."""
+    odds: Floats
+    """Mean log-likelihood of the rays against rays elsewhere, times the share of the ends that lie in known space."""
     on_wall: Floats
     """Share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
     known: Floats
     """Ends in known space."""
-    met: Floats
-    """Rays that end in known space or pass a wall: those that distinguish one place from another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,25 +166,25 @@ class Walls:
     def agreement(self, poses: Floats, rays: Rays) -> Agreement:
         """Return how rays (p,), p > 0, agree with the map at poses (h, 3).
 
-        An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two, which is neutral;
-        a ray that passes a wall counts as if it ended in free space. Without a reading it has the likelihood of a missing
-        return, to the power of a half: what is dark to one ray is dark to its neighbours.
+        An end on a wall counts log 1, one in free space log 0.1; a ray that passes a wall counts as if it ended in free space.
+        Without a reading it has the likelihood of a missing return, to the power of a half: what is dark to one ray is dark to
+        its neighbours. One that ends in unknown space is between the two; for the odds it is left out, and the others say so
+        much less.
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
         on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
-        strange = float(np.log(STRANGE))
-        unknown = (self.state_at(x, y) == UNKNOWN) & (on_wall < 0.5)
-        value = np.where(unknown, 0.5 * strange, np.log(STRANGE + (1.0 - STRANGE) * on_wall))
+        known = rays.hit & ((self.state_at(x, y) != UNKNOWN) | (on_wall >= 0.5))
         along, across = x - ox, y - oy
         t = _LOOKS[:, None, None] * np.maximum(1.0 - _BEFORE / np.maximum(np.hypot(along, across), _BEFORE), 0.0)
         passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
-        missed = np.where(passed, 0.5 * np.log(self.missing), 0.0)
-        value = np.where(rays.hit, np.where(passed, strange, value), missed)
-        ends, judged = rays.hit & ~unknown, ~unknown | ~rays.hit | passed
-        known = ends.sum(axis=1).astype(np.float64)
-        share = (ends & (on_wall >= 0.5)).sum(axis=1) / np.maximum(known, 1.0)
+        ends = np.log(STRANGE + (1.0 - STRANGE) * np.where(passed, 0.0, on_wall))
+        value = np.where(rays.hit, ends, np.where(passed, 0.5 * np.log(self.missing), 0.0))
+        judged, count = known | passed | ~rays.hit, known.sum(axis=1)
+        likelihood = np.where(judged, value, 0.5 * np.log(STRANGE)).mean(axis=1)
         fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
-        return Agreement(value.mean(axis=1), fit, share, known, (ends | passed).sum(axis=1).astype(np.float64))
+        share = (known & (on_wall >= 0.5)).sum(axis=1) / np.maximum(count, 1)
+        odds = count / max(rays.hit.sum(), 1) * (fit - ELSEWHERE)
+        return Agreement(likelihood, odds, share, count.astype(np.float64))
 
 
 def _turned(poses: Floats, points: Floats) -> tuple[Floats, Floats]:

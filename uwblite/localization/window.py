@@ -20,8 +20,8 @@ _TURNING = 1.0
 """m of driving that count for a turn by one radian."""
 _LOOK_EVERY, _RANGE_EVERY = 0.4, 0.25
 """m driven between the scans, and between the ranges to one anchor, that are kept."""
-_ALIKE, _LATEST = 3, 64
-"""Ranges to one anchor that a standing robot keeps, of so many latest ones to all anchors."""
+_ALIKE = 3
+"""Ranges to one anchor that a standing robot keeps."""
 _STANDING, _LOOK_AGAIN = 0.05, 1.0
 """m driven, below which a scan replaces the last one, and s after which it does: people who hid the walls move on."""
 RAYS = 48
@@ -80,7 +80,7 @@ class Window:
 
     def add_range(self, entry: WindowRange) -> None:
         """Keep a range, unless the robot has hardly moved since the last few to the same anchor; forget what is too old."""
-        own = [r for r in self.ranges[-_LATEST:] if r.anchor == entry.anchor]
+        own = [r for r in self.ranges if r.anchor == entry.anchor]
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
         self.ranges = [r for r in self.ranges if entry.way - r.way <= LENGTH]

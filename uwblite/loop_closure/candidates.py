@@ -18,8 +18,8 @@ from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..lidar import submaps
-from ..lidar.overlap import surface_cells
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import surface_cells
 from .closures import LoopClosureConfig
 
 Tried = set[tuple[int, int, bool]]

@@ -1,17 +1,17 @@
-"""Steps of the chain that scans do not fix: what they leave untied, and what closures shift between two of them.
+"""Steps of the chain that scans do not fix, and what closures shift between two of them.
 
 Doors and pillars repeat. Closures that confuse one with the next agree with each other, and a robust odometry allows jumps at
 the two ends of the stretch that they move. A wheel may slip once; it does not slip back by the same distance metres later.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, connected
-from ..graph.graph import Edges, Graph
+from ..arrays import Bools, Floats, Ints
+from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from .closures import LoopClosureConfig
 
@@ -22,10 +22,6 @@ class TiePolicy:
 
     near: ClassVar[int] = 4
     """Most keyframes that a scan edge of the same visit spans."""
-    another_visit: ClassVar[float] = 10.0
-    """Travelled distance between two visits, m."""
-    views: ClassVar[int] = 6
-    """Keyframes of a part of the map; fewer belong to the part before."""
     clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
     """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""
     jump: ClassVar[float] = 0.5
@@ -33,44 +29,6 @@ class TiePolicy:
     """m, and standard deviations, from which an error of one step of the odometry is more than noise."""
     made_good: ClassVar[float] = 0.3
     """Share of a jump that may remain after the opposite jump."""
-
-
-def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
-    """Return the steps (b,) that no odometry measured (e,) and scan edges, of all visits, leave free in some direction.
-
-    Along a bare corridor a lidar alone does not measure the distance. Clouds that are neither neighbours nor of another
-    visit were matched at the poses of the chain, and add no information to it.
-
-    Parameters
-    ----------
-    path : (k,) travelled distance, m.
-    """
-    part = tied_parts(wheels, replace(graph, edges=tuple(_near_or_again(e, path) for e in graph.edges)), measured)
-    large = np.flatnonzero(np.bincount(part)[part] >= TiePolicy.views)
-    if not len(large):
-        return large
-    # A few keyframes between two breaks do not form a part: they belong to the part before.
-    of = part[large[np.maximum(np.searchsorted(large, np.arange(len(part)), "right") - 1, 0)]]
-    return np.flatnonzero(~measured & (of[wheels.i] != of[wheels.j]))
-
-
-def _near_or_again(edges: Edges, path: Floats) -> Edges:
-    """Return the scan edges between neighbours and between visits; other edges as they are."""
-    if not isinstance(edges, ScanEdges):
-        return edges
-    again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
-    return edges.rows(np.flatnonzero((np.abs(edges.i - edges.j) <= TiePolicy.near) | again))
-
-
-def tied_parts(wheels: OdometryEdges, graph: Graph, sound: Bools) -> Ints:
-    """Return the part (k,) of each keyframe: scan edges of any visits connect keyframes, and so do sound steps (e,)."""
-    connecting = sound | steps_fixed(graph)[wheels.i]
-    i, j = [wheels.i[connecting]], [wheels.j[connecting]]
-    for edges in (e for e in graph.edges if isinstance(e, ScanEdges)):
-        fixing = _fixing(edges, graph)
-        i.append(edges.i[fixing])
-        j.append(edges.j[fixing])
-    return connected(np.concatenate(i), np.concatenate(j), len(graph.poses))
 
 
 def steps_fixed(graph: Graph) -> Bools:

@@ -6,7 +6,7 @@ Candidates are matched in batches, each with the sub-maps it needs: by one proce
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -15,12 +15,11 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated
 from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import Clouds, make_cloud
+from ..lidar.clouds import Clouds
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.overlap import net_overlap
 from ..lidar.scan_matching import Aligned, align_pairs, match, pairs_of
 from ..lidar.submaps import Submaps
-from ..lidar.visibility import FreeSpace, violates_free_space
+from ..lidar.visibility import FreeSpace, net_overlap, violates_free_space
 from .candidates import CandidatePolicy, Candidates
 from .closures import LoopClosureConfig
 from .parallel import batches, in_order
@@ -129,7 +128,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that are searched for."""
     candidates, config = batch.candidates, batch.config
     rows, guesses = [], []
-    prepared = cache(partial(_prepare, batch.clouds))
+    chosen = cache(lambda k: batch.clouds.chosen(np.array([k])))
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
@@ -138,7 +137,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
                 search_config, places = _coarse(batch.search), MatchingPolicy.many_places
             turn = CandidatePolicy.sigmas * np.sqrt(candidates.covariance[k, 2, 2])
             turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
-            target, source = (prepared(int(of[k])) for of in (candidates.target, candidates.source))
+            target, source = (chosen(int(of[k])) for of in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
             poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
@@ -185,12 +184,6 @@ def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tup
     np.maximum.at(second, row[other], share[other])
     second[tried] /= np.maximum(share[best[tried]], np.finfo(np.float64).tiny)
     return best, second
-
-
-def _prepare(clouds: Clouds, k: int) -> Clouds:
-    """Return a sub-map's cloud ready for the search; its normals point to the side of the laser."""
-    points, normals = clouds.cloud(k)
-    return make_cloud(points, points + normals, work=clouds.work)
 
 
 def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:

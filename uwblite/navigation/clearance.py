@@ -15,6 +15,7 @@ the squares around are looked at one by one.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ class ClearanceMap:
         """Return the cost of a metre driven at the centres of cells."""
         half = self.half[rows, cols]
         table = self._nearness(self._unit * np.arange(int(half.max(initial=0)) + 1)).astype(np.float32)
-        return np.asarray(np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), np.float32(1.0)) * table[half])
+        return table[half] if self.refused else np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), 1.0) * table[half]
 
     def bounds(self, points: Floats) -> Floats:
         """Return lower bounds (n,) of the squared clearance at points (n, 2), m and m^2; outside the map it is 0."""
@@ -189,7 +190,7 @@ def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[
         for right, up, squares in ((1, 0, edges), (0, 1, centres), (1, 1, edges)):
             may = _across_rows(squares, count, reach, min(near, reach), up, cut) >= least
             beside = [stands[dr : dr + count, dc : dc + geometry.cols] for dr in range(up + 1) for dc in range(right + 1)]
-            none = ~np.logical_or.reduce(beside)
+            none = ~reduce(np.logical_or, beside)
             across = (beside[0] == beside[3]) & (beside[1] == beside[2]) & (beside[0] != beside[1]) if right and up else none
             may &= none | across
             row, col = np.nonzero(may)

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import WIDE, Bools, Floats, Ints
 from .clearance import AT_ONCE, COMFORT, ROUNDING, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
@@ -24,10 +24,8 @@ _PLACES_PER_OCTAVE = 8
 """Places on a straight piece between one distance from its nearer end and twice that distance."""
 _SIEVES = 4
 """How often a shortcut is halved, at whose parts' ends it is looked up first: most of the long ones lead through obstacles."""
-_CORNER_COST = 1e-3
-"""m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
 _GAIN = 1e-3
-"""Relative; a round that gains less is the last."""
+"""Relative; a round that gains less is the last. A corner is worth as many m: of equal lines the one with fewest is taken."""
 _MOST_ROUNDS = 6
 
 
@@ -123,7 +121,7 @@ def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
     costs[across] = along.costs
     kept = piece[begin] == piece[end - 1]
     kept[across] = along.clear
-    graph = csr_matrix((costs[kept] + _CORNER_COST, (begin[kept], end[kept])), shape=(len(places), len(places)))
+    graph = csr_matrix((costs[kept] + _GAIN, (begin[kept], end[kept])), shape=(len(places), len(places)))
     totals, before = dijkstra(graph, indices=0, return_predecessors=True)
     return places[walk_back(before, 0, len(places) - 1)], float(totals[-1])
 
@@ -140,18 +138,13 @@ def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
 
 def _shortcuts(corners: int) -> tuple[Ints, Ints]:
     """Return first and last corner (m,) of every candidate."""
-    begins, ends, reach = [], [], 1
+    pairs, reach = [np.array([corners - 1], dtype=WIDE)], 1  # the whole in one, as 0 * corners + its end
     while reach < corners:
-        stride = max(reach // _STARTS_PER_SHORTCUT, 1)
-        begin = np.arange(0, corners - reach, stride)
-        begins.append(begin)
-        ends.append(begin + reach)
+        begin = np.arange(0, corners - reach, max(reach // _STARTS_PER_SHORTCUT, 1), dtype=WIDE)
+        pairs.append(begin * corners + begin + reach)
         reach *= 2
-    # From both ends to everywhere near, and the whole in one.
-    begins.append(np.array([0]))
-    ends.append(np.array([corners - 1]))
-    pairs = np.unique(np.stack([np.concatenate(begins), np.concatenate(ends)]), axis=1)
-    return pairs[0], pairs[1]
+    begin, end = np.divmod(np.unique(np.concatenate(pairs)), corners)
+    return begin.astype(np.intp), end.astype(np.intp)
 
 
 def walk_back(before: Ints, first: int, last: int) -> Ints:

@@ -25,13 +25,12 @@ from .smoothing import along_lines, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
-_STRETCH = 16
-"""Regions; a straight way through open space that is as long needs no search: its ends lie half a block beside the cheapest
-path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is smoothed."""
 _NEAR_TIGHT = 1.3
 """Cells from a tight place to the nodes that it is joined to: the centre of the next cell but half a cell."""
 BLOCK = 16
-"""Cells along the edge of a block; STRIP is a multiple of it."""
+"""Cells along the edge of a block; STRIP is a multiple of it. A straight way through open space over as many blocks needs no
+search: its ends lie half a block beside the cheapest path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is
+smoothed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +87,7 @@ class StepSearch:
         if not np.isfinite(costs[end]):
             return None
         chain = walk_back(before, start, end)
-        stops = np.append(np.arange(0, max(len(chain) - 1, 1), _STRETCH), len(chain) - 1)
+        stops = np.append(np.arange(0, max(len(chain) - 1, 1), BLOCK), len(chain) - 1)
         nodes = np.array([first, *(self._roomiest(int(chain[k])) for k in stops[1:-1]), last])
         places = self.places(nodes)
         open_ = along_lines(self.clearance, places[:-1], places[1:]).open
@@ -262,7 +261,7 @@ def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
     for start in range(0, grid.rows, STRIP):
         rows = slice(start, min(start + STRIP, grid.rows))
         part, more = _parted(clearance.passable(rows))
-        inner = part.ravel()
+        inner = part.ravel().astype(np.intp)
         values = (None, col[: len(inner)], row[: len(inner)] + start, clearance.cell_cost(rows).ravel())
         sums.append(np.stack([np.bincount(inner, v, more + 1)[1:] for v in values]))
         label[rows] = np.where(part > 0, part + count, 0)

@@ -1,11 +1,12 @@
 """Odometry edges, their noise and the scale of their turns, from the settings and from the recording."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from .. import se2
-from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread, spread_about_median, weighted_median
+from ..arrays import Floats, Ints, spread, weighted_median
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
@@ -203,37 +204,23 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 _TURNING = 0.1
 """rad; steps that turn by less, on average of lidar and wheels, do not show a ratio."""
-_STRETCHES = 4
-"""Parts of a recording, equal in turning steps, whose scales are compared."""
-_SIGMAS = 5.0
-"""Standard deviations beyond which scales differ."""
-_SAME, _DIFFERENT = 0.05, 0.25
-"""Difference of scales that floors and tyres explain, and one between stretches that no floor explains."""
-_SOON = 4
-"""Steps from one turning step to the next of the same turn."""
+_PARTS = 8
+"""Of a recording, equal in turning steps, whose scales are compared."""
+_SIGMAS, _SAME = 5.0, 0.05
+"""Standard deviations beyond which scales differ, and the difference that floors and tyres explain."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnScale:
+class TurnScale(NamedTuple):
     """Relative error of the turns of one recording's wheels, measured by the lidar from step to step."""
 
     value: float
     """Turn by the lidar / turn by the wheels - 1, 1: what ``heading_scale`` should be."""
     sigma: float
-    """Standard deviation, by the scatter of steps (correlated within a turn) and by that of the stretches, 1."""
-    stretches: Floats
-    """(4,) the same of each quarter of the turning steps."""
-    stretch_sigma: float
-    """Standard deviation of one stretch, by the scatter of steps, 1."""
+    """Standard deviation, by the scatter of the parts, 1."""
 
     def contradicts(self, heading_scale: float) -> bool:
         """Return whether a scale from the whole estimate cannot be that of the steps."""
         return abs(heading_scale - self.value) > max(_SIGMAS * self.sigma, _SAME)
-
-    @property
-    def varies(self) -> bool:
-        """Whether the stretches have different scales, so that it is not a constant of these wheels."""
-        return bool(np.ptp(self.stretches) > max(_SIGMAS * self.stretch_sigma, _DIFFERENT))
 
 
 def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[int, TurnScale]:
@@ -257,10 +244,7 @@ def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[i
     for index in np.unique(of_recording[clear & (of_recording >= 0)]).tolist():
         own = clear & (of_recording == index)
         if own.sum() >= _ENOUGH:
-            # Steps soon after each other that turn the same way are of one turn.
-            side = np.sign(turned[own] + lidar[own])
-            other = (np.diff(row[own]) > _SOON) | (side[1:] != side[:-1])
-            found[index] = _scale(lidar[own], turned[own], np.concatenate([[0], np.cumsum(other)]))
+            found[index] = _scale(lidar[own], turned[own])
     return found
 
 
@@ -275,30 +259,13 @@ def _neighbours(wheels: OdometryEdges, steps: ScanEdges) -> tuple[Ints, Floats]:
     return row[same][order], turned[same][order]
 
 
-def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
-    """Return the scale of turning steps (s,) in the order of time; turn : (s,) increasing number of each one's turn."""
+def _scale(lidar: Floats, wheels: Floats) -> TurnScale:
+    """Return the scale of turning steps (s,) in the order of time."""
     weight, direction, centre = np.hypot(lidar, wheels), np.arctan2(lidar, wheels), np.arctan(1.0)
     for _ in range(2):
         # Left and right turns give one direction, known up to half a turn.
         direction = centre + se2.wrap_angle(2.0 * (direction - centre)) / 2.0
         centre = weighted_median(direction, weight)
-    parts = np.array_split(np.arange(len(weight)), _STRETCHES)
-    centres = np.array([weighted_median(direction[p], weight[p]) for p in parts])
-    steepness = 1.0 + np.tan(centre) ** 2
-    count = _independent(direction - centre, weight, turn)
-    by_steps = steepness * MEDIAN_TO_MEAN * spread_about_median(direction) / np.sqrt(count)
-    by_stretches = steepness * np.std(centres, ddof=1) / np.sqrt(_STRETCHES)
-    value, sigma, stretch_sigma = np.tan(centre) - 1.0, max(by_steps, by_stretches), by_steps * np.sqrt(_STRETCHES)
-    return TurnScale(float(value), float(sigma), np.tan(centres) - 1.0, float(stretch_sigma))
-
-
-def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
-    """Return the effective number of independent steps of weighted ones (s,) whose errors are partly correlated within a turn.
-
-    The correlation of neighbouring steps of one turn is taken from how often their errors have the same sign: of normal values
-    with correlation r it is 1/2 + arcsin(r) / pi.
-    """
-    same = np.sign(error[1:] * error[:-1])[turn[1:] == turn[:-1]]
-    alike = float(np.sin(0.5 * np.pi * np.clip(same.mean(), 0.0, 1.0))) if len(same) else 0.0
-    sums, squares = np.bincount(turn, weight), np.square(weight).sum()
-    return float(weight.sum() ** 2 / (squares + alike * (np.square(sums).sum() - squares)))
+    parts = np.array_split(np.arange(len(weight)), _PARTS)
+    scatter = np.std([weighted_median(direction[part], weight[part]) for part in parts], ddof=1)
+    return TurnScale(float(np.tan(centre)) - 1.0, float((1.0 + np.tan(centre) ** 2) * scatter / np.sqrt(_PARTS)))

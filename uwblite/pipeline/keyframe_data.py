@@ -36,14 +36,14 @@ _LEAST_SHARE = 1e-6
 
 def make(recordings: Recordings, config: MappingConfig, delay: float, work: Work) -> ScanClouds:
     """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s, whose work is counted."""
-    built = clouds.joined([part for recording in recordings.each for part in _clouds_of(recording, config, delay)])
+    built = clouds.joined([part for recording in recordings.each for part in clouds_of(recording, config, delay)])
     return _with_raster(replace(built, work=work), config, delay, len(built.points))
 
 
 def remake(old: ScanClouds, before: Recordings, after: Recordings, config: MappingConfig) -> ScanClouds:
     """Return the clouds of recordings to which keyframes were added; unchanged clouds are taken over."""
     former = np.concatenate([_former(*pair, config, old.delay) for pair in zip(before.each, after.each, strict=True)])
-    parts = [part for r in after.each for part in _clouds_of(r, config, old.delay, former[r.rows] < 0)]
+    parts = [part for r in after.each for part in clouds_of(r, config, old.delay, former[r.rows] < 0)]
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
     both = clouds.joined([old.clouds, *parts]).chosen(place)
     return _with_raster(replace(both, work=old.clouds.work), config, old.delay, sum(len(part.points) for part in parts))
@@ -56,7 +56,7 @@ def _with_raster(built: Clouds, config: MappingConfig, delay: float, new: int) -
     return ScanClouds(built, raster, delay)
 
 
-def _clouds_of(recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None) -> Iterator[Clouds]:
+def clouds_of(recording: Recording, config: MappingConfig, delay: float, wanted: Bools | None = None) -> Iterator[Clouds]:
     """Yield the clouds of the keyframes of a recording, or of those wanted (k,), some at a time; empty ones without lidar."""
     if not recording.has_scans:
         count = len(recording.frames) if wanted is None else int(wanted.sum())

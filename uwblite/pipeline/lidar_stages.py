@@ -4,26 +4,36 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Ints
-from ..graph.calibration import RADIO, with_free
+from ..graph.calibration import LASER, RADIO, with_free
 from ..graph.graph import Graph
 from ..graph.marginals import marginals
 from ..graph.solver import Optimizer
-from ..lidar import joint_refinement, visibility
+from ..graph.work import POINTS
+from ..lidar import clouds, joint_refinement, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
+from ..lidar.scan_matching import PairPolicy, align_pairs, measured, pairs_of
+from ..lidar.scan_to_scan import TrackingConfig
+from ..odometry import keyframes
+from ..odometry.slips import covariance_of
 from ..problem.alternatives import EvidencePolicy
 from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.range_errors import without_pattern
+from . import keyframe_data
 from .estimate import Estimate, Task
 from .progress import solver_figures
 from .radio_stages import evidence_against, with_range_noise
+from .recordings import Recording, RecordingPolicy
 
 _TO_COME = 1e-3
 """Relative decrease of chi2 that ends a solution before the adjustment to surfaces, which solves once more."""
 STILL = 1e-3
 """Root mean square motion of the poses from which on the ranges' noise is estimated again, m."""
 _VIOLATION = 0.05
-"""Share of points in free space from which visits do not show the same place; people, glass and doors cause half of it."""
+"""Share of points in free space from which visits do not show the same place; glass and doors cause half of it."""
+_COME_AND_GONE = 2.0
+"""Ratio to the share within one visit that people explain: those of either visit are not there on the other one."""
 _ENOUGH_VISITS = 5
 """Least number of keyframes of either visit for which their free-space violation counts."""
 
@@ -112,11 +122,56 @@ def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate
     return replace(estimate, graph=graph, joint=refined.edges)
 
 
+def place_scans_between(estimate: Estimate, task: Task) -> Estimate:
+    """Measure where the robot was at scans between keyframes, each by the cloud of the keyframe on its farther side."""
+    if estimate.joint is None:
+        return estimate
+    each = tuple(_with_scans_between(r, estimate, task) if r.has_scans else r for r in task.recordings.each)
+    placed = sum(0 if r.between is None else len(r.between.keyframe) - len(r.frames) for r in each)
+    task.stages.end("scans between keyframes", placed=placed)
+    return replace(estimate, recordings=replace(task.recordings, each=each))
+
+
+def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) -> Recording:
+    scans, graph, own = estimate.lidar, estimate.graph, recording.frames.stamps
+    assert recording.log.scans is not None
+    stamps = recording.log.scans.middles + scans.delay
+    stamps = stamps[(stamps > own[0]) & (stamps < own[-1])]
+    step = np.searchsorted(own, stamps, "right") - 1
+    before, after = stamps - own[step], own[step + 1] - stamps
+    further = np.minimum(before, after) > RecordingPolicy.same_moment
+    if not further.any():
+        return recording
+    stamps, step = stamps[further], step[further]
+    # The nearer keyframe's cloud may hold the scan itself.
+    side = recording.first + step + (before < after)[further]
+    frames = keyframes.at(recording.log, stamps, np.ones(len(stamps), dtype=bool))
+    alone = keyframe_data.clouds_of(replace(recording, frames=frames), task.config, scans.delay)
+    both = clouds.joined([scans.clouds, *alone])
+    raster = replace(scans.raster, clouds=replace(both, work=scans.clouds.work))
+    scans.clouds.work[POINTS] += len(both.points) - len(scans.clouds.points)
+    mounting = np.array([graph.calibration.get(name) for name in LASER[:3]])
+    expected = recording.dense_trajectory(graph.poses, stamps)
+    guess = se2.between(se2.compose(graph.poses[side], mounting), se2.compose(expected, mounting))
+    pairs = pairs_of(both, side, len(scans.clouds) + np.arange(len(stamps)))
+    aligned = align_pairs(raster, pairs, guess, PairPolicy.gate, PairPolicy.gate)
+    variance = np.full(len(stamps), TrackingConfig.sigma**2 * PairPolicy.correlation)
+    z, root = measured(aligned.factors, aligned.pose, variance)
+    # The odometry's noise over the step is that of the way from either side, and of its clock.
+    of_step = np.searchsorted(estimate.odometry.i, recording.first + step)
+    turn = se2.rotation(guess[:, 2] + graph.poses[side, 2] - graph.poses[recording.first + step, 2])
+    prior = np.linalg.inv(np.swapaxes(turn, 1, 2) @ covariance_of(estimate.odometry, graph)[of_step] @ turn)
+    off = np.linalg.solve(np.swapaxes(root, 1, 2) @ root + prior, prior @ se2.between(z, guess)[..., None])[..., 0]
+    seen = se2.compose(se2.compose(se2.compose(mounting, z), off), se2.inverse(mounting))
+    good = (aligned.share >= PairPolicy.good_share) & (aligned.factors.asked >= PairPolicy.fewest)
+    return recording.with_poses_between(stamps[good], (side - recording.first)[good], seen[good])
+
+
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
-    """Compare the free space of one visit to a place with the points of another."""
-    recordings, poses = task.recordings, estimate.graph.poses
-    share, visits = visibility.free_space_violation(estimate.lidar.clouds, poses, recordings.path, recordings.of_keyframe)
-    task.stages.end("map consistency", visits=visits, free_space_violation=share)
-    if share > _VIOLATION and visits >= _ENOUGH_VISITS:
-        task.stages.note("free-space-violation", share=share, visits=visits)
+    """Compare the free space of one visit to a place with the points of another: what moves shows within one visit as well."""
+    recordings, poses, clouds = task.recordings, estimate.graph.poses, estimate.lidar.clouds
+    share, moving, visits = visibility.free_space_violation(clouds, poses, recordings.path, recordings.of_keyframe)
+    task.stages.end("map consistency", visits=visits, free_space_violation=share, within_one_visit=moving)
+    if share > max(_VIOLATION, _COME_AND_GONE * moving) and visits >= _ENOUGH_VISITS:
+        task.stages.note("free-space-violation", share=share, moving=moving, visits=visits)
     return estimate

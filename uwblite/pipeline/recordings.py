@@ -31,14 +31,26 @@ class RecordingPolicy:
 
     apart: ClassVar[float] = 1000.0
     """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
-    sparse: ClassVar[float] = 0.15
-    """s between samples of the odometry that interpolation does not bridge well."""
+    sparse: ClassVar[float] = 0.11
+    """s between samples of an odometry slower than 10 Hz, which interpolation does not bridge well."""
     alike: ClassVar[int] = 20
     """Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
     same_moment: ClassVar[float] = 1e-6
     """s; difference of stamps that is rounding."""
     scans_per_move: ClassVar[int] = 2
     """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosesBetween:
+    """Poses at keyframes and at scans between them."""
+
+    frames: Keyframes
+    """At all of these moments (n)."""
+    keyframe: Ints
+    """(n,) keyframe of the recording from which each pose is seen, counted from its first."""
+    since: Floats
+    """(n, 3) T_keyframe_base; m, m, rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +63,8 @@ class Recording:
     frames: Keyframes
     first: int
     """The graph's number of its first keyframe."""
+    between: PosesBetween | None = None
+    """None where the odometry alone tells the way from keyframe to keyframe."""
 
     @property
     def rows(self) -> slice:
@@ -73,8 +87,8 @@ class Recording:
 
     @property
     def trajectory_stamps(self) -> Floats:
-        """(n,) s of its odometry, and of keyframes where its samples are too far apart to interpolate between."""
-        stamps, own = self.log.odometry.stamps, self.frames.stamps
+        """(n,) s of its odometry, and of keyframes and scans where its samples are too far apart to interpolate between."""
+        stamps, own = self.log.odometry.stamps, (self.between or self).frames.stamps
         after = np.searchsorted(stamps, own)
         inside = (after > 0) & (after < len(stamps))
         gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
@@ -82,7 +96,20 @@ class Recording:
 
     def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
         """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
-        return keyframes.dense_trajectory(self.log.odometry, self.frames, poses[self.rows], stamps)
+        frames, own = self.frames, poses[self.rows]
+        if self.between is not None:
+            frames, own = self.between.frames, se2.compose(own[self.between.keyframe], self.between.since)
+        return keyframes.dense_trajectory(self.log.odometry, frames, own, stamps)
+
+    def with_poses_between(self, stamps: Floats, keyframe: Ints, since: Floats) -> "Recording":
+        """Return the recording with poses (m, 3) at further stamps (m,), seen from its keyframes (m,)."""
+        own = np.arange(len(self.frames))
+        moments = np.concatenate([self.frames.stamps, stamps])
+        order = np.argsort(moments, kind="stable")
+        frames = keyframes.at(self.log, moments[order], np.ones(len(order), dtype=bool))
+        keyframe = np.concatenate([own, keyframe])[order]
+        since = np.concatenate([np.zeros((len(own), 3)), since])[order]
+        return replace(self, between=PosesBetween(frames, keyframe, since))
 
     @property
     def name(self) -> str:

@@ -211,7 +211,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
         if 0 < turn <= rules.settling:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
-        normal = filled(problem, subtrees=True, like=normal)
+        normal = filled(problem, last=(), like=normal)
         task.stages.work[RAYS] += len(found.rays.keyframe)
         sums = weighted_sums(found, lidar.sensors, poses, rules.kernel * max(rules.wider * 0.5**turn, 1.0))
         certainty, rays = sums.poses, _blocks(sums, found.surfaces, graph, lidar, normal.unknowns)

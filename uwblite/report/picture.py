@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import ACCEPTED, ANCHOR, DOUBTED, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, Colour, rgb
 from .drawn_map import DrawnAnchor, DrawnMap, ellipse, free_sides, name_box
@@ -136,6 +135,8 @@ def draw_errors(grid: OccupancyGrid, points: Floats, errors: Floats, anchors: Se
 
     A cell has the error of the nearest place.
     """
+    from scipy.spatial import cKDTree  # a tenth of a second, which no other picture needs
+
     colours = np.zeros((*grid.log_odds.shape, 3), dtype=np.uint8)
     rows, cols = np.nonzero(grid.states() == FREE)
     nearest = cKDTree(points).query(grid.geometry.centre_of(rows, cols))[1]
@@ -169,7 +170,7 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
         for begin, n in zip(first[::-1], grid.log_odds.shape, strict=True)
     )
     surest_wall, surest_floor = (
-        extreme.reduceat(extreme.reduceat(grid.log_odds, row_starts, axis=0), col_starts, axis=1)
+        _joined(_joined(grid.log_odds, row_starts, together, extreme, 0), col_starts, together, extreme, 1)
         for extreme in (np.maximum, np.minimum)
     )
     cells = np.where(surest_wall > _WALL_SHOWS, surest_wall, surest_floor)
@@ -182,6 +183,14 @@ def _paste(image: Image, grid: OccupancyGrid, low: Floats, scale: float, tint: T
         shown = np.where(colours.any(axis=2, keepdims=True) & (cells < 0.0)[..., None], colours, shown)
     if len(rows) and len(cols):
         image[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] = shown.take(col[cols], axis=1).take(row[rows], axis=0)
+
+
+def _joined(cells: NDArray[np.float32], starts: Ints, most: int, extreme: np.ufunc, axis: int) -> NDArray[np.float32]:
+    """Return what `reduceat` does, for groups of so many rows or columns at most, several times as fast."""
+    found, last = cells.take(starts, axis), np.append(starts[1:], cells.shape[axis]) - 1
+    for k in range(1, most):
+        extreme(found, cells.take(np.minimum(starts + k, last), axis), out=found)
+    return found
 
 
 def _draw_axes(canvas: Canvas, low: Floats, scale: float) -> None:

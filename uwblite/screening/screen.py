@@ -66,13 +66,13 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, pairs, lost, standing = _lost_wheels(log, pairs)
     cut, carried = cuts.cuts(log, jumps.stamps, OdometryBreaks.of_all([gaps, lost]).stamps)
     facts += [*silent, *standing, *carried]
-    ratio, turns = float("nan"), (float("nan"), float("nan"))
+    ratio = float("nan")
     if pairs is not None:
         facts += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]), log)
-        ratio, turns = pairs.way_ratio, pairs.turn_ratio
+        ratio = pairs.way_ratio
     facts += _hardly_moving(log.odometry)
     breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
-    return replace(log, screening=Screening(tuple(facts), breaks, ratio, turns, bursts))
+    return replace(log, screening=Screening(tuple(facts), breaks, ratio, bursts))
 
 
 def _hardly_moving(odometry: Odometry) -> list[Fact]:

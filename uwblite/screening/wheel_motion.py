@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median
+from ..arrays import Bools, Floats, Ints, Table, runs_of
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
@@ -74,17 +74,12 @@ class PairPolicy:
 _NAN = float("nan")
 
 
-def ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
-    """Return the pairs whose motion by the wheels (e, d) is clear, and the ratio of the lidar's motion to it, along it."""
+def factor(wheels: Floats, lidar: Floats, clear: float) -> float:
+    """Return the factor of the wheels' motions (e, d) that most agree on; nan where there are too few clear ones."""
     size = np.sqrt(np.sum(wheels**2, axis=1))
-    rows = np.flatnonzero(size > clear)
-    return rows, np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
-
-
-def factor(wheels: Floats, lidar: Floats, clear: float, otherwise: float = 1.0) -> float:
-    """Return the factor of the wheels' motions (e, d) that most agree on; `otherwise` where there are too few."""
-    ratio = ratios(wheels, lidar, clear)[1]
-    return float(np.median(ratio)) if len(ratio) >= PairPolicy.enough else otherwise
+    rows = size > clear
+    ratio = np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
+    return float(np.median(ratio)) if len(ratio) >= PairPolicy.enough else _NAN
 
 
 def undiluted(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
@@ -93,7 +88,7 @@ def undiluted(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
-    ratio, inverse = factor(wheels, lidar, clear, _NAN), factor(lidar, wheels, clear, _NAN)
+    ratio, inverse = factor(wheels, lidar, clear), factor(lidar, wheels, clear)
     if not (ratio > 0.0 and inverse > 0.0):
         return otherwise if np.isnan(ratio) else ratio
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
@@ -132,14 +127,6 @@ class Pairs(Table):
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
         own = self.rows(self.measured)
         return undiluted(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0], _NAN)
-
-    @property
-    def turn_ratio(self) -> tuple[float, float]:
-        """The turn by the lidar / the turn by the wheels, and its standard deviation; nan where clear turns are too few."""
-        own = self.rows(self.measured)
-        each = ratios(own.wheels[:, 2:], own.lidar[:, 2:], PairPolicy.clear[1])[1]
-        ratio = undiluted(own.wheels[:, 2:], own.lidar[:, 2:], PairPolicy.clear[1], _NAN)
-        return ratio, sigma_of_median(each) if len(each) else _NAN
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:

@@ -72,8 +72,6 @@ class Screening:
     breaks: OdometryBreaks
     lidar_by_wheels: float = float("nan")
     """Distance by the lidar / distance by the wheels; nan where nothing shows it."""
-    turn_ratio: tuple[float, float] = (float("nan"), float("nan"))
-    """Turn by the lidar / turn by the wheels, and its standard deviation; nan where nothing shows it."""
     in_bursts: tuple[str, ...] = ()
     """Sensors whose stamps are times of receipt in bursts: no clock offset can be estimated against them."""
 

@@ -10,9 +10,8 @@ from typing import Any, Protocol
 from ..constraints import Constraints
 from ..errors import ConfigError
 from ..io.files import write_text
-from ..io.results import is_of_result
 from ..io.source import read_settings
-from ..io.stored_result import StoredResult, read_result
+from ..io.stored_result import StoredResult, is_of_result, read_result
 from .edits import edits_text, parse_edits, remap_command, with_anchor, with_closure
 from .pages import view_page
 from .shown_results import ShownResult, described, shown_result
