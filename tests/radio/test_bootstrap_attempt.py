@@ -51,7 +51,7 @@ def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time(
     is left at a distance goes on as if it had never been left."""
     one = Scheduled(32, [True, False, True], [True, False])
     one.run()
-    assert one.taken == [(10.0, 20), 6.0, 9.0, (6.0, 28), (6.0, 28), 7.2, (6.0, 32)]
+    assert one.taken == [(6.0, 20), 6.0, 9.0, (6.0, 28), (6.0, 28), 7.2, (6.0, 32)]
     slow = Scheduled(56, [False] * 9, [False] * 9)
     slow.run(21.0)
     assert slow.high == 24

@@ -48,8 +48,7 @@ class BootstrapConfig:
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
     scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, 3.0)
-    first_scales: ClassVar[tuple[float, ...]] = (10.0, 3.0)
-    """Scales of the ranges' kernel, one after the other, standard deviations; and those of the first stretch."""
+    """Scales of the ranges' kernel, one after the other, standard deviations."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
@@ -144,7 +143,7 @@ class Attempt:
             self.first = self.low, self.high
             self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
             if self.placed.any():
-                self._solve(self.config.first_scales)
+                self._solve(self.config.scales[1:])
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
             held, failed = self.config.growth
             self.piece = held * self.piece if self._extend(self.piece) else max(failed * self.piece, self.smallest)
