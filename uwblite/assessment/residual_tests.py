@@ -128,7 +128,8 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
     off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
     # Wheels that slip count too much; a robot that moved farther than they count was carried, or all anchors were.
-    moved, counted = se2.between(estimate.graph.poses[wheels.i], estimate.graph.poses[wheels.j]), wheels.corrected(estimate.graph)
+    poses, counted = estimate.graph.poses, wheels.corrected(estimate.graph)
+    moved = se2.between(poses[wheels.i], poses[wheels.j])
     carried = np.hypot(moved[:, 0], moved[:, 1]) > np.hypot(counted[:, 0], counted[:, 1]) + _CARRIED
     far = np.flatnonzero(np.where(noise < _MEASURED, off > _JUMP, carried))
     if len(far):
