@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
@@ -127,11 +126,7 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
         return
     # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
     off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
-    # Wheels that slip count too much; a robot that moved farther than they count was carried, or all anchors were.
-    moved = se2.between(estimate.graph.poses[wheels.i], estimate.graph.poses[wheels.j])
-    counted = wheels.corrected(estimate.graph)
-    carried = np.hypot(moved[:, 0], moved[:, 1]) > np.hypot(counted[:, 0], counted[:, 1]) + _CARRIED
-    far = np.flatnonzero(np.where(noise < _MEASURED, off > _JUMP, carried))
+    far = np.flatnonzero((noise < _MEASURED) & (off > _JUMP))
     if len(far):
         yield _slips(far, whitened, wheels, recordings)
 
