@@ -134,11 +134,11 @@ def minute_log(room_log, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def short_log(room_log, tmp_path_factory):
-    """Path of its first 25 s, within which nothing closes."""
+    """Path of its first 18 s, within which nothing closes."""
     from uwblite.io.carmen import read_log, write_log
 
     path = tmp_path_factory.mktemp("short") / "short.log.gz"
-    write_log(path, read_log(room_log).crop(0.0, 25.0))
+    write_log(path, read_log(room_log).crop(0.0, 18.0))
     return path
 
 

@@ -128,6 +128,13 @@ def runs_of(flags: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
+def best_run(gain: Floats) -> tuple[int, int]:
+    """Return begin and end of the run of greatest sum (Kadane)."""
+    sums = np.append(0.0, np.cumsum(gain))
+    end = int(np.argmax(sums - np.minimum.accumulate(sums)))
+    return int(np.argmin(sums[: end + 1])), end
+
+
 def spread(errors: Floats) -> float:
     """Return the robust standard deviation of errors (m,) about zero, by their median size; half may be outliers."""
     return MAD_TO_SIGMA * float(np.median(np.abs(errors)))

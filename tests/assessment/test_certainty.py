@@ -35,7 +35,7 @@ def test_a_path_whose_shape_is_known_roughly_only_is_doubted(across, ranges, sig
 @pytest.fixture(scope="module")
 def sound():
     """The heights of the anchors are given: what drifts is not told from them here."""
-    return replace(recording(two_rounds()[:4000]).without(lidar=True), mounting=SensorMounting(anchor_height=0.0))
+    return replace(recording(two_rounds()[:2600]).without(lidar=True), mounting=SensorMounting(anchor_height=0.0))
 
 
 def drifts(log, kind="drift"):

@@ -115,7 +115,7 @@ def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretc
         AnchorEstimate(name, np.zeros(2), np.eye(2), 50, 1.0, 0.0, 0.1, 0.1, status)
         for name, status in zip(names, statuses, strict=True)
     ]
-    found = Fact.of("wheels-against-lidar", start=0.0, stretches=stretches)
+    found = Fact.of("wheels-against-lidar", start=0.0, stretches=stretches, slips=False)
     screened = {"screening": Screening((found,), OdometryBreaks.none())}
     task = task_of(standing(2, lidar=True, each=[screened if n == whose - 1 else {} for n in range(2)]))
     task.stages.findings.extend(check_wheels_against_lidar(table, anchors, task))

@@ -16,7 +16,6 @@ from uwblite.graph.solver import (
     ALL_WORK_DONE,
     SolverConfig,
     _step,
-    as_much_again,
     cheaper_move,
     extrapolated,
     optimize,
@@ -595,10 +594,6 @@ def test_a_step_takes_whichever_way_costs_less(way):
 def test_the_decrease_to_come_is_the_rest_of_the_geometric_series(decrease, last, promised, to_come):
     """1/4 + 1/16 + ... of what came last; what the step promised where it kept less than half, or is the first."""
     assert extrapolated(decrease, last, promised) == pytest.approx(to_come)
-
-
-def test_a_robust_search_expectsas_much_again_as_the_last_step_brought_or_promised():
-    assert (as_much_again(0.1, np.inf, 0.5), as_much_again(0.5, 1.0, 0.1)) == (0.5, 0.5)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """A result that was written is read back as it was."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -12,11 +13,18 @@ from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 
 
-@pytest.fixture(params=[1, 2])
-def written(request, tmp_path):
-    result = small_result(each=request.param)
-    write_result(tmp_path / "map", [small_log()] * request.param, result, RunRecord("uwblite map x", ""))
-    return result, tmp_path / "map"
+@pytest.fixture(scope="module", params=[1, 2])
+def made(request, tmp_path_factory):
+    folder, result = tmp_path_factory.mktemp("made") / "map", small_result(each=request.param)
+    write_result(folder, [small_log()] * request.param, result, RunRecord("uwblite map x", ""))
+    return result, folder
+
+
+@pytest.fixture
+def written(made, tmp_path):
+    """A result and a folder of its own."""
+    shutil.copytree(made[1], tmp_path / "map")
+    return made[0], tmp_path / "map"
 
 
 def test_everything_comes_back(written):

@@ -12,7 +12,7 @@ from uwblite.arrays import concatenated
 from uwblite.lidar import scan_matching
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.scan_matching import _step, align_pairs, match, nondegenerate_step, pairs_of
+from uwblite.lidar.scan_matching import align_pairs, match, measured_part, nondegenerate_step, pairs_of
 
 TRUTH = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
 I, J = np.array([0, 0, 2]), np.array([1, 2, 1])
@@ -28,7 +28,7 @@ def world():
 def test_one_iteration_is_one_step_of_the_matches(world):
     raster, pairs, exact = world
     guess = exact + np.array([0.05, -0.04, 0.03])
-    step = nondegenerate_step(match(raster, pairs, guess, 0.3, 0.15))[0]
+    step = nondegenerate_step(*match(raster, pairs, guess, 0.3, 0.15).quadratic)[0]
     assert 0.01 < np.abs(step).max() < 0.15
     found = align_pairs(raster, pairs, guess, 0.3, 0.3, iterations=1)
     np.testing.assert_allclose(se2.between(found.pose, guess + step), 0.0, atol=1e-12)
@@ -42,17 +42,20 @@ def test_a_step_is_the_nondegenerate_one_whatever_was_measured(world):
     wall = np.outer([0.6, 0.8, 0.1], [0.6, 0.8, 0.1])
     hessian = np.concatenate([factors.hessian, [factors.hessian[0].max() * wall, np.zeros((3, 3))]])
     gradient = np.concatenate([factors.gradient, factors.gradient[:1], np.zeros((1, 3))])
-    mixed = replace(concatenated([factors, factors.rows(slice(2))]), hessian=hessian, gradient=gradient)
-    np.testing.assert_allclose(_step(mixed), nondegenerate_step(mixed)[0], rtol=1e-9, atol=1e-12)
-    assert np.abs(_step(mixed)[:4]).min(axis=1).min() > 0.0
-    np.testing.assert_array_equal(_step(mixed)[4], 0.0)
+    mixed = replace(concatenated([factors, factors.rows(slice(2))]), hessian=hessian, gradient=gradient).quadratic
+    information, step = measured_part(*mixed)
+    exact, root = nondegenerate_step(*mixed)
+    np.testing.assert_allclose(step, exact, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(information, np.swapaxes(root, 1, 2) @ root, rtol=1e-9, atol=1e-12 * hessian.max())
+    assert np.abs(step[:4]).min(axis=1).min() > 0.0
+    np.testing.assert_array_equal(step[4], 0.0)
 
 
 def test_no_step_is_longer_than_allowed(world):
     """0.3 m and 0.15 rad; a longer one keeps its direction."""
     raster, pairs, exact = world
     guess = exact + np.array([0.6, 0.5, 0.1])
-    step = nondegenerate_step(match(raster, pairs, guess, 0.8, 0.4))[0]
+    step = nondegenerate_step(*match(raster, pairs, guess, 0.8, 0.4).quadratic)[0]
     found = align_pairs(raster, pairs, guess, 0.8, 0.8, iterations=1)
     taken = found.pose - guess
     taken[:, 2] = se2.wrap_angle(taken[:, 2])
@@ -67,7 +70,7 @@ def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
     """By 0.6 rad, four times what is allowed; by half of what is allowed; 0.6 m and 0.3 rad, both twice as far."""
     raster, pairs, exact = world
     steps = np.array([[0.04, 0.0, -0.6], [0.1, 0.0, 0.075], [0.0, 0.6, 0.3]])
-    monkeypatch.setattr(scan_matching, "_step", lambda factors: steps)
+    monkeypatch.setattr(scan_matching, "measured_part", lambda *factors: (None, steps))
     found = align_pairs(raster, pairs, exact, 0.8, 0.8, iterations=1)
     taken = se2.wrap_angle(found.pose[:, 2] - exact[:, 2])
     np.testing.assert_allclose(taken, [-0.15, 0.075, 0.15])
@@ -80,7 +83,7 @@ def test_pairs_go_on_at_the_last_gate_until_none_moves(world):
     guess = exact + np.array([0.2, -0.15, 0.1])
     moves = []
     for pose in (guess, align_pairs(raster, pairs, guess, 0.5, 0.5, iterations=60).pose):
-        moves.append(np.abs(nondegenerate_step(match(raster, pairs, pose, 0.5, 0.25))[0]).max())
+        moves.append(np.abs(nondegenerate_step(*match(raster, pairs, pose, 0.5, 0.25).quadratic)[0]).max())
     assert moves[0] > 0.05
     assert moves[1] < 1e-3
 

@@ -211,7 +211,7 @@ def test_what_scatter_adds_is_taken_off_and_never_more(seed):
     rng = np.random.default_rng(seed)
     (hessian, gradient), (spurious, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)
     spurious *= 10 ** rng.uniform(-3, 1)
-    step, root = nondegenerate_step(factors_of(hessian, gradient, spurious))
+    step, root = nondegenerate_step(hessian[None], spurious[None], gradient[None])
     information = root[0].T @ root[0]
     size = np.trace(hessian)
     assert np.linalg.eigvalsh(hessian - information).min() > -1e-6 * size

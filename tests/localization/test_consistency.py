@@ -60,7 +60,7 @@ def planted(seed, steps=150):
 
 @pytest.fixture(scope="module")
 def errors():
-    return np.array([planted(seed) for seed in range(24)])
+    return np.array([planted(seed) for seed in range(16)])
 
 
 def test_errors_over_planted_worlds_are_as_large_as_stated(errors):

@@ -6,7 +6,7 @@ from helpers.localization_room import cast, grid_of
 
 from uwblite import se2
 from uwblite.localization import hypotheses
-from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH
+from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH, SLOW_SIGMA
 from uwblite.localization.walls import Rays, walls_of
 
 
@@ -54,15 +54,15 @@ def test_scans_between_two_oblique_walls_say_nothing_along_them_and_a_third_wall
 
 def test_range_errors_that_fade_keep_their_size_and_forget_by_the_distance_driven():
     """A Gauss-Markov process: stationary, the same by many steps as by one, correlated by exp(-way / length)."""
-    sigma, way = 0.2, 0.7 * SLOW_LENGTH
-    begun = hypotheses.started(np.zeros((1, 3)), np.zeros((1, 3, 3)), np.array([0.05]), slow=sigma)
+    sigma, way = SLOW_SIGMA, 0.7 * SLOW_LENGTH
+    begun = hypotheses.started(np.zeros((1, 3)), np.zeros((1, 3, 3)), np.array([0.05]))
     at = FIRST_ANCHOR
     for count in (1, 7):
         known = begun.covariance.copy()
         known[:, at, at] = 0.0
         still, fresh = begun, hypotheses.Hypotheses(begun.mean, known, begun.log_weight)
         for _ in range(count):
-            still, fresh = (hypotheses.moved(b, np.array([way / count, 0.0, 0.0]), slow_sigma=sigma) for b in (still, fresh))
+            still, fresh = (hypotheses.moved(b, np.array([way / count, 0.0, 0.0])) for b in (still, fresh))
         np.testing.assert_allclose(still.covariance[0, at, at], sigma**2, rtol=1e-12)
         np.testing.assert_allclose(fresh.covariance[0, at, at], sigma**2 * (1.0 - np.exp(-2.0 * way / SLOW_LENGTH)), rtol=1e-12)
 

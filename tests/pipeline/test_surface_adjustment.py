@@ -22,8 +22,8 @@ from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_cov
 
 @pytest.fixture(scope="module")
 def around():
-    """A map of two minutes in a hall with errors of real rooms, and what stood before and after the adjustment."""
-    trial, seen = made(Settings(world="hall", seed=4, minutes=2.0, rooms=RealRooms())), {}
+    """A map of a minute and a half in a hall with errors of real rooms, and what stood before and after the adjustment."""
+    trial, seen = made(Settings(world="hall", seed=4, minutes=1.5, rooms=RealRooms())), {}
 
     def watched(estimate, task):
         seen.update(before=estimate, after=adjust_surfaces(estimate, task), task=task)

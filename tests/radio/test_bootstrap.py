@@ -4,16 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from helpers.planted import aligned_error, odometry, ranges, wander
+from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.slips import LASTS
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
-from uwblite.radio.bootstrap import bootstrap_graph
-from uwblite.radio.bootstrap_attempt import BootstrapConfig, BootstrapResult, Measured
+from uwblite.radio.bootstrap import bootstrap_graph, of_likeliest_slips
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -213,6 +216,52 @@ def test_a_robot_that_stands_places_nothing_for_sure():
     bootstrapped, _ = start(Odometry(stamps, truth), ranges(rng, stamps, truth, np.array([[3.0, 1.0], [-2.0, 4.0]]), rate=2.0))
     assert bootstrapped.ambiguous.all() or not bootstrapped.placed.any()
     assert np.isfinite(bootstrapped.graph.poses).all()
+
+
+@pytest.mark.parametrize("part", [slice(80, 110), slice(-110, -80)])
+def test_a_slip_near_an_end_shows_in_the_few_ranges_beyond_it(part):
+    """Wheels that spin for 3 s count 1.2 m and 0.7 rad too much; the ranges of the other 97 % of the way agree all the same."""
+    rng = np.random.default_rng(34)
+    stamps, truth = wander(rng, 150.0)
+    places = places_around(rng, 4)
+    motion = se2.between(truth[:-1], truth[1:])
+    motion[part] += np.array([0.04, 0.0, 0.023])
+    wheels = odometry(stamps, se2.chain(truth[0], motion), rng, noise=0.01, turn_noise=0.01)
+    bootstrapped, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA))
+    error, _ = judged(bootstrapped, at, stamps, truth, places)
+    times = at[np.flatnonzero(bootstrapped.slips)]
+    assert error < WELL / 3
+    assert np.abs(times - stamps[part].mean()).max(initial=0.0) < 3.0 * LASTS
+
+
+@pytest.mark.parametrize("marked", [[(22, 26)], [(22, 26), (5, 9)], [(5, 9), (22, 26), (32, 36)], [(24, 28)], []])
+def test_slips_that_nothing_pays_for_go_and_others_are_found(marked):
+    """Wheels that count half a metre and 0.2 rad too much over each of four steps, and slips that are not there."""
+    truth = se2.chain(np.zeros(3), np.tile([0.5, 0.0, 0.15], (39, 1)))
+    motion = se2.between(truth[:-1], truth[1:])
+    motion[22:26] += [0.5, 0.0, 0.2]
+    anchors = np.array([[4.0, 3.0], [6.0, -3.0], [-4.0, 1.0]])
+    pose, anchor = np.repeat(np.arange(40), 3), np.tile([0, 1, 2], 40)
+    rng = np.random.default_rng(8)
+    distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T) + 0.05 * rng.standard_normal(120)
+    wheels = chained(se2.chain(np.zeros(3), motion), (0.02, 0.02, 0.02))
+    measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0))
+    config = BootstrapConfig(range_sigma=0.05)
+    attempt = Attempt(Graph(truth.copy(), anchors), measured, config, TrilaterationConfig(), ())
+    attempt.placed[:], attempt.low, attempt.high, attempt.poses = True, 0, 40, truth.copy()
+    for first, last in marked:
+        attempt.slips[first:last] = 1.0
+    attempt = attempt.with_slips(attempt.slips)
+    before = attempt.evidence(), attempt.slips.copy(), attempt.poses.copy()
+    likely = of_likeliest_slips(attempt)
+    steps = np.flatnonzero(likely.slips)
+    assert set(steps) & {22, 23, 24, 25}
+    assert steps.min() > 17
+    assert steps.max() < 30
+    assert likely.evidence() >= before[0]
+    # The attempt itself is as it was.
+    np.testing.assert_array_equal(attempt.slips, before[1])
+    np.testing.assert_array_equal(attempt.poses, before[2])
 
 
 def test_equal_inputs_give_equal_bytes():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from uwblite.arrays import best_run
 from uwblite.radio.place_evidence import PlaceModel, Track, intervals_of
-from uwblite.radio.place_intervals import _best_run, _times, explain
+from uwblite.radio.place_intervals import _times, explain
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 
@@ -149,7 +150,7 @@ def test_intervals_and_runs():
     for _ in range(20):
         gain = rng.normal(size=12)
         sums = {(i, j): gain[i:j].sum() for i in range(13) for j in range(i, 13)}
-        start, end = _best_run(gain)
+        start, end = best_run(gain)
         assert gain[start:end].sum() == pytest.approx(max(sums.values()))
 
 

@@ -13,7 +13,7 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import first_optimisation
 from uwblite.pipeline.recordings import gather
-from uwblite.radio.slip_search import TagRanges, likeliest_slip, log_prior
+from uwblite.radio.slip_search import TagRanges, bursts, likeliest_slip, log_prior
 from uwblite.sensor_log import SensorLog
 
 ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
@@ -83,3 +83,15 @@ def test_a_path_by_wheels_that_slip_and_ranges_alone(seed, moments):
     slipped = 1.0 / np.einsum("eii->ei", estimate.odometry.sqrt_information)[:, 2] > 0.1
     begins = task.recordings.stamps[estimate.odometry.i[slipped]]
     assert all(np.any(np.abs(begins - moment - 2.0) < 5.0) for moment in moments)
+
+
+def test_ranges_of_several_anchors_that_are_off_at_once_are_a_burst_and_those_of_one_anchor_hardly():
+    """An anchor behind an obstacle for a while has lasting errors, which count about once; a tag elsewhere shows in all."""
+    pose, anchor = np.repeat(np.arange(60), 4), np.tile(np.arange(4), 60)
+    errors = 0.1 * np.random.default_rng(3).standard_normal(240)
+    usual = np.log(0.9 * np.exp(-0.5 * (errors / 0.1) ** 2) / (0.1 * np.sqrt(2.0 * np.pi)) + 0.01)
+    assert bursts(pose, errors, usual, np.full(240, 0.3)) == []
+    for late, found in ((pose >= 50, [(50, 59)]), ((pose < 9) & (anchor == 1), [])):
+        off = np.where(late, errors + 1.5, errors)
+        density = np.where(late, np.log(0.01), usual)
+        assert bursts(pose, off, density, np.full(240, 0.3)) == found

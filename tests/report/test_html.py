@@ -13,7 +13,6 @@ import pytest
 from helpers.results import EVIL, small_result
 
 from uwblite.graph.graph import UnknownKey
-from uwblite.graph.work import StageSummary
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import OUTCOMES, CalibrationEstimate
@@ -73,10 +72,10 @@ def test_everything_that_belongs_in_it_is_there():
     for wanted in (
         "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small",
         "1 of 3 candidates accepted",
-        "odometry_scale", "\u22121.20 \u00b10.20 %", "the robot hardly turns", "40 / 50 = 0.80", "anchor 91A3 may be mirrored",
+        "odometry_scale", "\u22121.20 \u00b10.20 %", "the robot hardly turns", "anchor 91A3 may be mirrored",
     ):  # fmt: skip
         assert wanted in words, wanted
-    assert {"map", "anchors", "calibration", "loop-closures", "range-residuals", "stages", "warnings"} <= Page(text).ids
+    assert {"map", "anchors", "calibration", "loop-closures", "range-residuals", "warnings"} <= Page(text).ids
     assert text.count("<ellipse") == 2
     assert 'class="mirror"' in text
 
@@ -91,7 +90,7 @@ def test_verdict_and_map_come_first_and_how_it_was_made_last():
 def test_every_cell_of_a_wide_table_names_its_column():
     """On a phone a row is a block, and the head of the table is gone."""
     wide = re.findall(r'<table class="cards">(.*?)</table>', page(), re.S)
-    assert len(wide) >= 4
+    assert len(wide) >= 3
     for table in wide:
         head, cells = re.findall(r"<th>([^<]*)</th>", table), re.findall(r'<td[^>]*data-name="([^"]*)"', table)
         assert cells == head * (len(cells) // len(head))
@@ -103,12 +102,6 @@ def test_a_squared_height_is_shown_as_a_height():
     text = render(replace(small_result(), calibration=(squared,)), Heading("a", "b"))
     assert "height of anchor 5C0B above or below the tag</td>" in text
     assert ">0.30 m, below 0.50 m</td>" in text
-
-
-def test_figures_of_stages_have_words():
-    figures = {"keyframes": 186, "searched": 0, "used": 0, "alike": [1.0, 1.5], "shift": [1, 2], "converged": True}
-    text = render(replace(small_result(), stages=(StageSummary("keyframes", 0.0, figures),)), Heading("a", "b"))
-    assert ">keyframes 186</td>" in text
 
 
 def test_marked_ranges_are_those_that_disagree():

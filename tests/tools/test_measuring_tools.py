@@ -19,7 +19,7 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.mapping_config import preset
 
-SHORT = Settings(world="room", seed=3, minutes=1.0, scan_rate=5.0)
+SHORT = Settings(world="room", seed=3, minutes=0.6, scan_rate=5.0)
 COARSE = ("grid.resolution=0.2",)
 
 

@@ -293,7 +293,6 @@ def exchanged_names(begin: float, at: float, end: float, what: str, anchors: Seq
 def wheels_against_ranges(begin: float, at: float, end: float, what: str, value: float) -> Finding:
     """Warn of wheels that the ranges to the anchors contradict, more than clocks, names and moved anchors would explain."""
     text = {
-        "ways": f"from t = {begin:.0f} to {end:.0f} s the wheels count {value:.2f} times the way that they count otherwise",
         "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
         "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
         "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
@@ -345,13 +344,19 @@ def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "
 
 
 @_rule
-def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]]) -> Finding:
-    """Doubt a recording whose wheels and lidar measure different motions for long, one factor for all taken out."""
-    text = (
-        f"wheels and lidar measure different motions ({spans([(a - start, b - start) for a, b in stretches])}): one of the two "
-        "is stuck, slips or has another scale there than elsewhere; cut that part off, or drive it again"
-    )
-    return Finding("wheels-against-lidar", DOUBT, text, stretches=tuple(stretches))
+def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]], slips: bool) -> Finding:
+    """Doubt a recording whose wheels and lidar measure different motions for long; warn where the wheels slip for a time.
+
+    One factor for all motions is taken out before.
+    """
+    when = spans([(a - start, b - start) for a, b in stretches])
+    text = f"the wheels count more motion than the lidar measures ({when}): they slip there, and the map follows the lidar"
+    if not slips:
+        text = (
+            f"wheels and lidar measure different motions ({when}): one of the two is stuck, slips or has another scale there "
+            "than elsewhere; cut that part off, or drive it again"
+        )
+    return Finding("wheels-against-lidar", WARNING if slips else DOUBT, text, stretches=tuple(stretches))
 
 
 @_rule

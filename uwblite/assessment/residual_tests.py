@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
@@ -30,8 +31,8 @@ NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
 _JUMP, _CARRIED = 20.0, 0.5
 """Standard deviations that a step of wheels on the floor never exceeds; and the size, m or rad, too large for slip."""
-_MEASURED = 0.15
-"""Steps more uncertain than that, m, are no measurements."""
+_MEASURED = 1.0
+"""Steps more uncertain than wheels that slip, m, are no measurements."""
 _SCALE = 0.15
 """Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
 
@@ -121,26 +122,27 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
             )
             yield doubt("loose-links", text, at=at.tolist())
         return
-    whitened = wheels.residuals(estimate.graph)
-    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED
-    far = np.flatnonzero(measured & (np.abs(whitened).max(axis=1, initial=0.0) > _JUMP))
-    if estimate.placed.any() and len(far):
+    whitened, noise = wheels.residuals(estimate.graph), 1.0 / wheels.sqrt_information[:, 0, 0]
+    if not len(noise) or not estimate.placed.any():
+        return
+    # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
+    off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
+    # Wheels that slip count too much; a robot that moved farther than they count was carried, or all anchors were.
+    moved, counted = se2.between(estimate.graph.poses[wheels.i], estimate.graph.poses[wheels.j]), wheels.corrected(estimate.graph)
+    carried = np.hypot(moved[:, 0], moved[:, 1]) > np.hypot(counted[:, 0], counted[:, 1]) + _CARRIED
+    far = np.flatnonzero(np.where(noise < _MEASURED, off > _JUMP, carried))
+    if len(far):
         yield _slips(far, whitened, wheels, recordings)
-
-
-def _error_of(wheels: OdometryEdges, at: Ints, whitened: Floats) -> tuple[Floats, Floats]:
-    """Return way (s,), m, and turn (s,), rad, by which steps (s,) of the odometry are off."""
-    off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
-    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
 
 
 def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Recordings) -> Finding:
     """Return the finding on single steps (s,) that are far off by the ranges, where no scans tie their sides."""
     when = listed([seconds(recordings, k) for k in wheels.i[at].tolist()])
-    way, turn = (float(values.max()) for values in _error_of(wheels, at, whitened))
+    off = np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information[at]), whitened[at])
+    way, turn = float(np.hypot(off[:, 0], off[:, 1]).max()), float(np.abs(off[:, 2]).max())
     text = (
         f"at t = {when} s the ranges contradict the odometry by up to {way:.2f} m and {turn:.2f} rad: the wheels slipped or "
-        "were stuck, or the robot was carried"
+        "were stuck, or the robot or all anchors were carried"
     )
     add = doubt if max(way, turn) > _CARRIED else warning
     spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConfigError, FormatError, UsageError
-from ..evaluation.map import (
-    LandmarkErrors,
-    Landmarks,
-    find_columns,
-    landmark_errors,
-    landmark_errors_along,
-)
+from ..evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
 from ..evaluation.relations import FAR, RelationErrors, Relations, evaluate_relations
 from ..evaluation.trajectory import (
     AnchorErrors,

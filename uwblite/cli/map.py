@@ -174,6 +174,7 @@ _SHARES = {
     "joint refinement": (0.11, 0.0),
     "matched once more": (0.01, 0.0),
     "surfaces": (0.05, 0.0),
+    "scans between keyframes": (0.07, 0.0),
     "map consistency": (0.01, 0.0),
     "landmark distances": (0.01, 0.01),
     "occupancy grid": (0.05, 0.01),

@@ -73,6 +73,8 @@ class Backlog:
 
     def deadline(self) -> float | None:
         """Return the time at which events that wait need not do so any longer, s."""
+        if not self._waiting:
+            return None
         latest_first = reversed(self._waiting[-MEMORY:])
         frames = list(islice(((held.event.stamp, held.spacing) for held in latest_first if held.spacing is not None), FAST))
         if not frames:

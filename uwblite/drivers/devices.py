@@ -288,15 +288,7 @@ _ROWS = (
         talks=True,
         silent="the lidar is silent: its motor must turn, and its PWM wire must lie on ground or hang free",
     ),
-    DeviceKind(
-        "ydlidar-x2",
-        "lidar",
-        "YDLIDAR X2",
-        lambda *_: YdLidarX2Driver(),
-        YdLidarX2Driver.baud,
-        CP2102,
-        talks=True,
-    ),
+    DeviceKind("ydlidar-x2", "lidar", "YDLIDAR X2", lambda *_: YdLidarX2Driver(), YdLidarX2Driver.baud, CP2102, talks=True),
     DeviceKind("ydlidar-x4", "lidar", "YDLIDAR X4", lambda *_: YdLidarX4Driver(), YdLidarX4Driver.baud, CP2102),
     DeviceKind(
         "rplidar",

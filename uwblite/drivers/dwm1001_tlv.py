@@ -111,13 +111,7 @@ class Value:
 
 Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Corrupt
 
-_VALUES = {
-    0x4D: (2, "pan_id"),
-    0x4E: (8, "node_id"),
-    0x50: (4, "firmware"),
-    0x51: (4, "configuration"),
-    0x52: (4, "hardware"),
-}
+_VALUES = {0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware")}
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
 _HEAD_AS_STATUS = 0x0140
 """``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""

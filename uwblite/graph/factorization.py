@@ -5,7 +5,7 @@ gathers the values with one indexing operation.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy import sparse
@@ -18,15 +18,6 @@ from .elimination import Ordering
 from .graph import POSE, WIDTHS
 from .schwarz_cg import Pieces, TwoLevelFactor
 from .work import ENTRIES, FACTORISATIONS, Work
-
-
-@dataclass(frozen=True, slots=True)
-class SuperLUPolicy:
-    """How SuperLU goes through a matrix."""
-
-    large: ClassVar[int] = 400_000
-    panel: ClassVar[int] = 8
-    """Entries from which on so many columns are updated together; one at a time below."""
 
 
 class Factor(Protocol):
@@ -48,10 +39,10 @@ def counted(factor: Factor, work: Work) -> Factor:
 
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
-    """Factorise without pivoting; panels of few columns suit factors as sparse as these (half the time of the default)."""
-    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.nnz < SuperLUPolicy.large else SuperLUPolicy.panel
+    """Factorise without pivoting; single columns suit factors as sparse as these (half the time of the default panels)."""
+    options = {"SymmetricMode": True, "Equil": False}
     try:
-        return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=panel, options=options)
+        return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
     except RuntimeError as problem:
         raise SolverError(f"{SINGULAR} ({problem})") from None
 

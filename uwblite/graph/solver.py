@@ -194,7 +194,6 @@ class _Descent:
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
         self.robust = any(edges.kernel.name != "none" for edges in graph.edges)
-        self.to_come = as_much_again if self.robust else extrapolated
 
     def prepare(self) -> str:
         """Bring the normal equations to the estimate; return why the search ends here, "" where it goes on."""
@@ -242,7 +241,9 @@ class _Descent:
         """Continue from the trial, with less damping; return whether the remaining decrease is negligible."""
         graph, linearized, chi2 = trial
         decrease = self.chi2 - chi2
-        over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= DescentPolicy.free
+        # The reweighting of a robust kernel halves the remaining decrease with every step, at best.
+        to_come = extrapolated(decrease, np.inf if self.robust else self.last_decrease, promised)
+        over = to_come <= negligible and self.damping <= DescentPolicy.free
         self.decreases = [*self.decreases[1 - DescentPolicy.patience :], decrease]
         over = over or (len(self.decreases) == DescentPolicy.patience and sum(self.decreases) <= negligible)
         near = not reused and decrease <= DescentPolicy.near * self.chi2 and self.damping <= DescentPolicy.nearly_free
@@ -304,7 +305,7 @@ def _linearized(graph: Graph) -> _Trial:
 
 def extrapolated(decrease: float, last: float, promised: float) -> float:
     """Return the sum of the geometric series that the last two decreases begin, where the steps reach their predicted
-    decrease."""
+    decrease; else, and behind the first, as much again."""
     if not np.isfinite(last) or decrease < DescentPolicy.quadratic * promised:
         return max(decrease, promised)
     return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
@@ -313,11 +314,6 @@ def extrapolated(decrease: float, last: float, promised: float) -> float:
 def relaxed(ratio: float) -> float:
     """Return the factor of lambda after a step that decreased the cost by this ratio of the predicted decrease."""
     return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-
-
-def as_much_again(decrease: float, last: float, promised: float) -> float:
-    """Return the remaining decrease if every step halves it, as a robust kernel's reweighting does at best."""
-    return max(decrease, promised)
 
 
 class Optimizer:

@@ -64,8 +64,5 @@ def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Flo
         unit = ray[near] / np.maximum(distance[near], np.finfo(np.float64).tiny)[:, None]
         # A column seen from one side is hardly measured across the line of sight: the initial value fixes it there.
         normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
-        step = np.linalg.solve(normal, (weight * residual[near]) @ unit)
-        centre = centre + step
-        if np.hypot(*step) < 1e-5:
-            break
+        centre = centre + np.linalg.solve(normal, (weight * residual[near]) @ unit)
     return centre

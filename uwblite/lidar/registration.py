@@ -125,7 +125,7 @@ class Placed(Table):
 
         A direction whose own optimum lies beyond what holds for linear surfaces was not measured: the prior placed it.
         """
-        step, root = nondegenerate_step(self.factors)
+        step, root = nondegenerate_step(*self.factors.quadratic)
         along = np.einsum("eij,ej->ei", root, step)
         root = np.where((np.abs(along) <= RegistrationConfig.linear * np.linalg.norm(root, axis=2))[:, :, None], root, 0.0)
         z = self.pose + np.einsum("eij,ejk,ek->ei", np.linalg.pinv(root, rcond=SINGULAR), root, step)
@@ -274,17 +274,17 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
     pose, gate, temper, left = start.copy(), c.reach, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
         factors = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)[0]
-        matches, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
+        matches, step = measured_part(*factors.quadratic)
         pull = np.einsum("eij,ej->ei", information[left], _difference(pose[left], prior.mean[left]))
-        step = -limited(_solved(matches / scale + information[left], gradient / scale + pull))
+        matches /= scale
+        step = limited(_solved(matches + information[left], np.einsum("eij,ej->ei", matches, step) - pull))
         pose[left] += step
         if gate <= c.gate and temper < RegistrationConfig.cold:
             left = left[np.abs(step).max(axis=1) >= c.converged]
         gate, temper = max(gate * c.shrink, c.gate), temper * RegistrationConfig.cooling
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     factors, likelihood, most = objects.match(pairs, pose, c.gate)
-    matches = measured_part(factors.hessian, factors.spurious, factors.gradient)[0] / scale
-    return Placed(pose, factors, matches, likelihood, most)
+    return Placed(pose, factors, measured_part(*factors.quadratic)[0] / scale, likelihood, most)
 
 
 def of_fallible(log_odds: Floats, wrong: float) -> Floats:

@@ -97,6 +97,11 @@ class PairFactors(Table):
     """(e,) sum of w."""
 
     @property
+    def quadratic(self) -> tuple[Floats, Floats, Floats]:
+        """Hessian, the spurious part of it, and gradient."""
+        return self.hessian, self.spurious, self.gradient
+
+    @property
     def share(self) -> Floats:
         """(e,) share of the points looked up that match, 0..1."""
         return self.matched / np.maximum(self.asked, 1)
@@ -257,35 +262,29 @@ def _inverse(lower: Floats) -> Floats:
     return inverse
 
 
-def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Return information (..., 3, 3) and gradient (..., 3) without the part that the scatter of the normals may have added: a
-    direction keeps its Gauss-Newton step with the share 1 - m / l of its information, none where l is below the multiple m."""
+def nondegenerate_step(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with L^T L the
+    information in those directions, unscaled by noise: of each the share 1 - m / l, with the multiple m of scatter alone."""
     basis, inverse, values = _relative_eigen(information, spurious)
-    kept = np.maximum(1.0 - PairPolicy.measured / np.maximum(values, _LEAST), 0.0)
-    share = (basis * kept[..., None, :]) @ inverse
-    return share @ information, (share @ gradient[..., None])[..., 0]
-
-
-def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
-    """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
-    L^T L the information in those directions, see measured_part (unscaled by noise)."""
-    basis, inverse, values = _relative_eigen(factors.hessian, factors.spurious)
     kept = np.maximum(values - PairPolicy.measured, 0.0)
     divisor = np.where(kept > 0.0, values, np.inf)
-    step = -np.einsum("eji,ej->ei", inverse, np.einsum("eij,ej->ei", inverse, factors.gradient) / divisor)
+    step = -np.einsum("eji,ej->ei", inverse, np.einsum("eij,ej->ei", inverse, gradient) / divisor)
     return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis, 1, 2)
 
 
-def _step(factors: PairFactors) -> Floats:
-    """Return the step of nondegenerate_step: where every direction was measured, as mostly, that of Gauss and Newton."""
-    step, spurious = np.empty_like(factors.gradient), _floored(factors.hessian, factors.spurious)
-    excess = factors.hessian - PairPolicy.measured * spurious
-    (a, b), c = excess[:, 0, :2].T, excess[:, 1, 1]
-    whole = (a > 0.0) & (a * c > b * b) & (np.linalg.det(excess) > 0.0)
-    step[whole] = -np.linalg.solve(factors.hessian[whole], factors.gradient[whole, :, None])[..., 0]
-    if not whole.all():
-        step[~whole] = nondegenerate_step(factors.rows(~whole))[0]
-    return step
+def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Return L^T L (e, 3, 3) and the step (e, 3) of nondegenerate_step: where all directions were measured, as mostly, H - m N
+    and the step of Gauss and Newton."""
+    part = information - PairPolicy.measured * _floored(information, spurious)
+    (a, b), c = part[:, 0, :2].T, part[:, 1, 1]
+    lacking = ~((a > 0.0) & (a * c > b * b) & (np.linalg.det(part) > 0.0))
+    if not lacking.any():
+        return part, np.asarray(-np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
+    step = np.empty_like(gradient)
+    step[~lacking] = -np.linalg.solve(information[~lacking], gradient[~lacking, :, None])[..., 0]
+    step[lacking], root = nondegenerate_step(information[lacking], spurious[lacking], gradient[lacking])
+    part[lacking] = np.swapaxes(root, 1, 2) @ root
+    return part, step
 
 
 def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -299,7 +298,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
     -------
     Z (e, 3) and sqrt_information (e, 3, 3) in the chart e = Z^-1 T; zero along what cannot be seen.
     """
-    step, root = nondegenerate_step(factors)
+    step, root = nondegenerate_step(*factors.quadratic)
     z = T_i_j + step
     z[:, 2] = se2.wrap_angle(z[:, 2])
     return z, root @ se2.rotation(z[:, 2]) / np.sqrt(variance)[:, None, None]
@@ -348,7 +347,7 @@ def align_pairs(
     finished: list[tuple[Ints, PairFactors]] = []
     for _ in range(iterations):
         factors = match(raster, pairs, pose[moving], gate, gate / 2.0)
-        step = _step(factors)
+        step = measured_part(*factors.quadratic)[1]
         length = np.abs(step).max(axis=1)
         pose[moving] += limited(step)
         left = (length >= c.converged) | (gate > last_gate)

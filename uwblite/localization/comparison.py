@@ -15,8 +15,8 @@ from .sensing import TRACK_RAYS
 from .walls import INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Rays
 from .window import Window
 
-LOOK_BACK, _SEARCH_LOOKS = 4.0, 2.5
-"""m driven; places are compared by the scans of the first distance, and the search makes one cloud of those of the second."""
+LOOK_BACK = 4.0
+"""m driven; the search makes one cloud of the scans of the last metres, and places are compared by them."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, in addition to the uncertainty by ranges."""
 _FLAT = 3.0
@@ -112,12 +112,11 @@ class PlaceSearch:
 
         In the bank of the comparison are the new places alone.
         """
-        recent = rays.rows(ago <= _SEARCH_LOOKS)
-        found = yield from search.places(self._field, recent, ranges, self._bounds)
+        found = yield from search.places(self._field, rays, ranges, self._bounds)
         parts = []
-        match = hypotheses.MATCHES * PER_FACTOR * min(len(recent.hit), TRACK_RAYS)
+        match = hypotheses.MATCHES * PER_FACTOR * min(len(rays.hit), TRACK_RAYS)
         for part in search.units(max(len(found.poses), 1), match):
-            parts.append(self._started(found.poses[part], ranges, recent))
+            parts.append(self._started(found.poses[part], ranges, rays))
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])
@@ -155,7 +154,7 @@ class PlaceSearch:
         hessian /= _FLAT if walls is None else 1.0
         covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
         effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
-        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, anchors.slow_sigma, effect)
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, effect)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
 
 

@@ -86,20 +86,18 @@ def none(anchors: int) -> Hypotheses:
     return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
-def started(
-    poses: Floats, covariances: Floats, biases: Floats, slow: float = SLOW_SIGMA, effect: Floats | None = None
-) -> Hypotheses:
+def started(poses: Floats, covariances: Floats, biases: Floats, effect: Floats | None = None) -> Hypotheses:
     """Return hypotheses at poses (h, 3) with covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
-    biases : (a,) standard deviations of each anchor's range error that stays, m. slow : of the one that fades, m.
+    biases : (a,) standard deviations of each anchor's range error that stays, m.
     effect : (h, 3, a) by how much the poses move with the error that the ranges to an anchor have in common.
     """
     n = FIRST_ANCHOR + 2 * len(biases)
     mean, whole = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
     mean[:, POSE], whole[:, POSE, POSE] = poses, covariances
-    prior = [*WHEEL_SIGMA, *np.full(2 * HARMONICS, PATTERN_SIGMA), LASER_SIGMA, *np.full(len(biases), slow), *biases]
+    prior = [*WHEEL_SIGMA, *np.full(2 * HARMONICS, PATTERN_SIGMA), LASER_SIGMA, *np.full(len(biases), SLOW_SIGMA), *biases]
     rest = np.arange(WHEELS.start, n)
     whole[:, rest, rest] = np.square(prior)
     if effect is not None:
@@ -109,11 +107,11 @@ def started(
     return Hypotheses(mean, whole, np.zeros(len(poses)))
 
 
-def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float = SLOW_SIGMA) -> Hypotheses:
+def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
     """Drive every hypothesis by one step (3,) of the odometry.
 
-    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance, with a
-    standard deviation of slow_sigma, m. Slack, m and rad, is that of motion that the wheels did not measure.
+    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance. Slack, m
+    and rad, is the standard deviation of motion that the wheels did not measure.
     """
     d, turn = step[:2], float(step[2])
     way = float(np.hypot(*d))
@@ -137,7 +135,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     noise[:2] = _WHEELS.distance**2 * way
     noise[2] = _WHEELS.heading_per_metre**2 * way + _WHEELS.heading_per_turn**2 * abs(turn)
     noise[POSE] += _STANDING**2 + slack**2
-    noise[slow] = slow_sigma**2 * (1.0 - fade**2)
+    noise[slow] = SLOW_SIGMA**2 * (1.0 - fade**2)
     covariance = f @ bank.covariance @ f.transpose(0, 2, 1)
     covariance[:, np.arange(n), np.arange(n)] += noise
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
@@ -149,9 +147,10 @@ def scan_factors(walls: Walls, poses: Floats, rays: Rays, width: float) -> tuple
     Along an aisle H is the scatter of the walls' normals, which is left out (lidar.degeneracy).
     """
     hessian, spurious, gradient, weight = walls.factors(poses, rays, width)
-    hessian, gradient = measured_part(hessian, spurious, gradient)
     share = np.minimum(INDEPENDENT / np.maximum(weight, 1.0), 1.0) / WALL_SIGMA**2
-    return hessian * share[:, None, None], gradient * share[:, None]
+    information, step = measured_part(hessian, spurious, gradient)
+    information *= share[:, None, None]
+    return information, -np.einsum("hij,hj->hi", information, step)
 
 
 def refined(poses: Floats, ranges: Ranges, walls: Walls | None = None, rays: Rays | None = None) -> Floats:

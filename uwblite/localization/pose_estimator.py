@@ -29,8 +29,8 @@ _FRESH_WAY = _UNFELT = 0.1
 motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _STILL = 1e-3
 """m; a robot that has driven less stands."""
-_LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
-"""Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
+_LEAST_FRESH = 0.02
+"""Least share of a scan that is new; those of a robot that stands repeat one another."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
@@ -107,13 +107,13 @@ class PoseEstimator:
 
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
-        self._bank = self._moved(step, 0.0)
+        self._bank = hypotheses.moved(self._bank, step)
         self.work += hypotheses.PER_MOVE * self._bank.covariance.size * self._bank.mean.shape[1]
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
         """Add unmeasured motion, a standard deviation in m and rad; measurements before and after it cannot be combined."""
-        self._bank = self._moved(_STANDS, sigma)
+        self._bank = hypotheses.moved(self._bank, _STANDS, sigma)
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
@@ -147,11 +147,11 @@ class PoseEstimator:
         if not len(self._bank):
             return
         driven, self._scan_way = self._way - self._scan_way, self._way
-        before, least = self._bank, _LEAST_FRESH if driven > _STILL else _STANDING_FRESH
-        self._bank, found = self._matched(before, walls, rays, some, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
+        before, fresh = self._bank, float(np.clip(driven / _FRESH_WAY, _LEAST_FRESH, 1.0))
+        self._bank, found = self._matched(before, walls, rays, some, fresh)
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
-            pushed, there = self._matched(self._moved(_STANDS, _UNFELT), walls, rays, some, 1.0)
+            pushed, there = self._matched(hypotheses.moved(self._bank, _STANDS, _UNFELT), walls, rays, some, 1.0)
             if there.odds[0] > max(0.0, found.odds[0] + verdict.CERTAIN / hypotheses.INDEPENDENT):
                 self.wander(_UNFELT)
                 self._bank, found = pushed, there
@@ -215,9 +215,6 @@ class PoseEstimator:
         pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance_at(bank.poses[best, :2])
         reason = verdict.vague(covariance) if self.tracks else self._reason
         return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
-
-    def _moved(self, step: Floats, slack: float) -> Hypotheses:
-        return hypotheses.moved(self._bank, step, slack, self.known.anchors.slow_sigma)
 
     def _matched(self, bank: Hypotheses, walls: Walls, rays: Rays, some: Rays, fresh: float) -> tuple[Hypotheses, Agreement]:
         """Return hypotheses corrected by a scan, and how some of its rays, turned as the laser is, agree with the map there."""

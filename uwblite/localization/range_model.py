@@ -20,9 +20,8 @@ DRIFT = 0.03
 """m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 ANYWHERE = 30.0
 """m over which ranges are distributed where the place is unknown: the reach of the radio indoors."""
-SLOW_SIGMA, SLOW_LEFT = 0.12, 0.08
-"""m; common error of ranges to one anchor that fades: multipath, antennas, the anchor's place; and what is left of it where the
-map contains the range error at a place."""
+SLOW_SIGMA = 0.1
+"""m; common error of ranges to one anchor that fades: multipath, antennas, the anchor's place."""
 BIAS_SIGMA = 0.1
 """m; error of all ranges to one anchor that stays, as CalibrationConfig.range_bias_sound: another tag has another delay."""
 _WILD, _WIDTH = 0.05, 2.0 * ANYWHERE
@@ -33,33 +32,24 @@ _NOISE = RangeNoiseConfig()
 """Of a map that does not state it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Detours:
-    """How ranges are late: share of those with a detour, 0..1, and its mean, m."""
-
-    share: float
-    mean: float
+_LATE, _DETOUR = 0.2, 0.5
+"""Share of ranges with a detour, and its mean, m: 6 to 46 % by 0.2 to 0.7 m in twelve drives, fewer where the errors of the
+map's own ranges at the place are taken off."""
 
 
-NEW_PLACE = Detours(0.3, 0.5)
-"""Where nothing is known of the place: 10 to 46 % of the ranges in twelve drives, by 0.2 to 0.7 m (means)."""
-VISITED = Detours(0.12, 0.4)
-"""Of ranges from which the map's own errors at the place are taken off: 6 to 18 % of them in the same drives."""
-
-
-def mixture(error: NDArray[Any], sigma: NDArray[Any], detours: Detours = NEW_PLACE) -> tuple[NDArray[Any], NDArray[Any]]:
+def mixture(error: NDArray[Any], sigma: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the densities (...) of errors with standard deviations (...), m: those without a detour, and all of them.
 
     The mixture of radio.nlos_mixture for thousands of poses, a normal error of 0 having the density 1. The normal distribution
     is that of Page, Applied Statistics 1977 (off by 2e-4).
     """
-    z, ratio = error / sigma, sigma / detours.mean
+    z, ratio = error / sigma, sigma / _DETOUR
     over = z - ratio
-    core = (1.0 - detours.share - _WILD) * np.exp(-0.5 * z * z)
+    core = (1.0 - _LATE - _WILD) * np.exp(-0.5 * z * z)
     longer = np.exp(np.minimum(ratio * (0.5 * ratio - z), _LARGEST))
     longer *= 1.0 + np.tanh(over * (_PAGE[0] + _PAGE[1] * over * over))
     weight = float(np.sqrt(2.0 * np.pi))
-    return core, core + (0.5 * weight * detours.share) * ratio * longer + (weight * _WILD / _WIDTH) * sigma
+    return core, core + (0.5 * weight * _LATE) * ratio * longer + (weight * _WILD / _WIDTH) * sigma
 
 
 _PAGE = (float(np.sqrt(2.0 / np.pi)), 0.0356774)
@@ -86,11 +76,6 @@ class KnownAnchors(Table):
     """Relative error of all ranges, 1."""
     errors: tuple[RangeErrors, ...] = ()
     """(a,) what remains, by the tag's place; empty where the map does not say it."""
-
-    @property
-    def slow_sigma(self) -> float:
-        """Standard deviation of further common error of ranges to one anchor, m."""
-        return SLOW_LEFT if self.errors else SLOW_SIGMA
 
     @property
     def noise(self) -> Floats:
@@ -216,7 +201,7 @@ def _drawn(
     dy = s * x + c * y + (poses[:, 1:2] - ranges.places[:, 1])
     error = ranges.values - np.sqrt(dx * dx + dy * dy) - (0.0 if expected is None else expected)
     single, sigma = error.astype(np.float32), (ranges.sigma + wider).astype(np.float32)
-    return single, mixture(single, sigma, NEW_PLACE if expected is None else VISITED)[1]
+    return single, mixture(single, sigma)[1]
 
 
 def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:

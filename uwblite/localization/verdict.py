@@ -11,21 +11,17 @@ import numpy as np
 
 from ..arrays import Floats
 from . import hypotheses
-from .hypotheses import Hypotheses
+from .hypotheses import SAME, Hypotheses
 from .range_model import Ranges, range_errors, range_likelihood, series, shared_likelihood
 from .walls import Rays, Walls
 
 CERTAIN, LIKELY = (float(np.log(odds)) for odds in (400.0, 20.0))
 """Log-likelihoods of a certain place, and of a likely one."""
-_FOUND = (0.25, 0.1)
-"""m and rad; a pose that is less certain is not found yet."""
-_VAGUE = (0.4, 0.25)
-"""m and rad; a pose that has become less certain is within half a metre by less than 4 : 1, and counts as lost."""
+_FOUND, _VAGUE = 2.0, 1.25
+"""Standard deviations that a pose must be known to within one place (hypotheses.SAME) to be found, and not to be lost again: by
+more than 20 : 1, and by 4 : 1."""
 _RANGE_ELSEWHERE = -1.35
 """Log-likelihood of an independent range at the best place of a building that is not the map's."""
-_ALONE = 0.8
-"""Least share of ranges that agree where they are alone: 0.9 to 1 in the right place, 0.75 to 0.8 with anchors of another
-building."""
 FEW_ENDS, FEW_BESIDE = 12, 4
 """Least number of rays' ends in known space for a scan to count; the second beside ranges to three anchors."""
 _ENOUGH_RANGES = 6
@@ -49,14 +45,14 @@ def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
 def imprecise(covariance: Floats) -> str:
     """Return why the only place is not found yet, by its covariance (3, 3), m and rad; "" = it is known well enough."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = sigma[:2].max() <= _FOUND[0] and sigma[2] <= _FOUND[1]
+    known = _FOUND * sigma[:2].max() <= SAME[0] and _FOUND * sigma[2] <= SAME[1]
     return "" if known else "place or heading is not sure yet; drive on"
 
 
 def vague(covariance: Floats) -> str:
     """Return why a pose that is tracked is not known, by its covariance (3, 3), m and rad; "" = it is known."""
     place, heading = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
-    if place <= _VAGUE[0] and heading <= _VAGUE[1]:
+    if _VAGUE * place <= SAME[0] and _VAGUE * heading <= SAME[1]:
         return ""
     return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
 
@@ -78,19 +74,17 @@ class Odds:
     ranges: float
     share: float
     """Of the ranges that agree, 0..1."""
-    enough: bool
-    """There are ranges to two anchors that decide alone."""
     alone: bool
     """There are scans or ranges alone."""
     agreed: float
-    """m driven over which all searches found it and no other place. In another building the best place leaps: each counts
-    LIKELY, and by scans or ranges alone, with nothing independent beside them, it is all that counts."""
+    """m driven over which all searches found it and no other place: in another building the best place leaps. Each counts
+    LIKELY; by scans or ranges alone, with nothing independent beside them, it is all that counts, up to twice what they say."""
 
     @property
     def total(self) -> float:
         """Of all together."""
-        measured = self.scans + self.ranges
-        return LIKELY * self.agreed + (min(measured, 0.0) if self.alone else measured)
+        measured, stays = self.scans + self.ranges, LIKELY * self.agreed
+        return min(stays, 2.0 * measured) if self.alone else stays + measured
 
     @property
     def nowhere(self) -> str:
@@ -98,9 +92,8 @@ class Odds:
 
         What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike.
         """
-        blind = self.alone and self.enough and self.share < _ALONE
         against = self.total < 0.0 or min(self.scans, self.ranges) < -CERTAIN
-        if blind or (against and self.ranges < self.scans):
+        if against and self.ranges < self.scans:
             return f"the ranges fit the anchors nowhere (best place: {self.share:.0%} of them); is this the right map?"
         return "the scans fit the walls nowhere well; is this the right map?" if against else ""
 
@@ -115,8 +108,8 @@ def map_odds(scans: float, ends: float, pose: Floats, ranges: Ranges, agreed: fl
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= SURE * ranges.sigma
     anchors, sees = len(np.unique(ranges.anchor[agree])), ends >= FEW_ENDS
     likelihood = float(shared_likelihood(pose[None], ranges)[0]) - _RANGE_ELSEWHERE * float(series(ranges).share.sum())
-    share, enough = float(agree.sum()) / max(len(ranges), 1), anchors >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
-    return Odds(scans if sees else 0.0, likelihood, share, enough, not (sees and anchors >= 2), agreed)
+    share = float(agree.sum()) / max(len(ranges), 1)
+    return Odds(scans if sees else 0.0, likelihood, share, not (sees and anchors >= 2), agreed)
 
 
 def other_unit(walls: Walls | None, pose: Floats, rays: Rays, independent: float, ranges: Ranges) -> str:

@@ -17,6 +17,7 @@ from ..lidar.scan_matching import PairPolicy, align_pairs, measured, pairs_of
 from ..lidar.scan_to_scan import TrackingConfig
 from ..odometry import keyframes
 from ..odometry.slips import covariance_of
+from ..problem.alternatives import EvidencePolicy
 from ..problem.solution import rough, with_nonnegative_heights
 from ..radio.range_errors import without_pattern
 from . import keyframe_data
@@ -92,7 +93,7 @@ def solve_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
         # The analysis of other pairs of clouds cannot be used again, and it is large.
         optimizer = Optimizer()
         steady = before.solved(rough(task.config.solver))[0]
-        if evidence_against(with_range_noise(estimate, task.config), steady, task.config) <= 0.0:
+        if evidence_against(with_range_noise(estimate, task.config), steady, task.config) <= EvidencePolicy.positive:
             return _without_pattern(steady, task)
         estimate = _matched_once_more(estimate, shift, task)
         before = estimate

@@ -21,6 +21,7 @@ from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import slipped, with_slips
 from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
+from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
@@ -106,7 +107,7 @@ def _of_likelier_radio(estimate: Estimate, number: int, task: Task) -> Estimate:
     wide = _optimised(bootstrapped(estimate, number, task), task)
     if (missing := int(sound.placed.sum() - wide.placed.sum())) != 0:
         return sound if missing > 0 else wide
-    return wide if evidence_against(wide, sound, task.config) > 0.0 else sound
+    return wide if evidence_against(wide, sound, task.config) > EvidencePolicy.positive else sound
 
 
 def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:

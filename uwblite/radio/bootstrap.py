@@ -1,9 +1,14 @@
 """Starting values from nothing: attempts with several errors of the heading, the first of which agrees with the ranges."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ..arrays import runs_of
 from ..graph.graph import Calibration, Graph
+from ..odometry.slips import LASTS
+from ..problem.alternatives import EvidencePolicy
 from .bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
 from .trilateration import TrilaterationConfig
 
@@ -26,14 +31,54 @@ def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, s
     # Where it has a jump, it is completed only if nothing else agrees.
     first.run(torn=not others)
     if first.misfit() < config.agreement:
-        return first.estimate()
+        return of_likeliest_slips(first).estimate()
     heading, slipping = _likeliest_heading(first, others), list[Attempt]()
     while len(slipping) < config.slipping_starts and (not slipping or slipping[-1].slips.any()):
         # The wheels may have slipped in the first stretch as well.
         slipping.append(Attempt(graph, measured, config, search, [each.first for each in slipping]))
         slipping[-1].run()
     agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
-    return max([heading, *agreeing], key=Attempt.evidence).estimate()
+    return of_likeliest_slips(max([heading, *agreeing], key=Attempt.evidence)).estimate()
+
+
+def of_likeliest_slips(attempt: Attempt) -> Attempt:
+    """Return the attempt with the slips of greatest evidence.
+
+    Slips are tried at either end of bursts of ranges that are off, or in a row of those; each that there is may as well not be,
+    or be half its length earlier or later.
+    """
+    for _ in range(_SWEEPS):
+        before, times = attempt, np.append(0.0, np.cumsum(attempt.odometry.duration))
+        for first, last in attempt.bursts():
+            low = int(np.searchsorted(times, times[first] - _AROUND))
+            high = int(np.searchsorted(times, times[last] + _AROUND, "right"))
+            found = (attempt.slipping(low, high, forward=forward) for forward in (True, False))
+            attempt = _likeliest(attempt, (other.with_slips(other.slips) for other in found if other is not None))
+        for slip in runs_of(attempt.slips > 0.0):
+            attempt = _likeliest(attempt, _slipping_otherwise(attempt, *slip))
+        if attempt is before:
+            break
+    return attempt
+
+
+_SWEEPS, _AROUND = 3, 2.0 * LASTS
+"""Most rounds over all slips, and time before and after a burst in which a slip is sought, s."""
+
+
+def _likeliest(attempt: Attempt, others: Iterable[Attempt]) -> Attempt:
+    """Return the likeliest of other attempts where there is positive evidence for it in place of the present one."""
+    rival = max(others, key=Attempt.evidence, default=attempt)
+    return rival if rival.evidence() - attempt.evidence() > EvidencePolicy.positive else attempt
+
+
+def _slipping_otherwise(attempt: Attempt, first: int, last: int) -> Iterator[Attempt]:
+    """Yield the attempt without the slip over the steps first <= k < last, and with it half its length earlier and later."""
+    half = max((last - first) // 2, 1)
+    for begin, end in (first, first), (first - half, last - half), (first + half, last + half):
+        slips = attempt.slips.copy()
+        slips[first:last] = 0.0
+        slips[max(begin, 0) : end] = 1.0
+        yield attempt.with_slips(slips)
 
 
 def _likeliest_heading(first: Attempt, others: Sequence[Attempt]) -> Attempt:

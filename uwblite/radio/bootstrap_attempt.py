@@ -8,8 +8,9 @@ again and anchors not yet placed are searched from the poses so far.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -22,11 +23,11 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
-from ..odometry.slips import with_slips
+from ..odometry.slips import LASTS, with_slips
 from ..problem.alternatives import EvidencePolicy
 from .range_measurements import log_densities
 from .range_noise import RangeNoiseConfig, independent_shares
-from .slip_search import TagRanges, likeliest_slip, log_prior
+from .slip_search import TagRanges, bursts, likeliest_slip, log_prior
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
 
 
@@ -47,8 +48,7 @@ class BootstrapConfig:
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
     scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, 3.0)
-    first_scales: ClassVar[tuple[float, ...]] = (10.0, 3.0)
-    """Scales of the ranges' kernel, one after the other, standard deviations; and those of the first stretch."""
+    """Scales of the ranges' kernel, one after the other, standard deviations."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
@@ -143,7 +143,7 @@ class Attempt:
             self.first = self.low, self.high
             self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
             if self.placed.any():
-                self._solve(self.config.first_scales)
+                self._solve(self.config.scales[1:])
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
             held, failed = self.config.growth
             self.piece = held * self.piece if self._extend(self.piece) else max(failed * self.piece, self.smallest)
@@ -176,19 +176,29 @@ class Attempt:
     def evidence(self) -> float:
         """Return the logarithm of the likelihood of wheels and ranges with the prior of the slips found, but for a constant.
 
-        Of ranges the distribution of each anchor's errors is learnt, late and false ones included; neighbours are alike.
+        Of ranges the distribution of each anchor's errors is learnt, late and false ones included; neighbours are alike. So
+        false ranges to one anchor in a row count about once, those to several at a time once for each.
         """
         part, number = self._part(self.low, self.high), len(runs_of(self.slips > 0.0))
-        likely = independent = 0.0
-        for edges in part.edges:
-            if isinstance(edges, RangeEdges):
-                groups = [edges.anchor == anchor for anchor in np.unique(edges.anchor)]
-                shares = independent_shares(edges.tag_positions(part.poses), groups, RangeNoiseConfig())
-                independent = float(shares.sum())
-                likely += float(shares @ log_densities(edges, part, self.config.range_sigma)[0])
-            else:
-                likely -= 0.5 * edge_cost(edges, edges.residuals(part))
-        return likely + number * log_prior(0.0, independent / (number + 1))
+        likely = -0.5 * sum(edge_cost(e, e.residuals(part)) for e in part.edges if not isinstance(e, RangeEdges))
+        _, _, density, shares = self._errors(part)
+        slips = number * log_prior(0.0, float(shares.sum()) / (number + 1))
+        # How long slips last is exponentially distributed.
+        return likely + float(shares @ density) + slips - float(self.odometry.duration[self.slips > 0.0].sum()) / LASTS
+
+    def bursts(self) -> list[tuple[int, int]]:
+        """Return first and last pose of the stretches in which ranges to all anchors are as those from elsewhere would be."""
+        edges, errors, density, shares = self._errors(self._part(self.low, self.high))
+        return [(self.low + a, self.low + b) for a, b in bursts(edges.pose, errors, density, shares)]
+
+    def _errors(self, part: Graph) -> tuple[RangeEdges, Floats, Floats, Floats]:
+        """Return the ranges of a part, their errors (m,), m, the logarithm of the density (m,) of each, 1/m, and the share (m,)
+        of each that is independent of others."""
+        edges = next((e for e in part.edges if isinstance(e, RangeEdges)), self.ranges.rows(np.zeros(0, dtype=np.intp)))
+        groups = [edges.anchor == anchor for anchor in np.unique(edges.anchor)]
+        shares = independent_shares(edges.tag_positions(part.poses), groups, RangeNoiseConfig())
+        density, learnt = log_densities(edges, part, self.config.range_sigma)
+        return edges, -edges.residuals(part)[:, 0] * edges.sigma, density, shares * (learnt > 0.0)
 
     def misfit(self) -> float:
         """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
@@ -277,16 +287,16 @@ class Attempt:
             end, new = self.high - 1, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), end + 2)
             self.poses[end : self.high] = se2.chain(self.poses[end], motion[end : self.high - 1])
-            agreed = self._fits(end, self.high, end, piece, motion)
+            agreed = self._fits(end, self.high, end, piece)
         if self.low > 0:
             end, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, end - 1)
             back = se2.inverse(motion[self.low : end])[::-1]
             self.poses[self.low : end + 1] = se2.chain(self.poses[end], back)[::-1]
-            agreed = self._fits(self.low, end + 1, end, piece, motion) and agreed
+            agreed = self._fits(self.low, end + 1, end, piece) and agreed
         return agreed
 
-    def _fits(self, low: int, high: int, end: int, piece: float, motion: Floats) -> bool:
+    def _fits(self, low: int, high: int, end: int, piece: float) -> bool:
         """Return whether ranges from appended poses, beside a known one at an end of [low, high), agree with the prediction.
 
         Where they do not, the poses are optimised, and a slip is sought in them and as far again in what is known,
@@ -304,18 +314,24 @@ class Attempt:
             known = int(np.searchsorted(self.path, self.path[end] + piece, "right"))
             high = min(known, int(slips[slips > end].min(initial=self.high)))
         if self.seeks:
-            self._with_slip(low, high, motion, forward=forward)
+            self._with_slip(low, high, forward=forward)
         return False
 
-    def _with_slip(self, low: int, high: int, motion: Floats, *, forward: bool) -> None:
-        """Let the wheels slip once in [low, high), where all is much likelier then than with wheels that are bent; forward: the
-        pose at the lower end is known, not the other one."""
-        rows, duration = self.ranges.rows(self._rows(low, high, self.placed)), self.odometry.duration[low : high - 1]
-        prior, bent = log_prior(float(duration.sum()), len(rows)), self._cost(low, high)
+    def _with_slip(self, low: int, high: int, *, forward: bool) -> None:
+        """Let the wheels slip once in [low, high), where all is much likelier then than with wheels that are bent."""
+        count, duration = len(self._rows(low, high, self.placed)), float(self.odometry.duration[low : high - 1].sum())
+        prior, bent = log_prior(duration, count), self._cost(low, high)
         # Half the chi2 of a sound range is a half.
-        if bent - 0.5 * len(rows) + prior < EvidencePolicy.positive:
-            return
-        arm = rows.tag_positions(np.zeros_like(self.poses))
+        hopeful = bent - 0.5 * count + prior >= EvidencePolicy.positive
+        other = self.slipping(low, high, forward=forward) if hopeful else None
+        if other is not None and bent - other._cost(low, high) + prior >= EvidencePolicy.positive:
+            self.poses, self.slips, self.wheels = other.poses, other.slips, other.wheels
+
+    def slipping(self, low: int, high: int, *, forward: bool) -> Self | None:
+        """Return the attempt with the likeliest slip of the wheels in [low, high), None where there is none; forward: the pose
+        at the lower end is known, not the other one."""
+        rows, duration, motion = self.ranges.rows(self._rows(low, high, self.placed)), self.odometry.duration, self._motion
+        arm, duration = rows.tag_positions(np.zeros_like(self.poses)), duration[low : high - 1]
         pose, steps, start = rows.pose - low, motion[low : high - 1], self.poses[low]
         if not forward:
             pose, steps, start = high - low - 1 - pose, se2.inverse(steps)[::-1], self.poses[high - 1]
@@ -323,15 +339,26 @@ class Attempt:
         seen = TagRanges(pose, arm, self.anchors[rows.anchor], rows.planar_ranges(), self.sigma[rows.anchor])
         found = likeliest_slip(se2.chain(start, steps), duration, seen)
         if found is None:
-            return
-        before = self.poses.copy(), self.slips.copy(), self.wheels
+            return None
         ends = (low + found.first, low + found.last) if forward else (high - 1 - found.last, high - 1 - found.first)
-        self.poses[low:high] = found.poses if forward else found.poses[::-1]
-        self.slips[slice(*ends)] = 1.0
-        self.wheels = with_slips(self.odometry, self.slips)
-        self._anneal(low, high, low if forward else high - 1, self.config.scales[1:])
-        if bent - self._cost(low, high) + prior < EvidencePolicy.positive:
-            self.poses, self.slips, self.wheels = before
+        other = self._copy()
+        other.poses[low:high] = found.poses if forward else found.poses[::-1]
+        other.slips[slice(*ends)] = 1.0
+        other.wheels = with_slips(self.odometry, other.slips)
+        other._anneal(low, high, low if forward else high - 1, self.config.scales[1:])
+        return other
+
+    def with_slips(self, slips: Floats) -> Self:
+        """Return the attempt solved with probabilities (e,) that the wheels slip over each step."""
+        other = self._copy()
+        other.slips, other.wheels = slips, with_slips(self.odometry, slips)
+        other._solve(self.config.scales[-1:])
+        return other
+
+    def _copy(self) -> Self:
+        other = copy(self)
+        other.poses, other.sigma, other.slips = self.poses.copy(), self.sigma.copy(), self.slips.copy()
+        return other
 
     def _cost(self, low: int, high: int) -> float:
         """Return half the robust chi2 of wheels and ranges over the poses [low, high), that of ranges as annealing ends."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, best_run
 from .place_evidence import Explanation, MovePolicy, PlaceModel, intervals_of, ways_of
 from .trilateration import AnchorHypothesis
 
@@ -82,7 +82,7 @@ class _Search:
             here, level, shares = int(best.place[own[0]]), self.track.level(best.height), self.model.worth(best.place)[own]
             for k in sorted(set(range(len(best.found))) - {here}):
                 stays, leaves = (shares * self.model.likely(level, best.found[n], own) for n in (here, k))
-                start, end = _best_run(leaves - stays)
+                start, end = best_run(leaves - stays)
                 place = best.place.copy()
                 place[own[start:end]] = k
                 better += self._better(best, place, best.found, self.model.worth(place))
@@ -166,10 +166,3 @@ def _times(one: Floats, other: Floats, carried: Floats, least: int) -> tuple[flo
     slowly = float(begun[left] - since[low + moment]) + rest - float(np.log(len(one)))
     at_once = float(begun[once] - since[low + once]) + rest
     return (slowly, (low + left, low + moment)) if slowly > at_once else (at_once, (low + once, low + once))
-
-
-def _best_run(gain: Floats) -> tuple[int, int]:
-    """Return begin and end of the run of greatest sum (Kadane)."""
-    sums = np.append(0.0, np.cumsum(gain))
-    end = int(np.argmax(sums - np.minimum.accumulate(sums)))
-    return int(np.argmin(sums[: end + 1])), end

@@ -10,9 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table
+from ..arrays import Floats, Ints, Table, best_run
 from ..graph.robust import Kernel
-from ..odometry.slips import EVERY, LASTS
+from ..odometry.slips import EVERY, LASTS, SPEED
+from ..problem.alternatives import EvidencePolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,8 @@ class SlipSearchPolicy:
     """Time between moments that are tried, in mean durations of a slip."""
     kernel: ClassVar[Kernel] = Kernel("geman-mcclure", 3.0)
     """Of ranges, in standard deviations."""
+    bursts: ClassVar[int] = 3
+    """Runs of ranges at a time at which a slip is tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +92,28 @@ def likeliest_slip(poses: Floats, duration: Floats, ranges: TagRanges) -> Slip |
         if cost[k] < best:
             best, slip = float(cost[k]), Slip(first, last, _displaced(poses, first, last, motions[k]))
     return slip
+
+
+def bursts(pose: Ints, errors: Floats, density: Floats, shares: Floats) -> list[tuple[int, int]]:
+    """Return first and last pose of each run of ranges, the likeliest first, that the tag elsewhere, by as much as slips
+    displace it, explains better than their errors.
+
+    Parameters
+    ----------
+    pose, errors : (m,) of each range, m. density : (m,) logarithm of the density of such an error, 1/m. shares : (m,) of each
+        range that is independent of others.
+    """
+    order, found, elsewhere = np.argsort(pose, kind="stable"), list[tuple[int, int]](), SPEED * LASTS
+    displaced = -0.5 * (errors / elsewhere) ** 2 - np.log(np.sqrt(2.0 * np.pi) * elsewhere)
+    gain, pose = (shares * (displaced - density))[order], pose[order]
+    apart = -float(np.abs(gain).sum())
+    while len(found) < SlipSearchPolicy.bursts:
+        first, last = best_run(gain)
+        if gain[first:last].sum() < EvidencePolicy.positive:
+            break
+        found.append((int(pose[first]), int(pose[last - 1])))
+        gain[first:last] = apart
+    return found
 
 
 def log_prior(duration: float, ranges: float) -> float:

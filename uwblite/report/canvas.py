@@ -87,8 +87,8 @@ _Place = NDArray[np.signedinteger]
 """(2,) column and row of a pixel."""
 _FINE = 3
 """Sub-pixels per pixel and axis: ink is laid on a finer grid and averaged, which smooths the edges."""
-_HALO = 0.85
-"""Opacity of the ground behind text."""
+STRONG = 0.85
+"""Opacity of lines, and of the ground behind text."""
 
 
 class Canvas:
@@ -133,7 +133,7 @@ class Canvas:
         """Write a line of text with its top left corner (2,) there, on a halo of another colour where one is given."""
         place, ink = np.rint(corner).astype(int) - scale, np.pad(text_mask(text, scale), scale)
         if halo is not None:
-            self._ink(binary_dilation(ink, np.ones((2 * scale + 1,) * 2)), place, halo, _HALO)
+            self._ink(binary_dilation(ink, np.ones((2 * scale + 1,) * 2)), place, halo, STRONG)
         self._ink(ink, place, colour, 1.0)
 
     def _dab(self, points: Floats, radius: float, colour: Colour, opacity: float) -> None:

@@ -14,8 +14,8 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import MapResult
 from .printable import anchor_line
 
-_MOST_REJECTED = 1500
-"""Rejected closures shown at most; accepted ones all are."""
+MOST_SHOWN = 1500
+"""Rejected closures, and residuals of one anchor, that are shown at most; accepted closures all are."""
 _SIGMAS = 2.0
 """Standard deviations of an ellipse's half axes."""
 _MOST_SPREAD = 2.0
@@ -128,7 +128,7 @@ def shown_closures(closures: Sequence[_Judged]) -> list[int]:
     """Return the places of all accepted closures, then those of a sample of the rejected ones."""
     accepted = np.array([c.accepted for c in closures], dtype=bool)
     rejected = np.flatnonzero(~accepted)
-    return np.append(np.flatnonzero(accepted), rejected[thin(len(rejected), _MOST_REJECTED)]).tolist()
+    return np.append(np.flatnonzero(accepted), rejected[thin(len(rejected), MOST_SHOWN)]).tolist()
 
 
 def ellipse(covariance: Floats | None) -> tuple[float, float, float] | None:

@@ -16,13 +16,11 @@ from ..arrays import Floats, Ints
 from ..findings import DOUBT, Finding, folded
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from .canvas import PATHS
-from .drawn_map import drawn_map, shown_closures, thin
+from .drawn_map import MOST_SHOWN, drawn_map, shown_closures, thin
 from .page import SCALED, ZOOM, document, key
 from .printable import duration, escape, sigma_text, sigmas, signed
 from .svg_map import map_svg
 
-_MOST_RESIDUALS = 1500
-"""Residuals of one anchor drawn at most."""
 _USUAL, _LEAST_LIMIT = 0.99, 0.1
 """Share of the residuals that agree which lies within half the scale of their plot, and the least scale, m."""
 _PLOT = 1000, 60
@@ -87,7 +85,6 @@ def render(result: MapResult, heading: Heading, grid_png: bytes | None = None) -
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
         _section("Loop closures", _closure_table(result)),
-        _section("Stages", _stage_table(result)),
         _section("Again", f"<div class=scroll><table class=facts>{table}</table></div>{again}"),
     )
     title = escape(heading.title)
@@ -236,26 +233,6 @@ def _closure_table(result: MapResult) -> str:
     return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
 
 
-def _stage_table(result: MapResult) -> str:
-    rows = []
-    for stage in result.stages:
-        values = {name: v for name, v in stage.figures.items() if isinstance(v, int | float) and not isinstance(v, bool) and v}
-        chi2, dof = values.pop("chi2", None), values.pop("dof", 0)
-        ratio = f"{chi2:.0f} / {dof} = {_number(chi2 / dof, 2)}" if chi2 is not None and dof else ""
-        shown = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in values.items())
-        if ratio or shown:
-            rows.append((stage.name, ratio, shown))
-    table = _table(("stage", "\u03c7\u00b2 / degrees of freedom", "figures"), rows, "")
-    return f"<details><summary>{len(rows)} stages</summary>{table}<p class=hint>{_ABOUT_STAGES}</p></details>"
-
-
-_ABOUT_STAGES = (
-    "Each line is what its stage did; later ones add keyframes and weigh anew. \u03c7\u00b2 below the degrees of freedom is"
-    " intended: ranges, and scans that are matched several times, have errors in common and are given less weight for it."
-    " Lengths are in metres; report.json has all figures, and the time of each stage."
-)
-
-
 def _residuals(result: MapResult) -> str:
     table = {name: np.asarray(values) for name, values in result.range_table.items()}
     several = len(np.unique(result.recording)) > 1
@@ -271,7 +248,7 @@ def _residuals(result: MapResult) -> str:
     for index, anchor in enumerate(result.anchors):
         rows = np.flatnonzero((table["anchor"] == index) & np.isfinite(table["residual"]))
         if len(rows):
-            parts.append(_residual_plot(escape(anchor.id), table, rows[thin(len(rows), _MOST_RESIDUALS)], ends))
+            parts.append(_residual_plot(escape(anchor.id), table, rows[thin(len(rows), MOST_SHOWN)], ends))
     return "".join(parts)
 
 

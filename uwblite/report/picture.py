@@ -11,7 +11,7 @@ from scipy.special import expit
 
 from ..arrays import Floats, Ints
 from ..grid.occupancy_grid import FREE, OccupancyGrid
-from .canvas import ACCEPTED, ANCHOR, DOUBTED, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, Colour, rgb
+from .canvas import ACCEPTED, ANCHOR, DOUBTED, HEIGHT, PATHS, PROPOSED, START, STRONG, WIDTH, Canvas, Colour, rgb
 from .drawn_map import DrawnAnchor, DrawnMap, ellipse, free_sides, name_box
 from .svg_map import round_length
 
@@ -24,25 +24,25 @@ SIZE = 1400
 """Pixels of the longer side of a picture, about."""
 _SMALLEST = 240
 """Pixels; the picture is at least this wide and high, so that the strip below has room."""
-_PAD, _GAP, _TICK = 16, 8, 6
-"""Pixels: the border of the strip below; between mark and text; of a tick, as half of a mark."""
-_ROW = 26
-"""Pixels of a row of the strip below."""
 _SCALE = 2
 """Pixels per pixel of the font; ticks have one."""
+_GAP, _TICK = 8, 6
+"""Pixels: between mark and text; of a tick, as half of a mark."""
+_PAD, _ROW = 2 * _GAP, _SCALE * HEIGHT + _GAP
+"""Pixels: the border of the strip below, and its rows."""
 _TICK_EVERY, _LONGEST_BAR = 130, 220
 """Pixels between ticks, about, and of the scale bar at most."""
-_AXIS = 34
+_AXIS = 2 * _PAD
 """Pixels of the axes at the origin."""
 _LONGEST_NAME = 16
 """Letters of an anchor's name."""
 _THIN, _THICK, _WIDE = 1.3, 2.2, 6.0
 """Pixels of lines: closures and ellipses, paths, doubted stretches."""
-_FAINT, _CLEAR, _STRONG = 0.15, 0.6, 0.85
-"""Opacities: areas, doubted stretches, lines."""
-_TRIANGLE = np.array([[0.0, -1.1], [0.95, 0.6], [-0.95, 0.6]])
+_FAINT, _CLEAR = 0.15, 0.6
+"""Opacities: areas, doubted stretches."""
 _TURN = np.linspace(0.0, 2.0 * np.pi, 73)
 """rad; corners of an ellipse."""
+_TRIANGLE = np.stack([np.sin(_TURN[:-1:24]), -np.cos(_TURN[:-1:24])], axis=1)
 
 _LEVELS = 250
 """Shades of a cell, by its probability; the middle one is that of a cell that nobody saw."""
@@ -116,7 +116,7 @@ def draw_map(drawn: DrawnMap, *, caption: str = "", size: int = SIZE, tint: Tint
         _paste(canvas.image, drawn.grid, low, scale, tint)
     _draw_axes(canvas, low, scale)
     closures = pixel(np.array([c.ends for c in drawn.closures if c.accepted]).reshape(-1, 2, 2))
-    canvas.lines(closures.reshape(-1, 4), _THIN, ACCEPTED, _STRONG)
+    canvas.lines(closures.reshape(-1, 4), _THIN, ACCEPTED, STRONG)
     for number, path in enumerate(drawn.paths):
         _draw_path(canvas, pixel(path), PATHS[number % len(PATHS)])
     for stretch in drawn.doubted:
@@ -217,7 +217,7 @@ def _draw_axes(canvas: Canvas, low: Floats, scale: float) -> None:
 
 def _draw_path(canvas: Canvas, path: Floats, colour: Colour) -> None:
     """Draw a path (n, 2), pixels, with a disc at its start and a ring at its end."""
-    canvas.polyline(path, _THICK, colour, _STRONG)
+    canvas.polyline(path, _THICK, colour, STRONG)
     for end, radius, ink in ((path[:1], _TICK + 1, FLOOR), (path[:1], _TICK, START), (path[-1:], _TICK + 1, colour)):
         canvas.discs(end, radius, ink)
     canvas.discs(path[-1:], _TICK / 2 + 1, FLOOR)
@@ -231,7 +231,7 @@ def _draw_anchor(canvas: Canvas, anchor: DrawnAnchor, side: str, pixel: Callable
         ahead, aside = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
         outline = pixel(anchor.position + np.outer(major * np.cos(_TURN), ahead) + np.outer(minor * np.sin(_TURN), aside))
         canvas.polygon(outline[:-1], colour, _FAINT)
-        canvas.polyline(outline, _THIN, colour, _STRONG)
+        canvas.polyline(outline, _THIN, colour, STRONG)
     place = pixel(anchor.position)
     canvas.polygon(place + 1.5 * _GAP * _TRIANGLE, FLOOR)
     canvas.polygon(place + _GAP * _TRIANGLE, colour)

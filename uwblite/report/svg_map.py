@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ..arrays import Floats
+from .canvas import PATHS
 from .drawn_map import DrawnAnchor, DrawnMap, ellipse, free_sides, shown_closures, thin
 from .printable import escape
 
@@ -28,12 +29,13 @@ def map_svg(drawn: DrawnMap, image: str = "") -> str:
     top, size = -float(box[1, 1]), max(width, height)
     parts = [_image(drawn, image)] if image and drawn.grid is not None else []
     parts += ["".join(_closures(drawn)), '<g class="trajectory">']
-    lines = [(f"path path{k % 4}", path) for k, path in enumerate(drawn.paths)]
+    lines = [(f"path path{k % len(PATHS)}", path) for k, path in enumerate(drawn.paths)]
     lines += [("doubted", path) for path in drawn.doubted]
     parts += [f'<polyline class="{name}" points="{_points(p[thin(len(p), _MOST_POINTS)])}"/>' for name, p in lines]
     for k, path in enumerate(drawn.paths):
         for name, place in (("start", path[:1]), ("end", path[-1:])):
-            parts += [f'<circle class="{name} path{k % 4}" {_at(p, "cx", "cy")}><title>{name}</title></circle>' for p in place]
+            mark = f'<circle class="{name} path{k % len(PATHS)}"'
+            parts += [f'{mark} {_at(p, "cx", "cy")}><title>{name}</title></circle>' for p in place]
     sides = free_sides(drawn, box, (_TEXT / _PHONE, _TEXT / DESK))
     marks = "".join(_anchor(k, anchor, sides[k]) for k, anchor in enumerate(drawn.anchors))
     bar, x, y = round_length(_BAR * size), left + _BELOW * size, top + height - _BELOW * size

@@ -1,7 +1,7 @@
 """What explains ranges that do not fit the path by the wheels: the wheels, the radio's clock, or the anchors' names.
 
 The ranges to an anchor are distances from the path to one place. Each row of the table changes what they are taken to: the
-times of the ranges, the names of the anchors, the path after a moment or over a stretch of the way. Each has prior odds, and
+times of the ranges, the names of the anchors, the path after a moment. Each has prior odds, and
 all are compared by one likelihood with the recording as it stands and with one another: what fits best is the cause, and a row
 that explains the same readings less well is none.
 
@@ -32,7 +32,7 @@ class PathPolicy:
     fault: ClassVar[float] = 1e-3
     """Probability of a clock that is off by seconds, of names exchanged and of one anchor moved at a given moment."""
     wheels: ClassVar[float] = 1e-2
-    """Of wheels that are wrong from a given moment on, or over a given stretch."""
+    """Of wheels that are wrong from a given moment on."""
     most_late: ClassVar[float] = 20.0
     """Largest offset of the clock, s; all up to it are equally probable, and compared in steps of a second.
 
@@ -101,14 +101,14 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     traces = _traces(log)
     if not traces:
         return log, []
-    (late, ways), moments = _over_stretches(log, traces), _at_moments(log, traces)
+    late, moments = _late(log, traces), _at_moments(log, traces)
     if late.log_odds > EvidencePolicy.very_strong and log.ranges is not None:
         in_time = replace(log, ranges=replace(log.ranges, stamps=log.ranges.stamps - late.figures["late"]))
         left = _at_moments(in_time, _traces(in_time))
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
             return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left), in_time)]
-    return log, _facts([ways, *_with_names_undone(log, moments)], log)
+    return log, _facts(_with_names_undone(log, moments), log)
 
 
 def _most(rows: Sequence[Explanation]) -> float:
@@ -163,49 +163,28 @@ def _traces(log: SensorLog) -> list[Trace]:
     return found
 
 
-def _over_stretches(log: SensorLog, traces: Sequence[Trace]) -> tuple[Explanation, Explanation]:
-    """Return a radio's clock that is off throughout, and wheels with another scale over a stretch."""
+def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
+    """Return a radio's clock that is off throughout; its rival are wheels with another scale throughout."""
     offsets, factors = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors
     count, length = len(factors), PathPolicy.stretch
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    sound = np.zeros((len(PathPolicy.noise), count + len(offsets), len(edges) - 1))
-    each = np.zeros((len(PathPolicy.noise), 0, len(offsets)))
-    for number, (begin, end) in enumerate(zip(edges[:-1] - 1e-9, edges[1:], strict=True)):
+    each = np.zeros((len(PathPolicy.noise), 0, count + len(offsets)))
+    for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
         for trace in (trace.between(begin, end) for trace in traces):
             if len(trace.ranges) < PathPolicy.fewest:
                 continue
             shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
             paths = np.concatenate([factors[:, None, None] * trace.places, shifted])
-            one = _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
-            sound[:, :, number] += one
-            each = np.concatenate([each, one[:, None, count:]], axis=1)
-    scaled, late = sound[:, :count], sound[:, count:].sum(axis=2)
-    usual, far = scaled.sum(axis=2), np.abs(offsets) > 1.5
+            each = np.concatenate([each, _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))[:, None]], axis=1)
+    usual, late = np.split(each.sum(axis=1), [count], axis=1)
+    far = np.abs(offsets) > 1.5
     null = float(max(usual.max(), late[:, ~far].max()))
     # Turns that are wrong throughout look like an offset in each stretch, each another one.
-    apart = float((each.max(axis=2) - np.log(len(offsets))).sum(axis=1).max(initial=-np.inf))
+    apart = float((each[:, :, count:].max(axis=2) - np.log(len(offsets))).sum(axis=1).max(initial=-np.inf))
     late = late[np.argmax(late.max(axis=1)), far]
     odds = float(np.logaddexp.reduce(late)) - np.log(len(late)) + np.log(PathPolicy.fault)
     by = float(np.average(offsets[far], weights=np.exp(late - late.max())))
-    clock = Explanation(odds - max(null, apart), "late-ranges", {"late": -by})
-    found = [(-np.inf, 0, 0, 0, 0)]
-    for now, other in np.ndindex(count, count):
-        gains = [_best_stretch(one[other] - one[now]) for one in scaled]
-        found += [(usual[g, now] + gain, now, other, a, b) for g, (gain, a, b) in enumerate(gains)]
-    odds, now, other, a, b = max(found)
-    costs = float(np.log(PathPolicy.wheels) - np.log(count * (len(edges) - 1)))
-    figures = {"what": "ways", "value": float(factors[now] / factors[other])}
-    end = min(float(edges[b]), float(log.odometry.travelled[-1]))
-    return clock, Explanation(odds - null + costs, "wheels-against-ranges", figures, float(edges[a]), end)
-
-
-def _best_stretch(gains: Floats) -> tuple[float, int, int]:
-    """Return the largest sum of successive gains (n,), with its first one and the one after its last (Kadane)."""
-    sums = np.concatenate([[0.0], np.cumsum(gains)])
-    least = np.minimum.accumulate(sums)
-    end = 1 + int(np.argmax(sums[1:] - least[:-1]))
-    begin = int(np.argmin(sums[:end]))
-    return float(sums[end] - sums[begin]), begin, end
+    return Explanation(odds - max(null, apart), "late-ranges", {"late": -by})
 
 
 def _at_moments(log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None) -> list[Explanation]:

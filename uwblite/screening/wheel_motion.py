@@ -255,17 +255,22 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     parts = slice(0, 2), slice(2, None)
     way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
-    bad = np.zeros(len(own.start), dtype=bool)
+    bad, more = np.zeros(len(own.start), dtype=bool), []
     for part, allowed in zip(parts, PairPolicy.allowed, strict=True):
-        off, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
-        bad |= off > allowed + PairPolicy.relative * np.maximum(*sizes)
+        differs, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
+        off = differs > allowed + PairPolicy.relative * np.maximum(*sizes)
+        along = np.sum((wheels - own.lidar)[:, part] * wheels[:, part], axis=1)
+        more.append(off & (along > 0.5 * differs * sizes[1]))
+        bad |= off
     if log is not None and bad.any():
         by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
         bad[bad] = by_wheels > PairPolicy.worse * by_lidar
     smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
-    runs = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs_of(smooth)]
-    stretches = [(a, b) for a, b in runs if b - a >= lasting]
-    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches)] if stretches else []
+    runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
+    # Wheels that spin count too much, until they grip again; late clocks give as much back as they take, or go on to the end.
+    slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
+    stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
+    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
 
 
 def unmatched(pairs: Pairs) -> list[Fact]:
