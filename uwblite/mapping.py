@@ -1,7 +1,7 @@
 """The algorithm on one page: from recordings to trajectories, anchors and map.
 
-``build_map`` goes through the stages of ``_stages`` as the paper does: keyframes and edges, first optimisation with
-odometry and ranges, sub-maps and loop closures, second optimisation with lidar edges, occupancy grid. Additions to the paper
+``build_map`` goes through the paper's stages: keyframes and edges, first optimisation with odometry and ranges, and those of
+``_stages``: sub-maps and loop closures, second optimisation with lidar edges; occupancy grid. Additions to the paper
 are the calibration in the same least squares, noise estimated from the data, scan-to-scan matching between neighbouring
 clouds and the joint refinement of all of them. Every stage takes one Estimate and returns one.
 """
@@ -52,7 +52,7 @@ def build_map(
     Parameters
     ----------
     logs : the recording, ranges or scans may be missing; or several with ranges to the same anchors, by whatever robots on
-        whatever days: they become one map in the frame of the first.
+        whatever days: they become one map, in the frame of the first unless constraints or `align` say otherwise.
     config : settings; None = defaults.
     constraints : what is known beforehand: surveyed anchors, pinned poses, an earlier map's anchors ...
     progress : called as progress(stage, done, total); returning False raises Cancelled.
@@ -69,9 +69,9 @@ def build_map(
     logs = [logs] if isinstance(logs, SensorLog) else logs
     check_distinct(logs)
     logs = [prepared(log, config) for log in logs]
-    config = calibration_checks.with_given_mounting_and_clock(calibration_checks.with_units_checked(config, logs), logs)
+    config = calibration_checks.without_known_calibration(calibration_checks.with_units_checked(config, logs), logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
-    estimate, task = _in_sound_units(task, logs)
+    estimate, task = _first_optimisation(task, logs)
     range_alternatives.check_heights(estimate, task)
     for stage in _stages(task):
         estimate = stage(estimate, task)
@@ -81,7 +81,7 @@ def build_map(
     return summary.summarise(estimate, covariance, grid, task)
 
 
-def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
+def _first_optimisation(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
     """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
     estimate, config = radio_stages.first_optimisation(task), task.config
     factors = calibration_checks.odometry_unit_factors(estimate, task)

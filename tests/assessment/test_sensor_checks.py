@@ -24,7 +24,7 @@ from uwblite.assessment.sensor_checks import (
     lidar_figures,
     odometry_figures,
     rhythm,
-    straightness,
+    width_by_length,
 )
 from uwblite.graph.graph import UnknownKey
 from uwblite.lidar.laser_mounting import Turning
@@ -80,13 +80,13 @@ def test_one_stamp_has_no_rhythm():
 def test_a_path_is_as_wide_as_its_principal_axes_are_long(turn):
     angle = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
     ellipse = np.column_stack([3.0 * np.cos(angle), 1.2 * np.sin(angle)])
-    assert straightness(se2.rotate(turn, ellipse)) == pytest.approx(0.4)
-    assert straightness(se2.rotate(turn, ellipse * [1.0, 0.0])) == pytest.approx(0.0, abs=1e-6)
+    assert width_by_length(se2.rotate(turn, ellipse)) == pytest.approx(0.4)
+    assert width_by_length(se2.rotate(turn, ellipse * [1.0, 0.0])) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_a_robot_that_stands_has_no_width(count):
-    assert straightness(np.ones((count, 2))) == 0.0
+    assert width_by_length(np.ones((count, 2))) == 0.0
 
 
 def driven(poses, rate):
@@ -119,8 +119,8 @@ def test_a_robot_that_moves_across_its_heading_is_named(swing, said):
 
 
 def test_three_places_have_a_width_and_two_have_none():
-    assert straightness(np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])) == pytest.approx(1.0)
-    assert straightness(np.array([[0.0, 0.0], [1.0, 3.0]])) == 0.0
+    assert width_by_length(np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])) == pytest.approx(1.0)
+    assert width_by_length(np.array([[0.0, 0.0], [1.0, 3.0]])) == 0.0
 
 
 def test_a_robot_that_never_moves_has_no_speed():

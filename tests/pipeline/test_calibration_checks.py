@@ -30,9 +30,9 @@ from uwblite.pipeline import calibration_checks
 from uwblite.pipeline.calibration_checks import (
     odometry_unit_factors,
     with_constant_turn_scales,
-    with_given_mounting_and_clock,
     with_slip_in_turns,
     with_units_checked,
+    without_known_calibration,
 )
 from uwblite.pipeline.estimate import Estimate, OtherHeights
 from uwblite.pipeline.mapping_config import MappingConfig
@@ -249,7 +249,7 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
 def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
     logs = [log_of(STANDING, MOMENTS, lidar=True, screening=Screening((), OdometryBreaks.none(), in_bursts=s)) for s in late]
     config = MappingConfig()
-    found = with_given_mounting_and_clock(config, logs)
+    found = without_known_calibration(config, logs)
     expected = replace(config.calibration, range_delay=radio, laser_delay=lidar)
     assert found == replace(config, calibration=expected)
 
@@ -259,7 +259,7 @@ def test_a_laser_whose_poses_the_log_gives_is_where_it_is_said_to_be(is_base, fi
     """None: a recording without lidar."""
     mountings = [SensorMounting(laser_is_base=bool(b)) for b in is_base]
     logs = [log_of(STANDING, MOMENTS, lidar=b is not None, mounting=m) for b, m in zip(is_base, mountings, strict=True)]
-    assert with_given_mounting_and_clock(MappingConfig(), logs).calibration.laser_offset == (0.0 if fixed else 0.1)
+    assert without_known_calibration(MappingConfig(), logs).calibration.laser_offset == (0.0 if fixed else 0.1)
 
 
 WALKED, PERIOD = 400, 0.3

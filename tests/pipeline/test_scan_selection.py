@@ -13,7 +13,7 @@ from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
-from uwblite.pipeline.calibration_checks import with_given_mounting_and_clock
+from uwblite.pipeline.calibration_checks import without_known_calibration
 from uwblite.pipeline.recordings import prepared, thinned
 from uwblite.sensor_log import Odometry, SensorLog
 
@@ -79,5 +79,5 @@ def test_no_offset_of_the_lidars_clock_where_the_format_excludes_one():
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))))
     bound = replace(log, notes=replace(log.notes, one_clock=True))
     config = MappingConfig()
-    assert with_given_mounting_and_clock(config, [bound, bound]).calibration.laser_delay == 0.0
-    assert with_given_mounting_and_clock(config, [bound, log]) == config
+    assert without_known_calibration(config, [bound, bound]).calibration.laser_delay == 0.0
+    assert without_known_calibration(config, [bound, log]) == config

@@ -103,13 +103,13 @@ def test_a_piece_is_laid_on_at_either_end_by_the_odometry(piece, low, high):
 def test_a_piece_that_the_ranges_contradict_is_optimised_from_its_first_pose():
     attempt, truth = along_a_line()
     attempt.poses[8:, 1] += 0.8
-    assert not attempt._fits(7, 12, 7, 4.0)
+    assert not attempt._agree_or_mend(7, 12, 7, 4.0)
     np.testing.assert_array_equal(attempt.poses[:8], truth[:8])
     assert np.abs(attempt.poses - truth)[:, :2].max() < 0.1
     near, _ = along_a_line()
     near.poses[8:, 1] += 0.1
     before = near.poses.copy()
-    assert near._fits(7, 12, 7, 4.0)
+    assert near._agree_or_mend(7, 12, 7, 4.0)
     np.testing.assert_array_equal(near.poses, before)
 
 
@@ -167,7 +167,7 @@ def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low
         calls.append((first, last, end))
         return answers[0 if end == high - 1 else 1]
 
-    attempt._fits = fits
+    attempt._agree_or_mend = fits
     agreed = attempt._extend(piece)
     further, asked = max(int(piece / 0.5), 1), []
     if high < 40:
@@ -191,7 +191,7 @@ def test_a_slip_is_sought_in_a_piece_that_disagrees_and_as_far_again_in_what_is_
     attempt.poses[slice(9, None) if end == 8 else slice(0, 3), 1] += 3.0
     attempt.slips[[] if slip is None else slip] = 1.0
     attempt._with_slip = lambda first, last, forward: sought.append((first, last, forward))
-    assert not attempt._fits(low, high, end, 3.0)
+    assert not attempt._agree_or_mend(low, high, end, 3.0)
     assert sought == [(*span, end == 8)]
 
 

@@ -26,7 +26,7 @@ class CheckPolicy:
     many: ClassVar[float] = 0.1
     """Share from which on it is a warning."""
     few: ClassVar[int] = 10
-    """Ranges from which an anchor cannot be placed."""
+    """Least number of ranges by which an anchor can be placed."""
     finest: ClassVar[float] = 1.5e-6
     """s; stamps are written no finer than 1e-6, which `record` puts between rows that came in one piece."""
     periods: ClassVar[float] = 5.0
@@ -103,7 +103,7 @@ def odometry_figures(odometry: Odometry) -> Figures:
         "path m": length.sum(),
         "turned rad": np.abs(steps[:, 2]).sum(),
         "speed m/s": np.median(length[moving] / span[moving]) if moving.any() else 0.0,
-        "width of the path by its length": straightness(odometry.poses[:, :2]),
+        "width of the path by its length": width_by_length(odometry.poses[:, :2]),
     }
     return rhythm(odometry.stamps, expected_gap=0.5) | {"heading": _rounded(agreement)} | _rounded(figures)
 
@@ -125,7 +125,7 @@ def check_odometry(odometry: Odometry, figures: Figures) -> Iterator[Finding]:
         yield Finding("slow-odometry", WARNING, text, cure, "odometry")
 
 
-def straightness(xy: Floats) -> float:
+def width_by_length(xy: Floats) -> float:
     """Return the width of the path by its length: ratio of the standard deviations along its principal axes."""
     small, large = np.linalg.eigvalsh(np.cov(xy.T)) if len(xy) > 2 else (0.0, 0.0)
     return float(np.sqrt(max(small, 0.0) / large)) if large > 0 else 0.0
@@ -154,7 +154,7 @@ def _repeats(ranges: UwbRanges) -> float:
 
 
 def _anchor_figures(stamps: Floats, values: Floats, travelled: Floats, where: Floats) -> Figures:
-    """Return the figures of the ranges (n,) to one anchor; where : (n, 2) m, of the robot."""
+    """Return the figures of the ranges (n,) to one anchor; where : (n, 2) m, of the robot, frame of the odometry."""
     usable, zeros, count = plausible(values), int(np.sum(np.abs(values) <= SHORTEST_RANGE)), len(values)
     counts: Figures = {"count": count, "zeros": zeros, "absurd": int(np.sum(~usable)) - zeros}
     if int(usable.sum()) < CheckPolicy.few:
@@ -165,7 +165,7 @@ def _anchor_figures(stamps: Floats, values: Floats, travelled: Floats, where: Fl
         "noise m": noise,
         "nearest m": values[usable].min(),
         "farthest m": values[usable].max(),
-        "width of the path by its length": straightness(where[usable]),
+        "width of the path by its length": width_by_length(where[usable]),
     }
     return counts | {"spikes": spikes} | _rounded(figures)
 

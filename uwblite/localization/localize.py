@@ -28,7 +28,7 @@ LEAST_OVERLAP = 0.4
 LEAST_LOCALIZED = 0.8
 """Share of the poses that must be known, and on which both passes must agree."""
 _SPACING = (0.1, 0.1, 1.0)
-"""m, rad and s between poses, and between the scans that are used: nearer ones are redundant."""
+"""m, rad and s that count as one step each, and add up; poses and the scans that are used are a step apart."""
 _CONTRADICTION = 1e-5
 """Probability of two passes that agree to be as far apart."""
 _DIGITS = 4
@@ -105,7 +105,7 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     rows = np.unique(np.append(_first_of_each(_way(log)), len(log.odometry.stamps) - 1))
     passes, doubts = _both(log, known, rows, progress), []
     if _lost(passes) and known.walls is not None and len(shared) >= 2:
-        doubts.append(_walls_differ(passes[0].reason))
+        doubts.append(_walls_differ(passes[0].reason, "; the position rests on the anchors alone"))
         passes = _both(log, replace(known, walls=None), rows, progress)
     if _lost(passes):
         raise DataError(f"the recording is found nowhere in the map for certain: {passes[0].reason}")
@@ -158,12 +158,9 @@ def _lost(passes: tuple[Pass, Pass]) -> bool:
     return not any(np.isfinite(p.poses).any() for p in passes)
 
 
-def _walls_differ(why: str) -> Finding:
-    return doubt(
-        "walls-differ",
-        f"the walls do not lie on those of the map ({why}): the place has changed, or it is another; the position rests on "
-        "the anchors alone",
-    )
+def _walls_differ(why: str, then: str = "") -> Finding:
+    text = f"the walls do not lie on those of the map ({why}): the place has changed, or it is another{then}"
+    return doubt("walls-differ", text)
 
 
 def _way(log: SensorLog) -> Floats:

@@ -100,7 +100,7 @@ class Ranges(Table):
     places: Floats
     """(m, 2) of the anchors, m."""
     tags: Floats
-    """(m, 2) of the tag, in the present frame of the base, m."""
+    """(m, 2) where the tag was at each range, in the present frame of the base, m: its arm and the way since."""
     values: Floats
     """Horizontal distances, m."""
     sigma: Floats

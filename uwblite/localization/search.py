@@ -39,8 +39,8 @@ _HEADINGS = 126
 _POINTS = 72
 """Points of the scans that are matched, no two in one square of that spread."""
 _MOST_NODES = 60_000
-"""Most nodes of a level that are expanded, and most places that are tried by ranges; where more are equally good, the search is
-given up: too little was measured."""
+"""Most nodes of a level that are expanded, and most squares, and poses, that are tried by ranges; where more are equally good,
+the search is given up: too little was measured."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
 _MOST_RIVALS = 4096

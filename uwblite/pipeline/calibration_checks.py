@@ -108,7 +108,7 @@ def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> Mapp
     return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
 
 
-def with_given_mounting_and_clock(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
+def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
     """Return the settings without the calibration values that the recordings fix.
 
     Against stamps of receipt in bursts no clock has an offset, nor where a format has one clock for all. Where the poses of a

@@ -113,10 +113,10 @@ def _present(constraints: Constraints, anchor_ids: tuple[str, ...]) -> Constrain
 def _fit(
     constraints: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
 ) -> tuple[Floats, dict[str, float]]:
-    """Return the rigid motion (3,) that aligns most known places, and the anchors that disagree with it."""
+    """Return T_new_old (3,) by the surest given pose, or else by the anchors that agree, and the movable ones that do not."""
     if constraints.poses:
-        first = min(constraints.poses, key=lambda p: p.sigma)
-        motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
+        surest = min(constraints.poses, key=lambda p: max(p.sigma))
+        motion = se2.compose(np.array(surest.pose), se2.inverse(graph.poses[clock.nearest(surest.stamp, surest.recording)]))
         return motion, _strayed(constraints, graph, index, placed, motion)
     anchors = [a for a in constraints.anchors if placed[index[a.id]]]
     estimated = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)

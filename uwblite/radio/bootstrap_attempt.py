@@ -281,22 +281,22 @@ class Attempt:
         self.placed[anchor] = True
 
     def _extend(self, piece: float) -> bool:
-        """Append one piece at each open end by calibrated odometry; return whether it agreed with the anchors unchanged."""
+        """Append a piece, m, at each open end by calibrated odometry, mended where ranges contradict; return whether none did."""
         motion, agreed = self._motion, True
         if self.high < len(self.path):
             end, new = self.high - 1, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), end + 2)
             self.poses[end : self.high] = se2.chain(self.poses[end], motion[end : self.high - 1])
-            agreed = self._fits(end, self.high, end, piece)
+            agreed = self._agree_or_mend(end, self.high, end, piece)
         if self.low > 0:
             end, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, end - 1)
             back = se2.inverse(motion[self.low : end])[::-1]
             self.poses[self.low : end + 1] = se2.chain(self.poses[end], back)[::-1]
-            agreed = self._fits(self.low, end + 1, end, piece) and agreed
+            agreed = self._agree_or_mend(self.low, end + 1, end, piece) and agreed
         return agreed
 
-    def _fits(self, low: int, high: int, end: int, piece: float) -> bool:
+    def _agree_or_mend(self, low: int, high: int, end: int, piece: float) -> bool:
         """Return whether ranges from appended poses, beside a known one at an end of [low, high), agree with the prediction.
 
         Where they do not, the poses are optimised, and a slip is sought in them and as far again in what is known,

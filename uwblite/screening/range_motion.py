@@ -33,7 +33,7 @@ class MotionPolicy:
     margin: ClassVar[float] = 0.5
     """Change, m, that a blocked line of sight explains."""
     sigmas: ClassVar[float] = 5.0
-    """Error that a median never has, in standard deviations of one reading."""
+    """Error that neither a median nor a leap of single readings has, in standard deviations of one reading."""
     votes: ClassVar[int] = 2
     """Anchors that must agree, where so many are in reach."""
     apart: ClassVar[float] = 10.0
