@@ -281,7 +281,7 @@ class Attempt:
         self.placed[anchor] = True
 
     def _extend(self, piece: float) -> bool:
-        """Append a piece, m, at each open end by calibrated odometry, mended where ranges contradict; return whether none did."""
+        """Append a piece, m, at each open end by odometry, mended where ranges contradict; return whether none did."""
         motion, agreed = self._motion, True
         if self.high < len(self.path):
             end, new = self.high - 1, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
