@@ -29,8 +29,6 @@ TINY = 1e-9
 """Length, m, or share below which a value is rounding error."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
-MEDIAN_TO_MEAN = 1.2533
-"""Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
 
 
 class Table:

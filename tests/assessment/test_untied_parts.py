@@ -95,12 +95,15 @@ ALL, ALONG = (100.0, 100.0, 300.0), (1.0, 100.0, 300.0)
 
 @pytest.mark.parametrize(("slipped", "across", "found"), [
     ((50,), [], [50]), ((50,), [(50, 51, ALONG)], [50]), ((50,), [(50, 51, ALL)], []), ((50,), [(48, 52, ALL)], []),
-    ((50,), [(45, 55, ALL)], []), ((50,), [(20, 80, ALONG)], [50]), ((50,), [(45, 58, ALONG), (46, 57, ALL)], []),
+    ((50,), [(45, 55, ALL)], [50]), ((50,), [(20, 80, ALONG)], [50]), ((50,), [(45, 58, ALONG), (20, 80, ALL)], []),
     ((30, 32), [], [30]), ((30, 70), [], [30, 70]), ((30, 70), [(20, 60, ALL)], [70]), ((30, 31), [(30, 32, ALL)], []),
-    ((2,), [], []), ((30, 96), [], [30]),
+    ((2,), [], []), ((30, 96), [], [30]), (tuple(range(30, 98)), [], [30]),
 ])  # fmt: skip
 def test_steps_in_which_the_wheels_slip_are_tied_by_scans_that_leave_no_direction_free(slipped, across, found):
-    """A keyframe that hangs on two such steps alone is no part, nor are a few at either end."""
+    """A keyframe that hangs on two such steps alone is no part, nor are a few at either end.
+
+    Clouds of one visit that are not neighbours were matched where the chain had put them: they tie nothing.
+    """
     wheels = chained(POSES, np.array([0.01, 0.01, 0.003]))
     wheels.motion[np.array(slipped), 0] += 2.0
     others = [scan_edge(k, k + 1) for k in range(99) if k not in slipped]

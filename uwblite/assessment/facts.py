@@ -48,14 +48,21 @@ def spans(stretches: Sequence[tuple[float, float]]) -> str:
     return ", ".join(words) + more
 
 
+def _recordings(numbers: Sequence[int]) -> str:
+    """Return the numbers of recordings as words."""
+    *others, last = (str(number) for number in numbers)
+    return f"recordings {', '.join(others)} and {last}" if others else f"recording {last}"
+
+
 class _Words(Formatter):
-    """Formats figures; beside Python's formats there are `times`, `spans`, `names` and `sectors` of lists, `factor` of what is
-    added to 1, and `yes|no` of a truth."""
+    """Formats figures; beside Python's formats there are `times`, `spans`, `names`, `recordings` and `sectors` of lists,
+    `factor` of what is added to 1, and `yes|no` of a truth."""
 
     FORMATS: ClassVar[Mapping[str, Callable[[Any], str]]] = {
         "times": lambda times: listed(times, 1),
         "spans": spans,
         "names": lambda names: " and ".join(map(str, names)),
+        "recordings": _recordings,
         "sectors": lambda parts: ", ".join(f"{a:.0f} to {b:.0f}" for a, b in parts[:3]) + " ..." * (len(parts) > 3),
         "factor": lambda value: f"{1.0 + value:.2f}",
     }
@@ -233,13 +240,13 @@ TEXTS: Mapping[str, Text] = {
     ),
     "new-anchor": Text(
         "Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges.",
-        "anchor {anchor} has ranges only from recording {recording} on: recording {silent:names} drove within its reach "
+        "anchor {anchor} has ranges only from recording {recording} on: {silent:recordings} drove within its reach "
         "without hearing it, so it is new or was off",
         anchor="{anchor}",
     ),
     "absent-anchor": Text(
         "Warn of an anchor to which recordings after the last with ranges (1, 2, ...) should have ranges.",
-        "anchor {anchor} has no ranges after recording {recording}: recording {silent:names} drove within its reach without "
+        "anchor {anchor} has no ranges after recording {recording}: {silent:recordings} drove within its reach without "
         "hearing it, so it was taken away or is off",
         anchor="{anchor}",
     ),

@@ -116,7 +116,7 @@ def _check_map(view: RecordingView) -> Iterator[Finding]:
         return
     yield from _check_sensors(view)
     for finding in [] if view.repaired is None else check_recording(view.repaired):
-        if finding.kind == WHEELS_AGAINST_LIDAR:
+        if finding.kind == WHEELS_AGAINST_LIDAR and finding.severity == DOUBT:
             cure = "a map is doubted for it, unless its ranges agree with the lidar there"
             yield replace(finding, severity=WARNING, cure=cure)
         elif finding.severity == DOUBT:

@@ -111,22 +111,22 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     lets one step absorb the errors of many, and the map looks as if the robot had been carried.
     """
     wheels, recordings = estimate.odometry, task.recordings
-    if recordings.have_scans:
-        at = recordings.stamps[wheels.i[untied_steps(estimate, recordings)]] - recordings.stamps[0]
-        if len(at):
-            text = (
-                f"at t = {listed(at.tolist())} s the odometry fails where the lidar cannot measure the travelled distance, as "
-                "along a bare wall, and neither loop closures nor ranges connect the parts before and after: they may be "
-                "misplaced to each other; drive through the first part once more"
-            )
-            yield doubt("loose-links", text, at=at.tolist())
-        return
+    lidar = np.array([r.has_scans for r in recordings.each])[recordings.of_keyframe[wheels.i]]
+    loose = untied_steps(estimate, recordings) if lidar.any() else np.flatnonzero(lidar)
+    if len(loose := loose[lidar[loose]]):
+        at = recordings.stamps[wheels.i[loose]] - recordings.stamps[0]
+        text = (
+            f"at t = {listed(at.tolist())} s the odometry fails where the lidar cannot measure the travelled distance, as "
+            "along a bare wall, and neither loop closures nor ranges connect the parts before and after: they may be misplaced "
+            "to each other; drive through the first part once more"
+        )
+        yield doubt("loose-links", text, at=at.tolist())
     whitened, noise = wheels.residuals(estimate.graph), 1.0 / wheels.sqrt_information[:, 0, 0]
     if not len(noise) or not estimate.placed.any():
         return
     # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
     off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
-    far = np.flatnonzero((noise < _MEASURED) & (off > _JUMP))
+    far = np.flatnonzero(~lidar & (noise < _MEASURED) & (off > _JUMP))
     if len(far):
         yield _slips(far, whitened, wheels, recordings)
 

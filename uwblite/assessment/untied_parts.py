@@ -14,9 +14,11 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..findings import Finding, doubt
+from ..graph.graph import Edges, Graph
 from ..graph.marginals import JointCovariance
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
+from ..loop_closure.chain_breaks import TiePolicy, fixing
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
 from ..sensor_log.sensors import radio_name
@@ -37,6 +39,8 @@ _MOST = 64
 _ANCHORS, _MEASURED = 2, 3
 """Least number of anchors that end or appear together, or by which more agree than do not; and of ranges to each of them, also
 of constrained keyframes at an end of a recording."""
+_ANOTHER_VISIT = 10.0
+"""Travelled distance between two visits, m."""
 _PER_METRE = 0.02
 """rad/m; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives straight
 on exceeds the limit below after 7 m."""
@@ -46,7 +50,7 @@ _ASTRAY = 0.5
 
 def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map whose parts only the odometry connects, where another sensor had no data in between."""
-    ranges = estimate.ranges
+    ranges, path = estimate.ranges, task.recordings.path
     alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
     yield from check_loose_ends(estimate, alive, task)
     for recording in task.recordings.each:
@@ -58,7 +62,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             sizes = first - recording.rows.start, recording.rows.stop - last
             wheels = estimate.odometry
             slips = ((wheels.i >= first - 1) & (wheels.j <= last))[:, None] * _SLIP
-            if min(sizes) < _PART or _tied(estimate, slips, np.array([first - 1]), np.array([last]))[0]:
+            if min(sizes) < _PART or _tied(estimate, path, slips, np.array([first - 1]), np.array([last]))[0]:
                 continue
             what = "the lidar is silent" if recording.has_scans else "all anchors are replaced by others"
             yield doubt(
@@ -141,12 +145,29 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     ]
 
 
-def _tied(estimate: Estimate, slips: Floats, i: Ints, j: Ints) -> Bools:
-    """Return whether keyframes i (m,) are known from j (m,) by all measurements, where steps may slip by (e, 3), m, m, rad."""
+def _of_other_visits(edges: Edges, graph: Graph, path: Floats) -> Edges:
+    """Return scan edges between visits, and between neighbours those that leave no direction free.
+
+    The others were matched where the chain had put the clouds: many weak ones seem to measure the way along a bare wall.
+    """
+    if not isinstance(edges, ScanEdges):
+        return edges
+    again = np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+    clear = (np.abs(edges.i - edges.j) <= TiePolicy.near) & fixing(edges, graph)
+    return edges.rows(np.flatnonzero(clear | again))
+
+
+def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> Bools:
+    """Return whether keyframes i (m,) are known from j (m,) by all measurements, where steps may slip by (e, 3), m, m, rad.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m.
+    """
     steps, root = np.flatnonzero(slips.any(axis=1)), estimate.odometry.sqrt_information.copy()
     covariance = np.linalg.inv(np.swapaxes(root[steps], 1, 2) @ root[steps]) + slips[steps, :, None] ** 2 * np.eye(3)
     root[steps] = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
-    others = [edges for edges in estimate.graph.edges if not isinstance(edges, OdometryEdges)]
+    others = [_of_other_visits(e, estimate.graph, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
     graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
     return np.asarray(np.linalg.eigvalsh(relative / np.outer(_SLIP, _SLIP))[:, -1] < _KNOWN**2)
@@ -163,17 +184,19 @@ def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
     off = np.abs(wheels.residuals(estimate.graph)).max(axis=1, initial=0.0)
     slips = np.where((off > _SUDDEN)[:, None], np.minimum(off[:, None] * noise, _SLIP), 0.0)
-    steps = np.flatnonzero(slips.any(axis=1))
-    new = np.append(True, np.diff(wheels.i[steps]) >= _PART)[: len(steps)]
-    first, last = steps[new], steps[np.append(new[1:], True)[: len(steps)]]
-    rows = [recordings.each[n].rows for n in recordings.of_keyframe[wheels.i[first]].tolist()]
-    sizes = [min(i + 1 - own.start, own.stop - j) for own, i, j in zip(rows, wheels.i[first], wheels.j[last], strict=True)]
-    runs = np.flatnonzero(np.array(sizes) >= _PART)
-    largest = np.array([slips[a : b + 1].max() for a, b in zip(first[runs], last[runs], strict=True)])
-    runs = np.sort(runs[np.argsort(-largest, kind="stable")[:_MOST]])
-    if not len(runs):
-        return runs
-    return first[runs[~_tied(estimate, slips, wheels.i[first[runs]], wheels.j[last[runs]])]]
+    rows = np.array([(r.rows.start, r.rows.stop) for r in recordings.each])[recordings.of_keyframe[wheels.i]]
+    sides = np.minimum(wheels.i + 1 - rows[:, 0], rows[:, 1] - wheels.j)
+    steps = np.flatnonzero(slips.any(axis=1) & (sides >= _PART))
+    if not len(steps):
+        return steps
+    new = np.append(True, np.diff(wheels.i[steps]) >= _PART)
+    first, last = steps[new], steps[np.append(new[1:], True)]
+    for a, b in zip(first.tolist(), last.tolist(), strict=True):
+        # Wheels that spin are off by the same in each step of a run, and such errors add up.
+        slips[a : b + 1] = slips[a : b + 1].max(axis=0) * np.sqrt(b + 1 - a)
+    largest = slips[first].max(axis=1)
+    runs = np.sort(np.argsort(-largest, kind="stable")[:_MOST])
+    return first[runs[~_tied(estimate, recordings.path, slips, wheels.i[first[runs]], wheels.j[last[runs]])]]
 
 
 def check_untied_recordings(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -68,7 +68,7 @@ def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], so
 
 def truncated_weight(squared: Floats, mu: float) -> Floats:
     """Return the weights (e,) of residuals whose squares (e,) are given in units of the squared threshold."""
-    between = np.sqrt(mu * (mu + 1.0) / np.maximum(squared, np.finfo(np.float64).eps)) - mu
+    between = np.sqrt(mu * (mu + 1.0) / np.maximum(squared, np.sqrt(np.finfo(np.float64).tiny))) - mu
     return np.clip(np.where(squared >= (mu + 1.0) / mu, 0.0, between), 0.0, 1.0)
 
 

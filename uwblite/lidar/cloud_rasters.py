@@ -1,7 +1,7 @@
 """A raster for every cloud in which each cell names the nearest point: a look-up of a million points needs no tree."""
 
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,6 @@ def rasterize(clouds: Clouds, cell: float, reach: float, targets: Ints | None = 
     return CloudRasters(clouds, cell, origin, shape, start, np.concatenate(run), np.concatenate(kept).reshape(-1))
 
 
-@cache
 def _offsets(reach: float) -> Ints:
     """Return the cells (m, 2) within reach of one, cells, the farthest first."""
     cells = np.argwhere(np.ones((2 * int(reach) + 1,) * 2)) - int(reach)

@@ -56,8 +56,8 @@ class PairPolicy:
 _LEAST = float(np.finfo(np.float32).tiny)
 SINGULAR = TINY
 """Share of the largest information below which a direction has none."""
+_ONE = np.eye(3)
 _FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-_ONE = np.eye(len(_FLOOR))
 """N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
 and y, whatever the frame."""
 

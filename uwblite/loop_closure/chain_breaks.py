@@ -35,13 +35,13 @@ def steps_fixed(graph: Graph) -> Bools:
     """Return whether some scan edge of the same visit fixes the step from each keyframe (k,) in all directions."""
     count = np.zeros(len(graph.poses) + 1, dtype=np.intp)
     for edges in (e for e in graph.edges if isinstance(e, ScanEdges)):
-        own = (np.abs(edges.i - edges.j) <= TiePolicy.near) & _fixing(edges, graph)
+        own = (np.abs(edges.i - edges.j) <= TiePolicy.near) & fixing(edges, graph)
         np.add.at(count, np.minimum(edges.i, edges.j)[own], 1)
         np.add.at(count, np.maximum(edges.i, edges.j)[own], -1)
     return np.asarray(np.cumsum(count)[:-1] > 0)
 
 
-def _fixing(edges: ScanEdges, graph: Graph) -> Bools:
+def fixing(edges: ScanEdges, graph: Graph) -> Bools:
     """Return which scan edges (e,) agree with the map and fix a pose in all directions."""
     agrees = np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < LoopClosureConfig.agrees
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information

@@ -81,7 +81,9 @@ class ClearanceMap:
         """Return the cost of a metre driven at the centres of cells."""
         half = self.half[rows, cols]
         table = self._nearness(self._unit * np.arange(int(half.max(initial=0)) + 1)).astype(np.float32)
-        return table[half] if self.refused else np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), 1.0) * table[half]
+        if self.refused:
+            return table[half]
+        return np.where(self.dear[rows, cols], np.float32(UNKNOWN_PRICE), np.float32(1.0)) * table[half]
 
     def bounds(self, points: Floats) -> Floats:
         """Return lower bounds (n,) of the squared clearance at points (n, 2), m and m^2; outside the map it is 0."""

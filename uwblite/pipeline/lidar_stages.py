@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from ..graph.calibration import LASER, RADIO, with_free
 from ..graph.graph import Graph
 from ..graph.marginals import marginals
@@ -34,6 +34,8 @@ _VIOLATION = 0.05
 """Share of points in free space from which visits do not show the same place; glass and doors cause half of it."""
 _COME_AND_GONE = 2.0
 """Ratio to the share within one visit that people explain: those of either visit are not there on the other one."""
+_AT_ONCE = 1024
+"""Single scans whose clouds are in memory at once."""
 _ENOUGH_VISITS = 5
 """Least number of keyframes of either visit for which their free-space violation counts."""
 
@@ -133,9 +135,9 @@ def place_scans_between(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) -> Recording:
-    scans, graph, own = estimate.lidar, estimate.graph, recording.frames.stamps
+    """Place the scans between a recording's keyframes, so many at once that their clouds take little memory."""
     assert recording.log.scans is not None
-    stamps = recording.log.scans.middles + scans.delay
+    own, stamps = recording.frames.stamps, recording.log.scans.middles + estimate.lidar.delay
     stamps = stamps[(stamps > own[0]) & (stamps < own[-1])]
     step = np.searchsorted(own, stamps, "right") - 1
     before, after = stamps - own[step], own[step + 1] - stamps
@@ -144,7 +146,21 @@ def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) ->
         return recording
     stamps, step = stamps[further], step[further]
     # The nearer keyframe's cloud may hold the scan itself.
-    side = recording.first + step + (before < after)[further]
+    side = recording.first + step + (before <= after)[further]
+    parts = [(stamps[some], step[some], side[some]) for some in chunks(len(step), _AT_ONCE)]
+    placed = [_seen_from(recording, estimate, task, part) for part in parts]
+    good, seen = (np.concatenate(of) for of in zip(*placed, strict=True))
+    return recording.with_poses_between(stamps[good], (side - recording.first)[good], seen[good])
+
+
+def _seen_from(recording: Recording, estimate: Estimate, task: Task, of: tuple[Floats, Ints, Ints]) -> tuple[Bools, Floats]:
+    """Return which scans (m,) match the cloud of a keyframe, and where the base was, seen from it (m, 3).
+
+    Parameters
+    ----------
+    of : stamps (m,), s; numbers (m,) of the recording's steps that hold them; keyframes (m,) that see them.
+    """
+    scans, graph, (stamps, step, side) = estimate.lidar, estimate.graph, of
     frames = keyframes.at(recording.log, stamps, np.ones(len(stamps), dtype=bool))
     alone = keyframe_data.clouds_of(replace(recording, frames=frames), task.config, scans.delay)
     both = clouds.joined([scans.clouds, *alone])
@@ -163,8 +179,7 @@ def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) ->
     prior = np.linalg.inv(np.swapaxes(turn, 1, 2) @ covariance_of(estimate.odometry, graph)[of_step] @ turn)
     off = np.linalg.solve(np.swapaxes(root, 1, 2) @ root + prior, prior @ se2.between(z, guess)[..., None])[..., 0]
     seen = se2.compose(se2.compose(se2.compose(mounting, z), off), se2.inverse(mounting))
-    good = (aligned.share >= PairPolicy.good_share) & (aligned.factors.asked >= PairPolicy.fewest)
-    return recording.with_poses_between(stamps[good], (side - recording.first)[good], seen[good])
+    return (aligned.share >= PairPolicy.good_share) & (aligned.factors.asked >= PairPolicy.fewest), seen
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:

@@ -1,9 +1,9 @@
 """What explains ranges that do not fit the path by the wheels: the wheels, the radio's clock, or the anchors' names.
 
 The ranges to an anchor are distances from the path to one place. Each row of the table changes what they are taken to: the
-times of the ranges, the names of the anchors, the path after a moment. Each has prior odds, and
-all are compared by one likelihood with the recording as it stands and with one another: what fits best is the cause, and a row
-that explains the same readings less well is none.
+times of the ranges, the names of the anchors, the path after a moment. Each has prior odds, and all are compared by one
+likelihood with the recording as it stands and with one another: what fits best is the cause, and a row that explains the same
+readings less well is none.
 
 Of the readings of an anchor along a stretch of the way the likelihood is that of the best place (places and their common error
 cost by Schwarz, 1978), with Cauchy errors; that of a drive of which only the way is known, where the path is wrong; or that of
@@ -164,7 +164,7 @@ def _traces(log: SensorLog) -> list[Trace]:
 
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
-    """Return a radio's clock that is off throughout; its rival are wheels with another scale throughout."""
+    """Return a radio's clock that is off throughout; its rivals are wheels with another scale throughout."""
     offsets, factors = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors
     count, length = len(factors), PathPolicy.stretch
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)

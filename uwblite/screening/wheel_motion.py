@@ -247,7 +247,8 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     """Tell where wheels and lidar measure different motions for long, one factor for all taken out.
 
     Along a bare wall any motion matches two scans of few rays, that of the wheels as well as that which the lidar seems to
-    measure; such pairs show nothing, where the log with their scans is given.
+    measure; such pairs show nothing, where the log with their scans is given. Wheels that spin while the robot drives count too
+    much, until they grip again; late clocks give back what they take, or go on to the end, and a covered lidar stands still.
     """
     own, lasting = pairs.rows(pairs.measured), PairPolicy.lasting
     if len(own.start) < 2 * PairPolicy.enough:
@@ -267,7 +268,7 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
         bad[bad] = by_wheels > PairPolicy.worse * by_lidar
     smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
     runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
-    # Wheels that spin count too much, until they grip again; late clocks give as much back as they take, or go on to the end.
+    more = [of & np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1) for of in more]
     slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
     stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
     return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
