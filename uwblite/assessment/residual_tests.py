@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
 from ..graph.calibration import RANGE_SCALE
@@ -124,9 +125,14 @@ def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
     whitened, noise = wheels.residuals(estimate.graph), 1.0 / wheels.sqrt_information[:, 0, 0]
     if not len(noise) or not estimate.placed.any():
         return
-    # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others.
-    off = np.abs(whitened).max(axis=1) * np.maximum(noise / (2.0 * np.median(noise)), 1.0)
-    far = np.flatnonzero(~lidar & (noise < _MEASURED) & (off > _JUMP))
+    # Of a step that probably slipped the noise is that of slip: it is compared with the noise of the others. But wheels that
+    # slip count too much: a robot that moved farther was carried.
+    larger = noise / (2.0 * np.median(noise))
+    poses, counted = estimate.graph.poses, wheels.corrected(estimate.graph)
+    moved = se2.between(poses[wheels.i], poses[wheels.j])
+    carried = np.hypot(moved[:, 0], moved[:, 1]) > np.hypot(counted[:, 0], counted[:, 1]) + _CARRIED
+    off = ~lidar & (np.abs(whitened).max(axis=1) * np.maximum(larger, 1.0) > _JUMP)
+    far = np.flatnonzero(off & (noise < _MEASURED) & ((larger <= 1.0) | carried))
     if len(far):
         yield _slips(far, whitened, wheels, recordings)
 

@@ -30,8 +30,8 @@ _PART = 6
 """Least number of keyframes of a part for a doubt."""
 _SLIP = np.array([1.0, 1.0, 0.2])
 """m, m, rad, by which wheels that slip are off in a step at most."""
-_KNOWN = 0.5
-"""Share of it, in any direction, up to which the relative pose of two parts must be known."""
+_KNOWN, _KNOWN_SHARE = 0.5, 0.01
+"""Share of it, and of the map's diameter, up to which the relative pose of two parts must be known, in any direction."""
 _SUDDEN = 5.0
 """Standard deviations that a step of faultless wheels hardly ever exceeds."""
 _MOST = 64
@@ -39,6 +39,8 @@ _MOST = 64
 _ANCHORS, _MEASURED = 2, 3
 """Least number of anchors that end or appear together, or by which more agree than do not; and of ranges to each of them, also
 of constrained keyframes at an end of a recording."""
+_SPIN = 5.0
+"""Time, s, for which wheels spin."""
 _ANOTHER_VISIT = 10.0
 """Travelled distance between two visits, m."""
 _PER_METRE = 0.02
@@ -170,7 +172,9 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
     others = [_of_other_visits(e, estimate.graph, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
     graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
-    return np.asarray(np.linalg.eigvalsh(relative / np.outer(_SLIP, _SLIP))[:, -1] < _KNOWN**2)
+    extent = float(np.hypot(*np.ptp(graph.poses[:, :2], axis=0)))
+    known = max(_KNOWN, _KNOWN_SHARE * extent / float(_SLIP[0]))
+    return np.asarray(np.linalg.eigvalsh(relative / np.outer(_SLIP, _SLIP))[:, -1] < known**2)
 
 
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
@@ -192,9 +196,11 @@ def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     new = np.append(True, np.diff(wheels.i[steps]) >= _PART)
     first, last = steps[new], steps[np.append(new[1:], True)]
     for a, b in zip(first.tolist(), last.tolist(), strict=True):
-        # Wheels that spin are off by the same in each step of a run, and such errors add up.
-        slips[a : b + 1] = slips[a : b + 1].max(axis=0) * np.sqrt(b + 1 - a)
-    largest = slips[first].max(axis=1)
+        # Wheels that spin for seconds are off by the same in each step, and such errors add up.
+        stamps = recordings.stamps[wheels.i[a : b + 1]]
+        together = np.searchsorted(stamps, stamps + _SPIN) - np.arange(b + 1 - a)
+        slips[a : b + 1] *= np.sqrt(together.max())
+    largest = np.array([slips[a : b + 1].max() for a, b in zip(first, last, strict=True)])
     runs = np.sort(np.argsort(-largest, kind="stable")[:_MOST])
     return first[runs[~_tied(estimate, recordings.path, slips, wheels.i[first[runs]], wheels.j[last[runs]])]]
 
