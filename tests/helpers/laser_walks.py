@@ -66,6 +66,21 @@ def walked(seed, walls=HALL, metres=60.0, half_width=4.0, spacing=6, **settings)
     return truth, path, scanned(truth, walls, 0.01, seed, beams=300, reach=5.6)
 
 
+def with_a_walker(truth, clouds):
+    """Return clouds in each of which a person stands, 2 m ahead of where the robot is and each time somewhere else."""
+    parts = []
+    for k in range(len(truth)):
+        points, normals = clouds.cloud(k)
+        angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+        body = [2.0 + 0.3 * (k % 3), 0.4 * (k % 5) - 0.8] + 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        hidden = np.abs(np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(body[:, 1].mean(), body[:, 0].mean())) < 0.2
+        parts.append((np.concatenate([points[~hidden], body]), np.concatenate([normals[~hidden], np.zeros_like(body)])))
+    counts = np.array([len(points) for points, _ in parts])
+    points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    owner = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
+    return Clouds(np.concatenate([[0], np.cumsum(counts)]), points, normals, owner, np.zeros(len(points)))
+
+
 def in_map(clouds: Clouds, poses):
     """Return all points and normals (p, 2) in the map frame, given keyframe poses (k, 3)."""
     own = poses[clouds.owner]

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.laser_walks import walked
+from helpers.laser_walks import walked, with_a_walker
 
 from uwblite import se2
-from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.lidar.visibility import (
     dynamic_share,
@@ -92,21 +91,6 @@ def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(hal
     T_a_b = se2.between(where[a], where[b])
     assert violates_free_space(free[a], points[0], free[b], points[1], T_a_b) < 0.05
     assert violates_free_space(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
-
-
-def with_a_walker(truth, clouds):
-    """Return clouds in each of which a person stands, 2 m ahead of where the robot is and each time somewhere else."""
-    parts = []
-    for k in range(len(truth)):
-        points, normals = clouds.cloud(k)
-        angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-        body = [2.0 + 0.3 * (k % 3), 0.4 * (k % 5) - 0.8] + 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        hidden = np.abs(np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(body[:, 1].mean(), body[:, 0].mean())) < 0.2
-        parts.append((np.concatenate([points[~hidden], body]), np.concatenate([normals[~hidden], np.zeros_like(body)])))
-    counts = np.array([len(points) for points, _ in parts])
-    points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
-    owner = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
-    return Clouds(np.concatenate([[0], np.cumsum(counts)]), points, normals, owner, np.zeros(len(points)))
 
 
 def test_people_violate_free_space_within_one_visit_as_they_do_between_two(hall):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.laser_walks import HALL, walked
+from helpers.laser_walks import HALL, walked, with_a_walker
 from helpers.planted import odometry, recording, scans, wander
 from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.told import doubted
@@ -81,6 +81,17 @@ def test_a_map_whose_visits_do_not_show_the_same_place_is_doubted(torn):
     estimate, task = estimate_of(Graph(poses), scans=ScanClouds(clouds, None, 0.0)), task_of(recordings_of(truth))
     assert check_map_consistency(estimate, task) is estimate
     assert [n.kind for n in doubted(task.stages)] == ["free-space-violation"] * torn
+
+
+def test_people_who_walk_along_explain_violated_free_space(monkeypatch):
+    """They show within one visit as well: no doubt, however small the share that is one without them."""
+    truth, _, clouds = walked(3)
+    clouds = with_a_walker(truth, clouds)
+    estimate, task = estimate_of(Graph(truth), scans=ScanClouds(clouds, None, 0.0)), task_of(recordings_of(truth))
+    monkeypatch.setattr(lidar_stages, "_VIOLATION", 0.001)
+    check_map_consistency(estimate, task)
+    assert task.stages.done[-1].figures["free_space_violation"] > 0.001
+    assert doubted(task.stages) == []
 
 
 def test_pairs_of_one_visit_do_not_lead_across_a_step_that_clouds_measure_falsely():
