@@ -87,6 +87,18 @@ def test_ranges_measure_it_too_and_a_moved_anchor_is_no_other_unit():
     assert "times" not in other_unit(None, poses[-1], no_rays, 0.0, ranges_at(poses, 1.0, moved=-2.0))
 
 
+@pytest.mark.parametrize("count", [40, 400])
+def test_ranges_that_fit_without_error_are_in_the_unit_of_the_map(count):
+    """Of a robot that drives in a small circle, however many: that sigmas are long says nothing about the unit."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count)
+    poses = np.column_stack([4.0 + 1.5 * np.cos(angle), 3.0 + 1.5 * np.sin(angle), angle + 0.5 * np.pi])
+    no_rays = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
+    ranges = ranges_at(poses, 1.0)
+    sigma, white = np.full(len(ranges), 0.25), np.full(len(ranges), 0.05)
+    drifted = dataclasses.replace(ranges, sigma=sigma, white=white, way=1.5 * np.repeat(angle, 4))
+    assert other_unit(None, poses[-1], no_rays, 0.0, drifted) == ""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scans", [True, False])
 @pytest.mark.parametrize("factor", [0.9, 1.1])

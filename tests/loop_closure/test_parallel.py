@@ -30,11 +30,11 @@ def test_answers_come_in_the_order_of_the_tasks(workers):
 
 @pytest.fixture(scope="module")
 def minutes(room_log, tmp_path_factory):
-    """Two recordings of 10 s in one room, as files."""
+    """Two recordings of 15 s in one room, as files."""
     folder, log = tmp_path_factory.mktemp("minutes"), read_log(room_log)
     paths = [folder / "one.log", folder / "two.log"]
     for path, start in zip(paths, (0.0, 50.0), strict=True):
-        write_log(path, log.crop(start, start + 10.0))
+        write_log(path, log.crop(start, start + 15.0))
     return paths
 
 

@@ -127,9 +127,10 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, independent: float
     odds = np.zeros(len(_FACTORS))
     for k, factor in enumerate(_FACTORS):
         larger = Rays(rays.ends * factor, rays.origins * factor, rays.hit)
-        measured = replace(ranges, tags=ranges.tags * factor, values=ranges.values * factor, sigma=ranges.sigma * factor)
-        there = hypotheses.refined(pose[None], measured, seen, larger)
-        odds[k] = range_likelihood(there, measured)[0]
+        there = hypotheses.refined(pose[None], ranges.times(factor), seen, larger)
+        # Errors and detours keep their sizes: it is the map that is smaller.
+        smaller = replace(ranges, places=ranges.places / factor)
+        odds[k] = range_likelihood(there / [factor, factor, 1.0], smaller)[0]
         odds[k] += independent * float(seen.agreement(there, larger).log_likelihood[0]) if seen is not None else 0.0
     sound = np.abs(_FACTORS - 1.0) < 1.5 * _UNIT
     gain = odds[~sound].max() - odds[sound].max()
