@@ -99,6 +99,13 @@ def test_ranges_that_fit_without_error_are_in_the_unit_of_the_map(count):
     assert other_unit(None, poses[-1], no_rays, 0.0, drifted) == ""
 
 
+@pytest.mark.parametrize(("factor", "sound"), [(0.97, True), (1.03, True), (1.05, False)])
+def test_scans_allow_the_error_of_a_data_sheet_and_no_more(factor, sound):
+    walls = enlarged(known(), factor).walls
+    found = other_unit(walls, POSES[-1] * [factor, factor, 1.0], rays_of(POSES), 45.0, NO_RANGES)
+    assert (found == "") == sound
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scans", [True, False])
 @pytest.mark.parametrize("factor", [0.9, 1.1])

@@ -41,8 +41,6 @@ _ANCHORS, _MEASURED = 2, 3
 of constrained keyframes at an end of a recording."""
 _SPIN = 5.0
 """Time, s, for which wheels spin."""
-_ANOTHER_VISIT = 10.0
-"""Travelled distance between two visits, m."""
 _PER_METRE = 0.02
 """rad/m; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives straight
 on exceeds the limit below after 7 m."""
@@ -147,14 +145,14 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     ]
 
 
-def _of_other_visits(edges: Edges, graph: Graph, path: Floats) -> Edges:
+def _independent(edges: Edges, graph: Graph, path: Floats) -> Edges:
     """Return scan edges between visits, and between neighbours those that leave no direction free.
 
     The others were matched where the chain had put the clouds: many weak ones seem to measure the way along a bare wall.
     """
     if not isinstance(edges, ScanEdges):
         return edges
-    again = np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+    again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
     clear = (np.abs(edges.i - edges.j) <= TiePolicy.near) & fixing(edges, graph)
     return edges.rows(np.flatnonzero(clear | again))
 
@@ -169,7 +167,7 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
     steps, root = np.flatnonzero(slips.any(axis=1)), estimate.odometry.sqrt_information.copy()
     covariance = np.linalg.inv(np.swapaxes(root[steps], 1, 2) @ root[steps]) + slips[steps, :, None] ** 2 * np.eye(3)
     root[steps] = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
-    others = [_of_other_visits(e, estimate.graph, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
+    others = [_independent(e, estimate.graph, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
     graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
     extent = float(np.hypot(*np.ptp(graph.poses[:, :2], axis=0)))

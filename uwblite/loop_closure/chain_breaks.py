@@ -22,6 +22,8 @@ class TiePolicy:
 
     near: ClassVar[int] = 4
     """Most keyframes that a scan edge of the same visit spans."""
+    another_visit: ClassVar[float] = 10.0
+    """Travelled distance between two visits, m."""
     clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
     """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""
     jump: ClassVar[float] = 0.5

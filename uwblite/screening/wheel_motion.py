@@ -2,8 +2,8 @@
 
 Pairs of scans a short time apart, spread over the recording, are matched and compared with the odometry of the same time.
 One factor for all distances and one for all turns are calibration, and removed before. A remaining difference over a stretch is
-a fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; any other lasting
-difference is a doubt.
+a fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; wheels that count
+too much for a while slip, and are named; any other lasting difference is a doubt.
 """
 
 from dataclasses import dataclass
@@ -257,18 +257,18 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
     bad, more = np.zeros(len(own.start), dtype=bool), []
+    drives = np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1)
     for part, allowed in zip(parts, PairPolicy.allowed, strict=True):
         differs, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
         off = differs > allowed + PairPolicy.relative * np.maximum(*sizes)
         along = np.sum((wheels - own.lidar)[:, part] * wheels[:, part], axis=1)
-        more.append(off & (along > 0.5 * differs * sizes[1]))
+        more.append(off & drives & (along > 0.5 * differs * sizes[1]))
         bad |= off
     if log is not None and bad.any():
         by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
         bad[bad] = by_wheels > PairPolicy.worse * by_lidar
     smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
     runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
-    more = [of & np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1) for of in more]
     slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
     stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
     return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
