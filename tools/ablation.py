@@ -74,7 +74,7 @@ def _stage(name: str) -> LeftOut:
 
 def _repair(name: str) -> LeftOut:
     """Leave out a repair of the screening."""
-    return LeftOut(patches=((f"screening.{name}", lambda log: (log, [])),))
+    return LeftOut(patches=((f"screening.{name}", lambda log, *pairs: (log, [])),))
 
 
 def _pairs_alone(estimate: Estimate, task: Pipeline) -> Estimate:

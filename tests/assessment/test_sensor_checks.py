@@ -20,14 +20,12 @@ from uwblite.assessment.sensor_checks import (
     check_odometry,
     check_radio,
     check_rhythm,
-    check_turning,
     lidar_figures,
     odometry_figures,
     rhythm,
     width_by_length,
 )
 from uwblite.graph.graph import UnknownKey
-from uwblite.lidar.laser_mounting import Turning
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate
 from uwblite.sensor_log import LONGEST_RANGE, LaserScans, Odometry, SensorLog, UwbRanges
 
@@ -272,23 +270,3 @@ def test_many_error_codes_are_noted(errors, said):
     ranges = np.tile(np.linspace(1.0, 2.0, 100), (10, 1))
     ranges[:, :errors] = np.nan
     assert ["error codes" in f.text for f in checked(ranges)[1]] == ([True] if said else [])
-
-
-def turned(**values):
-    """Return sensor and text of the findings of a comparison of turns that came out so."""
-    plain = Turning(
-        pairs=40, typical=0.3, as_given=0.01, other=0.5, misfit=0.01, delay=0.0, delay_clear=True, ratio=1.0
-    )
-    return [(f.sensor, f.text) for f in check_turning(replace(plain, **values))]
-
-
-@pytest.mark.parametrize(("delay", "clear", "said"), [
-    (0.07, True, "0.07 s too early"), (-0.07, True, "0.07 s too late"), (0.06, True, ""), (0.2, False, ""),
-])  # fmt: skip
-def test_a_clear_delay_of_the_laser_is_named(delay, clear, said):
-    assert [said in text for _, text in turned(delay=delay, delay_clear=clear)] == ([True] if said else [])
-
-
-def test_turns_that_nothing_shows_are_noted():
-    assert [f.kind for f in check_turning(None)] == ["no-turns"]
-    assert [text.startswith("laser and wheels disagree") for _, text in turned(misfit=0.2)] == [True]

@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.planted import box, drive, odometry, recording, scans, wander
 from helpers.told import told
 
 from uwblite import se2
+from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.mapping import MappingConfig, build_map
 from uwblite.screening import directions
-from uwblite.screening.directions import heading_with_the_path, laser_ahead
-from uwblite.screening.wheel_motion import Pairs
+from uwblite.screening.directions import heading_with_the_path, laser_ahead, laser_upright
+from uwblite.screening.wheel_motion import Pairs, compare
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting
 
 
@@ -35,18 +38,19 @@ def test_pairs_along_bare_walls_do_not_hide_the_direction_of_the_laser(angle, st
 
 
 @pytest.mark.parametrize(("seen", "changed", "open_sign"), [
-    ({"heading": 1.0, "y": -1.0}, "the sign of its heading", False), ({"heading": -1.0, "y": 1.0}, "the sign of its y", False),
-    ({"heading": 0.0, "y": 0.0}, "the sign of its heading", True),
+    ({"heading": 1, "y": -1}, "the sign of its heading", False), ({"heading": -1, "y": 1}, "the sign of its y", False),
+    ({"heading": 0, "y": 0}, "the sign of its heading", True),
 ])  # fmt: skip
 def test_a_heading_against_its_path_is_mended_as_the_laser_shows(monkeypatch, seen, changed, open_sign):
     """The heading counts the wrong way, or y does; without a laser nothing shows which."""
     stamps = 0.1 * np.arange(400)
     odometry = Odometry(stamps, se2.chain(np.zeros(3), np.tile([0.05, 0.0, 0.02], (399, 1))) * [1.0, 1.0, -1.0])
 
-    def fits(log):
-        return seen["heading" if np.array_equal(log.odometry.poses[:, 1], odometry.poses[:, 1]) else "y"]
+    def mended(log):
+        return "heading" if np.array_equal(log.odometry.poses[:, 1], odometry.poses[:, 1]) else "y"
 
-    monkeypatch.setattr(directions, "_fits_laser", fits)
+    monkeypatch.setattr(directions, "compare", mended)
+    monkeypatch.setattr(directions, "_turns_alike", seen.__getitem__)
     done, facts = heading_with_the_path(SensorLog(odometry))
     (remark,) = told(facts)
     sign = [1.0, 1.0, -1.0] if "heading" in changed else [1.0, -1.0, 1.0]
@@ -84,3 +88,78 @@ def test_turns_show_whether_the_laser_or_the_way_of_driving_is_turned(angle, aro
     moved = np.append(se2.rotate(angle, tag[:2]), 0.6) if around else tag
     np.testing.assert_allclose(done.mounting.tag_position, moved, atol=0.01)
     assert f"differs by {np.degrees(angle):+.0f}"[:13] in remark.text
+
+
+ROOM = np.concatenate([box(14, 11), box(3, 1) + np.array([2, 1, 2, 1]), box(1, 2) - np.array([4, 2, 4, 2])])
+TURNS = [(0.0, 0.0, 0.6), (0.4, 0.0, 0.0), (0.0, 0.0, -0.5), (0.3, 0.0, 0.0), (0.0, 0.0, 0.4)] * 2
+UP, DOWN = SensorMounting(), SensorMounting(laser_flipped=True)
+
+
+def turner(mounting=UP, lag=0.0, turn_scale=1.0, seed=0, legs=TURNS):
+    """A recording of a robot that turns on the spot now and then; its log does not contain how the laser hangs."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = drive(legs, [4.0] * len(legs))
+    seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=mounting)
+    seen = replace(seen, stamps=seen.stamps + lag)
+    return recording(odometry(stamps, truth, rng, noise=0.005, turn_noise=0.01, turn_scale=turn_scale), None, seen)
+
+
+def turned_over(log):
+    """Return whether the laser is taken as mounted the other way up than given."""
+    pairs = compare(log)
+    return pairs is not None and laser_upright(log, pairs)[0].mounting.laser_flipped is not log.mounting.laser_flipped
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("mounting", [UP, DOWN])
+def test_the_way_up_shows_in_the_turns(seed, mounting):
+    assert turned_over(turner(mounting, seed=seed)) is (mounting is DOWN)
+
+
+def test_a_way_up_given_rightly_is_not_contradicted():
+    assert not turned_over(replace(turner(DOWN), mounting=DOWN))
+    assert turned_over(replace(turner(UP), mounting=DOWN))
+
+
+@pytest.mark.parametrize("other", [{"lag": 0.3}, {"lag": -0.2}, {"turn_scale": 0.5}, {"turn_scale": 2.0}])
+@pytest.mark.parametrize("mounting", [UP, DOWN])
+def test_neither_another_clock_nor_another_track_hides_the_way_up(mounting, other):
+    assert turned_over(turner(mounting, **other)) is (mounting is DOWN)
+
+
+@pytest.mark.parametrize("mounting", [UP, DOWN])
+def test_scans_that_see_nothing_decide_nothing(mounting):
+    """In a large bare hall most scans see no wall: any turn fits two of them."""
+    log = turner(mounting)
+    ranges = log.scans.ranges.copy()
+    ranges[np.arange(len(ranges)) % 20 < 13] = np.inf
+    assert turned_over(replace(log, scans=replace(log.scans, ranges=ranges))) is (mounting is DOWN)
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(1.0, False), (3.9, True)])
+def test_a_few_scans_that_see_something_decide_nothing(seconds, shown):
+    """In a yard only scans beside the one post match at all, and a single pair fits a laser either way up."""
+    log = turner(DOWN)
+    ranges = np.where((log.scans.stamps < log.scans.stamps[0] + seconds)[:, None], log.scans.ranges, np.inf)
+    assert turned_over(replace(log, scans=replace(log.scans, ranges=ranges))) is shown
+
+
+def test_a_robot_that_never_turns_shows_nothing_and_one_that_turns_only_while_driving_does():
+    assert not turned_over(turner(DOWN, legs=[(0.3, 0.0, 0.0)] * 4))
+    assert turned_over(turner(DOWN, legs=[(0.6, 0.0, 0.35)] * 6))
+
+
+@pytest.mark.slow
+def test_a_laser_upside_down_is_mapped_and_reported():
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 12.0)
+    seen = scans(stamps, truth, ROOM, rate=5.0, noise=0.01, rng=rng, mounting=DOWN)
+    log = recording(odometry(stamps, truth, rng, noise=0.005, turn_noise=0.005), None, seen)
+    result = build_map(log)
+    assert [d for d in result.doubts if d.kind == "laser-turned-over"]
+    assert evaluate_trajectory(stamps, result.trajectory, stamps, truth).ate.rmse < 0.03
+    reported = build_map(replace(log, mounting=DOWN))
+    assert not [d for d in reported.doubts if d.kind == "laser-turned-over"]
+    np.testing.assert_array_equal(reported.trajectory, result.trajectory)
+    counted = build_map(log, MappingConfig(detect_laser_flip=False))
+    assert not [d for d in counted.doubts if d.kind == "laser-turned-over"]

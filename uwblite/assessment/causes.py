@@ -20,7 +20,7 @@ def _of(*kinds: str | frozenset[str]) -> frozenset[str]:
     return frozenset().union(*(kind.split() if isinstance(kind, str) else kind for kind in kinds))
 
 
-_TIMES = _of("silences equal-stamps laser-delay slow-odometry odometry-gap clock-offset no-turns")
+_TIMES = _of("silences equal-stamps slow-odometry odometry-gap clock-offset")
 """What stamps that are no times look like."""
 _PLACES = _of(
     "anchor-distrusted anchor-mirror-ambiguous anchor-unplaced no-anchor moved-anchor anchors-moved-together",
@@ -35,7 +35,7 @@ _BY_RANGES = _of(
 """What a map by ranges and wheels alone shows of a fault of either."""
 _BY_SCANS = _of(
     "free-space-violation no-closure open-loops loose-links turn-scale scales uncertain",
-    "poor-fit untied-parts turns-disagree unusual-calibration mirrored",
+    "poor-fit untied-parts unusual-calibration mirrored",
 )
 """What a map shows of a fault of lidar or wheels."""
 _ALL = _of(_BY_RANGES, _BY_SCANS, "wheels-against-lidar carried wheels-stand-still")
@@ -52,7 +52,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "made-up-stamps": _TIMES,
         "stamps-of-receipt": _TIMES,
         "stamps-in-bursts": _TIMES,
-        "hardly-moving": _of(_PLACES, "uncertain straight-path no-turns moves-across-heading"),
+        "hardly-moving": _of(_PLACES, "uncertain straight-path moves-across-heading"),
         "scans-do-not-match": _of(_BY_SCANS, "wheels-against-lidar range-scatter odometry-alone"),
         "laser-turned-over": _of(_BY_SCANS, "wheels-against-lidar range-scatter anchors-moved-together"),
         "wheels-stand-still": _BY_RANGES | _BY_SCANS,

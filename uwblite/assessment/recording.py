@@ -11,10 +11,8 @@ from typing import Any
 
 from ..errors import DataError
 from ..findings import DOUBT, NOTE, WARNING, WHEELS_AGAINST_LIDAR, Finding, of_severity, ranked
-from ..lidar.laser_mounting import Turning
 from ..map_result import MapResult
 from ..screening.screen import screen
-from ..screening.wheel_motion import show_motion
 from ..sensor_log import SensorLog
 from . import sensor_checks
 from .causes import explained
@@ -53,8 +51,6 @@ class RecordingView:
     """Why no map can be made."""
     figures: dict[str, Any]
     """See Diagnosis."""
-    turning: Turning | None
-    """Turns by laser and wheels."""
 
 
 def diagnose(
@@ -74,15 +70,13 @@ def diagnose(
     except DataError as error:
         refused = refused or str(error)
     figures: dict[str, Any] = {"odometry": sensor_checks.odometry_figures(log.odometry)}
-    turning = None
     if log.ranges is not None and len(log.ranges.stamps):
         figures["uwb"] = sensor_checks.radio_figures(log)
         made = ((), ()) if result is None else (result.anchors, result.calibration)
         figures["radio calibration"] = sensor_checks.calibration_figures(*made)
     if log.scans is not None and len(log.scans.stamps):
         figures["lidar"] = sensor_checks.lidar_figures(log)
-        figures["lidar"]["turning"], turning = sensor_checks.turning_figures(log)
-    view = RecordingView(log, repaired, result, refused, figures, turning)
+    view = RecordingView(log, repaired, result, refused, figures)
     rules = (_check_notes, _check_map, _check_each_sensor)
     return Diagnosis(explained(ranked(finding for rule in rules for finding in rule(view))), figures)
 
@@ -152,7 +146,6 @@ def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:
     found = [*sensor_checks.check_odometry(view.log.odometry, figures["odometry"])]
     found += sensor_checks.check_radio(figures["uwb"]) if "uwb" in figures else ()
     found += sensor_checks.check_lidar(figures["lidar"]) if "lidar" in figures else ()
-    found += sensor_checks.check_turning(view.turning) if show_motion(view.log.scans) else ()
     for finding in found:
         if view.log.notes.one_clock and finding.kind in ("silences", "slow-odometry") and finding.sensor != "radio":
             cure = "a program wrote a pose with each scan that it used; where the raw log is left, map that"

@@ -7,11 +7,9 @@ import numpy as np
 
 from ..arrays import Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
-from ..lidar.laser_mounting import Turning, compare
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.repeats import RepeatPolicy
 from ..screening.units import CLEARLY, heading_agreement, heading_reading
-from ..screening.wheel_motion import show_motion
 from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, Odometry, SensorLog, UwbRanges, plausible
 
 Figures = dict[str, Any]
@@ -35,8 +33,6 @@ class CheckPolicy:
     """Hz; ranges and rays between odometry readings that are farther apart are placed badly at usual speeds."""
     window: ClassVar[float] = 2.0
     """s; anchors within it are in reach at one time."""
-    late: ClassVar[float] = 0.06
-    """s; clock offsets below are not distinguished from the time that a sweep takes."""
     sigmas: ClassVar[float] = 5.0
     """Standard deviations beyond which nothing is noise."""
 
@@ -257,19 +253,6 @@ def lidar_figures(log: SensorLog) -> Figures:
     return rhythm(scans.stamps, expected_gap=1.0) | {"beams": beams} | _rounded(figures)
 
 
-def turning_figures(log: SensorLog) -> tuple[Figures, Turning | None]:
-    """Return what laser and wheels measure of turns, as figures and as such."""
-    turning = compare(log) if show_motion(log.scans) else None
-    if turning is None:
-        return {}, None
-    figures = {
-        "misfit rad": turning.as_given,
-        "misfit if mounted the other way up rad": turning.other,
-        "laser_delay s": turning.delay,
-    }
-    return {"pairs": turning.pairs} | _rounded(figures), turning
-
-
 def check_lidar(figures: Figures) -> Iterator[Finding]:
     """Say what rhythm and beams of the scans show."""
     yield from check_rhythm("lidar", figures)
@@ -281,22 +264,3 @@ def check_lidar(figures: Figures) -> Iterator[Finding]:
     elif invalid > 0.5:
         cure = "dark or slanting surfaces; they are left out and clear no space"
         yield Finding("error-codes", NOTE, f"{invalid:.0%} of the readings are error codes", cure, "lidar")
-
-
-def check_turning(turning: Turning | None) -> Iterator[Finding]:
-    """Say what the turns of laser and wheels show of clock and beam order."""
-    if turning is None:
-        cure = "clock offset and mounting of the laser cannot be checked"
-        yield Finding("no-turns", NOTE, "the robot hardly turns in place", cure, "lidar")
-        return
-    if not turning.agree:
-        text = f"laser and wheels disagree on turning (typically by {turning.misfit:.2f} rad of {turning.typical:.2f} rad)"
-        yield Finding("turns-disagree", WARNING, text, "check the stamps, the beam order and the wheels' heading", "lidar")
-        return
-    if abs(turning.delay) > CheckPolicy.late and turning.delay_clear:
-        text = (
-            f"the laser's stamps are about {abs(turning.delay):.2f} s too {'early' if turning.delay > 0.0 else 'late'} for the "
-            f"odometry's clock (laser_delay {turning.delay:+.2f} s, to be added to them)"
-        )
-        cure = "a map measures it better and corrects small offsets; stamp both with one clock, each when its reading begins"
-        yield Finding("laser-delay", WARNING, text, cure, "lidar")

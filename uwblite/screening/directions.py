@@ -7,17 +7,14 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..findings import Fact
-from ..lidar import laser_mounting
 from ..sensor_log import SensorLog
 from .units import CLEARLY, heading_reading
-from .wheel_motion import PairPolicy, Pairs
+from .wheel_motion import PairPolicy, Pairs, compare
 
-_TURNS = 300
-"""Pairs of scans, at most, by whose turns it is decided whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
 """Angle by which a laser points elsewhere than given, and turn up to which a pair of scans shows the direction of driving;
-difference up to which directions of motion agree, all rad; and share of them that must agree. Along bare walls a match stays at
-the wheels' guess, whichever way the laser looks."""
+difference up to which directions of motion agree, all rad; and share of pairs that must agree. Along bare walls a match stays
+at the wheels' guess, whichever way the laser looks."""
 
 
 def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
@@ -29,26 +26,30 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     tried = {
         what: replace(log, odometry=replace(log.odometry, poses=log.odometry.poses * signs)) for what, signs in mirrors.items()
     }
-    fits = {what: _fits_laser(other) for what, other in tried.items()}
+    fits = {what: _turns_alike(compare(other)) for what, other in tried.items()}
     best = max(fits, key=lambda what: fits[what])
-    return tried[best], [Fact.of("heading-against-path", inverted=best, settled=fits[best] > 0.0)]
+    return tried[best], [Fact.of("heading-against-path", inverted=best, settled=fits[best] > 0)]
 
 
-def _fits_laser(log: SensorLog) -> float:
-    """Return 1 where the laser's turns agree with the wheels', -1 where they are the other way round, 0 where none decides."""
-    seen = None if log.scans is None or not len(log.scans.stamps) else laser_mounting.compare(log, _TURNS)
-    if seen is None or not seen.agree:
-        return 0.0
-    return -1.0 if seen.turned_over else 1.0
+def _turns_alike(pairs: Pairs | None) -> int:
+    """Return 1 where lidar and wheels turn the same way, -1 where they turn opposite ways, 0 where nothing shows it."""
+    if pairs is None:
+        return 0
+    by_wheels, by_lidar = pairs.wheels[:, 2], pairs.lidar[:, 2]
+    clear = pairs.measured & (np.minimum(np.abs(by_wheels), np.abs(by_lidar)) > PairPolicy.moving)
+    if clear.sum() < PairPolicy.enough:
+        return 0
+    alike = float(np.mean((by_wheels * by_lidar > 0.0)[clear]))
+    return int(alike > _CONCENTRATED) - int(1.0 - alike > _CONCENTRATED)
 
 
-def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
+def laser_upright(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the laser mounted upright or upside down, as its turns show.
 
     A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in opposite
     directions. This repairs the first two; the third would give a mirror image, and nothing distinguishes them.
     """
-    if _fits_laser(log) >= 0.0:
+    if _turns_alike(pairs) >= 0:
         return log, []
     flipped = not log.mounting.laser_flipped
     log = replace(log, mounting=replace(log.mounting, laser_flipped=flipped))

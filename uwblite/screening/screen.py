@@ -48,8 +48,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     facts += [*set_right, *outside, *repeated, *spread, *times, *glitches, *broken, *turned]
     repairs = [repeats.without_repeated_scans, repeats.without_lidar_marks, repeats.without_own_body]
     repairs += [repeats.without_marks, repeats.without_repeated_ranges, range_motion.without_shared_names]
-    repairs += [explained_by_ranges, directions.heading_with_the_path]
-    repairs += [directions.laser_upright] * turn_laser + [clocks.with_late_scans_placed]
+    repairs += [explained_by_ranges, directions.heading_with_the_path, clocks.with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)
         facts += more
@@ -58,9 +57,10 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     if pairs is not None and not pairs.measured.any():
         silent += wheel_motion.unmatched(pairs)
         pairs = None
-    if pairs is not None:
-        log, ahead = directions.laser_ahead(log, pairs)
-        pairs, silent = wheel_motion.compare(log) if ahead else pairs, silent + ahead
+    for mounted_as_seen in (directions.laser_upright,) * turn_laser + (directions.laser_ahead,):
+        if pairs is not None:
+            log, mounted = mounted_as_seen(log, pairs)
+            pairs, silent = wheel_motion.compare(log) if mounted else pairs, silent + mounted
     ratio = float("nan") if pairs is None else pairs.way_ratio
     units.refuse_other_ranges(range_motion.change_by_way(log), ratio)
     log, pairs, lost, standing = _lost_wheels(log, pairs)
