@@ -20,9 +20,7 @@ from uwblite.io.graph_file import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
 from uwblite.radio import graph_starts
 from uwblite.radio.graph_starts import (
-    _BEND,
     Start,
-    _converged,
     _places,
     place_anchors,
     place_chains,
@@ -30,7 +28,7 @@ from uwblite.radio.graph_starts import (
     starts,
     starts_nearby,
 )
-from uwblite.radio.trilateration import AnchorHypothesis
+from uwblite.radio.trilateration import AnchorHypothesis, PathPlacement
 
 
 def test_an_anchor_of_two_ranges_has_a_place_only_where_one_is_given():
@@ -219,26 +217,8 @@ def test_four_robots_of_tiers_from_their_odometry(shared_data, tmp_path):
 def test_the_best_places_of_a_chain_are_four_a_tenth_apart_the_cheapest_first(monkeypatch):
     """By distance or by heading; of places nearer to each other than that only the cheapest counts."""
     found = [(3.0, 0.0, 0.11), (1.0, 0.0, 0.0), (2.0, 0.09, 0.09), (9.0, 0.5, 0.0), (4.0, 0.12, 0.0), (5.0, 0.3, 0.0)]
-    ends = iter([(cost, np.array([x, 0.0, theta])) for cost, x, theta in found])
-    monkeypatch.setattr(graph_starts, "_starts", lambda *_: found)
-    monkeypatch.setattr(graph_starts, "_converged", lambda *_: next(ends))
+    ends = [PathPlacement(cost, np.array([x, 0.0, theta]), np.eye(3)) for cost, x, theta in sorted(found)]
+    monkeypatch.setattr(graph_starts, "path_placements", lambda *_: ends)
     assert [cost for cost, _ in _places(np.zeros((4, 2)), np.zeros((4, 2)), np.ones(4))] == [1.0, 3.0, 4.0, 5.0]
     ((cost, place),) = _places(np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))
     assert (cost, place.tolist()) == (0.0, [0.0] * 3)
-
-
-def test_from_everywhere_the_search_goes_down():
-    """The cost is sum log(1 + (error / bend)^2); a step that would raise it is tried again, shorter."""
-    rng = np.random.default_rng(7)
-    there, own, place = rng.uniform(-1, 1, (20, 2)), rng.uniform(-1, 1, (20, 2)), np.array([1.0, -2.0, 0.5])
-    ranges = np.hypot(*(se2.transform(place, own) - there).T) + rng.normal(0.0, 0.05, 20)
-
-    def cost(T):
-        return np.log1p(((np.hypot(*(se2.transform(T, own) - there).T) - ranges) / _BEND) ** 2).sum()
-
-    starts = np.column_stack([rng.uniform(-8, 8, (20, 2)), rng.uniform(-3, 3, 20)])
-    found = [_converged(start, there, own, ranges) for start in starts]
-    for start, (least, T) in zip(starts, found, strict=True):
-        assert least == pytest.approx(cost(T))
-        assert least < cost(start) - 1.0
-    assert np.abs(se2.between(place, min(found, key=lambda f: f[0])[1])).max() < 0.1

@@ -14,6 +14,7 @@ from uwblite.radio.trilateration import (
     _refine,
     _scored,
     ambiguous,
+    path_placements,
     trilaterate,
     trilaterate_each,
 )
@@ -220,3 +221,24 @@ def test_covariances_are_those_of_least_squares_with_the_bias_under_its_prior():
     normal[2, 2] += (drift / CONFIG.bias_sigma) ** 2
     normal += 1e-3 * np.diag(np.diag(normal))
     np.testing.assert_allclose(covariance[0], np.linalg.inv(normal), rtol=1e-3, atol=1e-6)
+
+
+def test_a_rigid_path_is_placed_among_known_points_by_ranges_some_of_which_are_false():
+    """The cost is half of sum c^2 log(1 + (error / c)^2) with c = 2.5 standard deviations; no motion nearby is cheaper."""
+    rng = np.random.default_rng(7)
+    points, tags, truth = rng.uniform(-1, 1, (20, 2)), rng.uniform(-1, 1, (20, 2)), np.array([1.0, -2.0, 0.5])
+    ranges = np.hypot(*(se2.transform(truth, tags) - points).T) + rng.normal(0.0, 0.05, 20)
+    ranges[:2] += 3.0
+    roots = np.full(20, 5.0)
+
+    def cost(motion, size=np.inf):
+        errors = np.append(roots * (np.hypot(*(se2.transform(motion, tags) - points).T) - ranges), motion / size)
+        return 0.5 * 2.5**2 * np.log1p((errors / 2.5) ** 2).sum()
+
+    for size in (np.inf, 1.0):
+        best, *others = path_placements(points, tags, ranges, roots, size)
+        assert best.cost == pytest.approx(cost(best.motion, size))
+        assert all(best.cost <= other.cost for other in others)
+        assert all(cost(best.motion + step, size) > best.cost for step in 0.01 * np.concatenate([np.eye(3), -np.eye(3)]))
+        assert np.abs(se2.between(truth, best.motion)).max() < 0.1
+    assert np.linalg.eigvalsh(best.information).min() > 1.0

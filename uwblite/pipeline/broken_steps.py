@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from .. import se2
 from ..arrays import Floats, Ints
@@ -19,6 +18,7 @@ from ..findings import Fact
 from ..radio.place_evidence import Explanation, MovePolicy, PlaceModel, Track, intervals_of
 from ..radio.place_intervals import explain
 from ..radio.range_noise import short_term_sigma
+from ..radio.trilateration import path_placements
 from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
 
@@ -31,16 +31,12 @@ class BreakPolicy:
     """Probability that a recording's path has one."""
     size: ClassVar[float] = 1.0
     """Standard deviation of the error of such a step, m and rad."""
-    turns: ClassVar[int] = 8
-    """Headings from which the error of the step is sought."""
     rounds: ClassVar[int] = MovePolicy.laps
     """Most solutions of a path that ranges hold; two are usual."""
     near: ClassVar[int] = 3
     """Ranges by which the time of a change may be off."""
     sigma: ClassVar[float] = 0.1
     """Least standard deviation of ranges of known places, m."""
-    loss: ClassVar[float] = 2.5
-    """Standard deviations from which on an error counts less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,34 +260,11 @@ class BrokenStep:
             at, bias = each.place[own], np.array([place.bias for place in each.found])
             root = np.sqrt(radio.model.worth(each.place)[own]) / max(2.0 * radio.track.sigma, BreakPolicy.sigma)
             parts.append((each.places[at], radio.track.path[own], radio.track.level(each.height)[own] - bias[at], root))
-        places, tags, measured, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
+        places, tags, measured, root = (np.concatenate(each) for each in zip(*parts, strict=True))
         place, tag = se2.transform(home, places), se2.transform(home, tags)
 
-        def errors(step: Floats) -> Floats:
-            """Return whitened errors of the ranges, and the prior of the step."""
-            distance = np.hypot(*(se2.transform(step, tag) - place).T)
-            return np.append(weight * (distance - measured), step / BreakPolicy.size)
-
-        angles = np.linspace(-np.pi, np.pi, BreakPolicy.turns, endpoint=False)
-        starts = [*np.column_stack([np.zeros((len(angles), 2)), angles]), *self._motions_of_anchors(home)]
-        tried = [least_squares(errors, start, loss="cauchy", f_scale=BreakPolicy.loss) for start in starts]
-        done = min(tried, key=lambda each: float(each.cost))
-        spread = -0.5 * np.linalg.slogdet(done.jac.T @ done.jac)[1] - len(done.x) * np.log(BreakPolicy.size)
-        return np.asarray(done.x), float(spread)
-
-    def _motions_of_anchors(self, home: Floats) -> list[Floats]:
-        """Return motions (3,) of the stretch that would move the anchors of the moves back to where they were."""
-        if not self.moves:
-            return []
-        places = [self.before[move.radio].places for move in self.moves]
-        former = [move.before for move in self.moves]
-        later = [int(self.before[move.radio].place[move.interval[0]]) for move in self.moves]
-        here, there = (
-            se2.transform(home, np.array([of[k] for of, k in zip(places, numbers, strict=True)]))
-            for numbers in (former, later)
-        )
-        shift = np.append((here - there).mean(axis=0), 0.0)
-        return [shift, se2.align(there, here)] if len(here) > 1 else [shift]
+        _, motion, information = path_placements(place, tag, measured, root, BreakPolicy.size)[0]
+        return motion, float(-0.5 * np.linalg.slogdet(information)[1] - len(motion) * np.log(BreakPolicy.size))
 
     def _cost(self, poses: Floats) -> float:
         """Return chi2 of what ties the stretch to the rest besides ranges: scans of other visits, and what the user gave.

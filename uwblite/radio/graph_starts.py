@@ -1,10 +1,9 @@
 """Starts for the optimisation of an imported graph: every chain and every anchor gets a place.
 
 Without a certificate (graph/certificate.py) further starts may lead to a lower minimum. Trajectories of several robots that
-only ranges and landmarks connect are placed one after another, the best connected first, each rigid: for every heading R on a
-circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at b) means
-|a - R b - t| = d; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. A robust descent follows,
-because odometry drifts and some ranges are wrong. The optimisation of the whole graph decides between several hypotheses.
+only ranges and landmarks connect are placed one after another, the best connected first, each rigid, by the ranges to placed
+points (0 where the chain sees a landmark; trilateration.path_placements). The optimisation of the whole graph decides between
+several hypotheses.
 """
 
 from collections.abc import Iterable, Iterator
@@ -12,7 +11,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
@@ -21,16 +19,14 @@ from ..graph.graph import Graph
 from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
-from .trilateration import TrilaterationConfig, trilaterate
+from .trilateration import TrilaterationConfig, path_placements, trilaterate
 
 _CLEARLY = 0.02
 """Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
-_HEADINGS = 24
-"""Starts of a chain's heading."""
 _MOST_RANGES, _LEAST_RANGES = 300, 4
 """Ranges used for one chain: more add no information; fewer are three unknowns and no check."""
-_BEND = 0.5
-"""m; from this residual on a range gets less weight: the error of rigid chains after some minutes of odometry."""
+_BEND = 0.2
+"""m; standard deviation of a range along a rigid chain: the error after some minutes of odometry."""
 _KEPT, _APART = 4, 0.1
 """Hypotheses kept, and m and rad between them."""
 
@@ -186,28 +182,7 @@ def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Flo
     if len(ranges) < _LEAST_RANGES:
         return [(0.0, np.zeros(3))]
     best: list[tuple[float, Floats]] = []
-    for cost, T in sorted((_converged(start, there, own, ranges) for start in _starts(there, own, ranges)), key=lambda p: p[0]):
-        if all(np.abs(se2.between(T, other)).max() > _APART for _, other in best):
-            best.append((cost, T))
+    for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _BEND)):
+        if all(np.abs(se2.between(motion, other)).max() > _APART for _, other in best):
+            best.append((cost, motion))
     return best[:_KEPT]
-
-
-def _starts(there: Floats, own: Floats, ranges: Floats) -> list[Floats]:
-    starts = []
-    for theta in np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False):
-        p = there - se2.rotate(np.full(len(own), theta), own)
-        A = np.column_stack([-2.0 * p, np.ones(len(p))])
-        t = np.linalg.lstsq(A, ranges**2 - np.sum(p**2, axis=1), rcond=None)[0]
-        starts.append(np.array([t[0], t[1], theta]))
-    return starts
-
-
-def _converged(start: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
-    """Return cost and place after a descent with Cauchy weights."""
-
-    def residuals(T: Floats) -> Floats:
-        return np.asarray(np.hypot(*(se2.transform(T, own) - there).T) - ranges)
-
-    found = least_squares(residuals, start, loss="cauchy", f_scale=_BEND)
-    T = np.array([*found.x[:2], float(se2.wrap_angle(found.x[2]))])
-    return float(np.log1p((found.fun / _BEND) ** 2).sum()), T

@@ -1,16 +1,21 @@
-"""Places of anchors by ranges along a path alone.
+"""Places of anchors by ranges along a path alone, and places of a rigid path by ranges to known points.
 
 The intersection of the circles is searched, not linearised: every cell of a coarse raster is scored by how many
 ranges agree with it up to one common bias (their median), so up to almost half of the ranges may be outliers. The best
 cells are refined one by one. A straight path leaves two mirrored positions that fit equally well; both are returned.
+
+A rigid path is placed from a circle of headings R: a range d from its point b to a known point a means |a - R b - t| = d;
+squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. A robust descent follows.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
+from .. import se2
 from ..arrays import MAD_TO_SIGMA, Floats, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
@@ -212,3 +217,44 @@ def _scored(
     spread = own * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0.0))
     order = np.argsort(cost, kind="stable").tolist()
     return [AnchorHypothesis(states[k, :2], float(bias[k]), float(own[k]), float(cost[k]), float(spread[k])) for k in order]
+
+
+class PathPlacement(NamedTuple):
+    """A place of a rigid path."""
+
+    cost: float
+    """Half the robust sum of squares of whitened errors and of the prior."""
+    motion: Floats
+    """(3,) T_points_path."""
+    information: Floats
+    """(3, 3) of the motion, of errors and prior."""
+
+
+_HEADINGS, _LOSS = 12, 2.5
+"""Starts of the heading, and standard deviations from which on an error counts less."""
+
+
+def path_placements(
+    points: Floats, tags: Floats, ranges: Floats, roots: Floats, size: float = np.inf
+) -> list[PathPlacement]:
+    """Return the places of a rigid path, one from each of some headings, the best first.
+
+    Parameters
+    ----------
+    points : (m, 2) known ones, m. tags : (m, 2) the tag in the path's frame, m. ranges : (m,) between them, m.
+    roots : (m,) square roots of the ranges' information, 1/m. size : prior standard deviation of the motion, m and rad.
+    """
+
+    def errors(motion: Floats) -> Floats:
+        distance = np.hypot(*(se2.transform(motion, tags) - points).T)
+        return np.append(roots * (distance - ranges), motion / size)
+
+    found = []
+    for heading in np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False):
+        away = points - se2.rotate(np.full(len(tags), heading), tags)
+        rows = roots[:, None] * np.column_stack([-2.0 * away, np.ones(len(away))])
+        place = np.linalg.lstsq(rows, roots * (ranges**2 - np.sum(away**2, axis=1)), rcond=None)[0][:2]
+        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=_LOSS)
+        motion = np.append(done.x[:2], se2.wrap_angle(done.x[2]))
+        found.append(PathPlacement(float(done.cost), motion, done.jac.T @ done.jac))
+    return sorted(found, key=lambda each: each.cost)
