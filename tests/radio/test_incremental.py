@@ -211,13 +211,13 @@ def test_an_anchor_with_a_mirror_image_joins_at_the_end_only():
     np.testing.assert_allclose(np.abs(straight.graph.anchors[0]), [14.0, 6.0], atol=0.05)
 
 
-def test_an_anchor_is_searched_once_there_are_ranges_and_again_with_a_fifth_more():
+def test_an_anchor_is_searched_once_there_are_ranges_and_again_with_half_more():
     state = _one_anchor(False)
     tried = []
-    for now in (19, 20, 23, 24, 28, 29):
+    for now in (19, 20, 29, 30, 44, 45):
         state._search(now)
         tried.append(int(state.tried[0]))
-    assert tried == [0, 20, 20, 24, 24, 29]
+    assert tried == [0, 20, 20, 30, 30, 45]
 
 
 def test_a_place_that_is_not_certain_does_not_join_yet(monkeypatch):

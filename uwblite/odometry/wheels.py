@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, spread, weighted_median
+from ..arrays import TINY, Floats, Ints, spread, weighted_median
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
@@ -89,7 +89,7 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
     off = np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off)
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
-    covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    covariance = np.linalg.pinv(information, rcond=TINY, hermitian=True)
     seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
     in_wheels = wheels.end_sqrt_information[own]
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))

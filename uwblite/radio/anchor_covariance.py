@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Bools, Floats, spread, spread_about_median
+from ..arrays import TINY, Bools, Floats, spread, spread_about_median
 from ..graph.graph import Graph, edge_weights
 from ..graph.marginals import Covariances, Marginals, marginals
 from ..graph.range_edges import RangeEdges
@@ -35,8 +35,6 @@ _SAMPLE = 200
 """Ranges of a sample from which the share of an error that remains in residuals is computed."""
 _NO_WEIGHT = 1e-12
 """Weight below which a range does not count."""
-_LEAST_SIGMA, _LEAST_SHARE = 1e-9, 1e-9
-"""m and rad, below any; share of a variance below which round-off begins."""
 
 
 def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
@@ -132,10 +130,10 @@ def _grown(plain: Covariances, among: Floats, moving: Bools) -> Floats:
 
 def _root(covariances: Floats) -> Floats:
     """Return the lower triangles L (k, 3, 3) with L L^T = covariances, which round-off may have made indefinite."""
-    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariances), _LEAST_SIGMA**2))
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariances), TINY**2))
     correlations = covariances / (sigma[:, :, None] * sigma[:, None, :])
     values, vectors = np.linalg.eigh(correlations)
-    sound = (vectors * np.maximum(values, _LEAST_SHARE)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    sound = (vectors * np.maximum(values, TINY)[:, None, :]) @ vectors.transpose(0, 2, 1)
     return np.asarray(sigma[:, :, None] * np.linalg.cholesky(sound))
 
 

@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, runs_of, spread
+from ..arrays import TINY, Bools, Floats, Ints, runs_of, spread
 from ..config import setting
 from ..graph.gnc import tightened
 from ..graph.graph import Graph, edge_cost
@@ -235,7 +235,7 @@ class Attempt:
         best, most, config = None, 0.0, self.config
         total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), config.seen)
         for length in [d for d in config.seed_distances if d < total] + [total]:
-            places = 1 + max(0, min(config.starts, int(2 * total / max(length, _TINY)) - 2))
+            places = 1 + max(0, min(config.starts, int(2 * total / max(length, TINY)) - 2))
             for start in np.linspace(0.0, total - length, places):
                 low = int(np.searchsorted(self.path, start))
                 high = int(np.searchsorted(self.path, start + length, "right"))
@@ -244,7 +244,7 @@ class Attempt:
                 found = self._search(low, high, config.drift * length)
                 clear = [h[0] for h in found.values() if h and not ambiguous(h, self.search)]
                 worth = sum(1.0 / (1.0 + h.sigma / config.range_sigma + h.position_sigma) for h in clear)
-                if worth > most + _TINY or (best is None and length == total):
+                if worth > most + TINY or (best is None and length == total):
                     best, most = (found, low, high), worth
             if most > config.clear_enough * count:
                 break
@@ -399,7 +399,3 @@ class Attempt:
         radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
         alone = Graph(self.poses[low:high], self.anchors, (), self.calibration, work=self.graph.work)
         return alone.with_edges(wheels, radio)
-
-
-_TINY = 1e-9
-"""Lengths, m, and scores that are none."""

@@ -21,6 +21,7 @@ from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, optimize
 from ..graph.unknowns import free_unknowns
+from ..problem.solution import rough
 from .graph_starts import ranges_to
 from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
@@ -40,8 +41,7 @@ class IncrementalPolicy:
     significance: ClassVar[float] = 5.0
     """Standard deviations by which chi2 may exceed the usual."""
     ranges: ClassVar[int] = 20
-    again: ClassVar[float] = 1.2
-    """Ranges before an anchor is searched, and the factor on them after which it is searched again."""
+    """Ranges before an anchor is searched; it is searched again when there are `resolve_factor` times as many."""
     position_sigma: ClassVar[float] = 0.5
     drift: ClassVar[float] = 0.1
     """An anchor less certain than this is not added yet, m; assumed error of the path that it is searched from, m."""
@@ -50,7 +50,7 @@ class IncrementalPolicy:
     """Standard deviations beyond which a range is an outlier, and the share of these with which an anchor is removed."""
     search: ClassVar[TrilaterationConfig] = TrilaterationConfig(ambiguity=0.7)
     """Stricter than usual, since another try comes soon."""
-    step: ClassVar[SolverConfig] = SolverConfig(max_iterations=30, relative_decrease=1e-4)
+    step: ClassVar[SolverConfig] = rough(SolverConfig())
     """Of the intermediate optimisations."""
 
 
@@ -238,7 +238,7 @@ class _Incremental:
     def _search(self, now: int) -> None:
         """Place the anchors that the ranges so far make clear; at the end also those that stay doubtful."""
         last, counts, anchors = now == len(self.guess), self._counts(now), self.graph.anchors.copy()
-        enough = counts >= np.maximum(IncrementalPolicy.ranges, IncrementalPolicy.again * self.tried)
+        enough = counts >= np.maximum(IncrementalPolicy.ranges, IncrementalPolicy.resolve_factor * self.tried)
         for anchor in np.flatnonzero(~self.joined & (last | enough)).tolist():
             self.tried[anchor] = counts[anchor]
             measured = (edges.rows(edges.anchor == anchor) for edges in self._ranges(now))

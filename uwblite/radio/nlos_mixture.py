@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import erfcx
 
-from ..arrays import MAD_TO_SIGMA, Floats
+from ..arrays import MAD_TO_SIGMA, TINY, Floats
 
 _TAIL, _DETOUR, _WILD = 0.2, 0.5, 0.05
 """Usual share of ranges with a detour, mean detour, m, and share of gross errors."""
@@ -115,7 +115,7 @@ def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> Range
         of_core, of_tail, gross = float(core.sum()), float(slow.sum()), rest * float(each.sum())
         total = of_core + of_tail + gross + _CLEAN
         tail, wild = of_tail / total, gross / total
-        of_core, of_tail = max(of_core, _NOTHING), max(of_tail, _NOTHING)
+        of_core, of_tail = max(of_core, TINY), max(of_tail, TINY)
         detour = max(float(slow @ expected) / of_tail, _SHORTEST * sigma)
         moved = float(core @ off) / of_core
         centre += moved
@@ -132,10 +132,6 @@ def shortest_half(values: Floats) -> tuple[float, float]:
     spans = order[inside - 1 :] - order[: len(order) - inside + 1]
     first = int(np.argmin(spans))
     return float(order[first : first + inside].mean()), 0.5 * MAD_TO_SIGMA * float(spans[first])
-
-
-_NOTHING = 1e-9
-"""Ranges that are none."""
 
 
 def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats, Floats]:

@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, runs_of
+from ..arrays import TINY, Bools, Floats, Ints, runs_of
 from .nlos_mixture import RangeMixture, fit
 from .range_noise import RangeNoiseConfig, independent_shares
 from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
@@ -151,7 +151,7 @@ class PlaceModel:
         error = np.zeros(len(place))
         for _ in range(MovePolicy.laps):
             offset = at[of] - path
-            distance = np.maximum(np.hypot(*offset.T), _TINY)
+            distance = np.maximum(np.hypot(*offset.T), TINY)
             error[placed], direction = level[placed] - distance, offset / distance[:, None]
             likely, pulled, weight = self._errors(error, group, place >= 0, shares)
             information, gradient = np.tile(free, (len(at), 1, 1)), np.zeros((len(at), 2))
@@ -161,7 +161,7 @@ class PlaceModel:
             step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
             if np.abs(step).max() < self.config.still:
                 break
-            at = at + step * np.minimum(1.0, MovePolicy.farthest / np.maximum(np.hypot(*step.T), _TINY))[:, None]
+            at = at + step * np.minimum(1.0, MovePolicy.farthest / np.maximum(np.hypot(*step.T), TINY))[:, None]
         evidence = likely + self._log_prior(place, height)
         evidence += float(np.sum(np.log(2.0 * np.pi / self.area) - 0.5 * determinants))
         sigma = np.linalg.eigvalsh(information)[:, 0] ** -0.5
@@ -205,8 +205,6 @@ class PlaceModel:
         return moved + (float(np.log(policy.usual / len(policy.heights))) if height != self.track.heights[0] else 0.0)
 
 
-_TINY = 1e-9
-"""m; keeps divisions finite."""
 _NOWHERE = AnchorHypothesis(np.zeros(2), 0.0, 1.0, np.inf, np.inf)
 """In place of that of too few ranges."""
 

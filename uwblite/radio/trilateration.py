@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, Floats, row_medians
+from ..arrays import MAD_TO_SIGMA, TINY, Floats, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
 
@@ -53,8 +53,6 @@ class TrilaterationConfig:
     """Most steps of descent, and m of one that ends it; also the damping, as a share of the information."""
 
 
-_NEAREST = 1e-9
-"""m; keeps divisions finite."""
 _AT_ONCE = 8
 """Stretches searched together; more do not fit into the processor's cache."""
 
@@ -182,7 +180,7 @@ def _refine(
     for _ in range(config.steps):
         here, width = state[on], scale[on]
         dx, dy = here[:, :1] - x, here[:, 1:2] - y
-        distance = np.maximum(np.sqrt(dx * dx + dy * dy), _NEAREST)
+        distance = np.maximum(np.sqrt(dx * dx + dy * dy), TINY)
         rows = np.stack([dx / distance, dy / distance, np.ones_like(dx), ranges - distance - here[:, 2:]], axis=1)
         error = rows[:, -1]
         weight = 1.0 / np.square(1.0 + np.square(error / width[:, None]))
@@ -192,9 +190,9 @@ def _refine(
         prior = (np.clip(sigma, drift, width) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * here[:, 2]
-        equations += config.still * equations * eye + _NEAREST * eye
+        equations += config.still * equations * eye + TINY * eye
         delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
-        farthest = 2.0 * steps[on] / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), _NEAREST)
+        farthest = 2.0 * steps[on] / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), TINY)
         state[on] = here + delta * np.minimum(1.0, farthest)[:, None]
         normal[on] = equations
         tight = np.maximum(2.0 * sigma, max(drift, config.finest))
