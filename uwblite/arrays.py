@@ -29,6 +29,8 @@ TINY = 1e-9
 """Length, m, or share below which a value is rounding error."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
+OUTLIER = 3.0
+"""Standard deviations beyond which an error is gross: of normal ones 0.3 %."""
 
 
 class Table:

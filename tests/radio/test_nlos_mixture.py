@@ -1,6 +1,5 @@
 """Errors of ranges: core, detours and nonsense separated; late errors pull less than early ones."""
 
-
 import numpy as np
 import pytest
 from hypothesis import given

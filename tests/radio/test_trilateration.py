@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
+from uwblite.arrays import OUTLIER
 from uwblite.radio.trilateration import (
     AnchorHypothesis,
     TrilaterationConfig,
@@ -185,7 +186,7 @@ def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
     ranges = np.array([5.0, 4.0, 3.0]) + 0.3 + [0.1, -0.2, 4.0]
     covariance = np.array([[0.04, 0.0, 9.0], [0.0, 0.01, 9.0], [9.0, 9.0, 99.0]])
     scored = _scored(path, ranges, (state[None], covariance[None], np.array([0.5])), 0.1, CONFIG)[0]
-    assert scored.cost == pytest.approx((5.0 + CONFIG.outlier**2) / 3.0 + (0.3 / CONFIG.bias_sigma) ** 2 / 3.0)
+    assert scored.cost == pytest.approx((5.0 + OUTLIER**2) / 3.0 + (0.3 / CONFIG.bias_sigma) ** 2 / 3.0)
     assert (scored.sigma, scored.bias) == (0.5, 0.3)
     assert scored.position_sigma == pytest.approx(0.5 * 0.2)
     assert _scored(path, ranges, (state[None], -covariance[None], np.array([0.5])), 0.1, CONFIG)[0].position_sigma == 0.0

@@ -17,7 +17,7 @@ from ..arrays import Floats, Ints
 from ..findings import Fact
 from ..radio.place_evidence import Explanation, MovePolicy, PlaceModel, Track, intervals_of
 from ..radio.place_intervals import explain
-from ..radio.range_noise import short_term_sigma
+from ..radio.range_noise import MOST_RANGES, short_term_sigma
 from ..radio.trilateration import path_placements
 from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
@@ -35,8 +35,6 @@ class BreakPolicy:
     """Most solutions of a path that ranges hold; two are usual."""
     near: ClassVar[int] = 3
     """Ranges by which the time of a change may be off."""
-    sigma: ClassVar[float] = 0.1
-    """Least standard deviation of ranges of known places, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +83,7 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
         rows = rows[np.lexsort((ranges.stamps[rows], recording[rows]))]
         if not len(rows):
             continue
-        chosen = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MovePolicy.most_ranges)).round().astype(np.intp))
+        chosen = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_RANGES)).round().astype(np.intp))
         sample = rows[chosen]
         unknown = ranges.calibration[sample[0], 2] >= 0
         height = float(np.sqrt(max(values[sample[0], 2], 0.0)))
@@ -258,7 +256,7 @@ class BrokenStep:
             own = radio.inside(self.begin, self.end)
             own = own[each.place[own] >= 0]
             at, bias = each.place[own], np.array([place.bias for place in each.found])
-            root = np.sqrt(radio.model.worth(each.place)[own]) / max(2.0 * radio.track.sigma, BreakPolicy.sigma)
+            root = np.sqrt(radio.model.worth(each.place)[own]) / radio.model.usual.sigma
             parts.append((each.places[at], radio.track.path[own], radio.track.level(each.height)[own] - bias[at], root))
         places, tags, measured, root = (np.concatenate(each) for each in zip(*parts, strict=True))
         place, tag = se2.transform(home, places), se2.transform(home, tags)

@@ -28,7 +28,7 @@ from ..radio import bootstrap, prior_selection
 from ..radio.bootstrap_attempt import Measured
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, log_densities, range_edges
-from ..radio.range_noise import assumed, short_term_sigma
+from ..radio.range_noise import RangeNoiseConfig, assumed, short_term_sigma
 from . import joining, map_frame, range_alternatives
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -45,8 +45,6 @@ class LapPolicy:
     free too."""
     most_growth: ClassVar[float] = 1.3
     """Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
-    least_scatter: ClassVar[float] = 0.03
-    """m; scatter that is usual for radios, below which the growth is not tested."""
 
 
 def first_optimisation(task: Task) -> Estimate:
@@ -277,7 +275,7 @@ def _let_go(held: Estimate, weak: Estimate) -> bool:
     Noise learnt there would be the error of the poses, and would fix them where they are. Sustained outliers of one anchor
     cause residuals too, but of this anchor only.
     """
-    growth = np.array([b / max(a, LapPolicy.least_scatter) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
+    growth = np.array([b / max(a, RangeNoiseConfig().min_sigma) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
     return len(growth) > 0 and float(np.median(growth)) > LapPolicy.most_growth
 
 

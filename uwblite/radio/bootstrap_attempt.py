@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from .. import se2
-from ..arrays import TINY, Bools, Floats, Ints, runs_of, spread
+from ..arrays import OUTLIER, TINY, Bools, Floats, Ints, runs_of, spread
 from ..config import setting
 from ..graph.gnc import tightened
 from ..graph.graph import Graph, edge_cost
@@ -47,7 +47,7 @@ class BootstrapConfig:
     """Distance appended at once, as a share of the first stretch, and factors on it where the prediction held and where not."""
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
-    scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, 3.0)
+    scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, OUTLIER)
     """Scales of the ranges' kernel, one after the other, standard deviations."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
     range_sigma: float = setting(0.15, advanced=True)

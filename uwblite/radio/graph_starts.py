@@ -19,12 +19,13 @@ from ..graph.graph import Graph
 from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
+from .range_noise import MOST_RANGES
 from .trilateration import TrilaterationConfig, path_placements, trilaterate
 
 _CLEARLY = 0.02
 """Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
-_MOST_RANGES, _LEAST_RANGES = 300, 4
-"""Ranges used for one chain: more add no information; fewer are three unknowns and no check."""
+_LEAST_RANGES = 4
+"""Of a chain: fewer are three unknowns and no check."""
 _BEND = 0.2
 """m; standard deviation of a range along a rigid chain: the error after some minutes of odometry."""
 _KEPT, _APART = 4, 0.1
@@ -164,7 +165,7 @@ def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floa
             else:
                 own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
                 ranges.append(np.zeros(int(tied.sum())))
-    every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
+    every = max(-(-sum(map(len, ranges)) // MOST_RANGES), 1)
     return np.concatenate(there)[::every], np.concatenate(own)[::every], np.concatenate(ranges)[::every]
 
 

@@ -34,8 +34,6 @@ class MovePolicy:
     """That its line of sight changes lastingly while a recording is made; that one whose height nobody gave is high."""
     heights: ClassVar[tuple[float, ...]] = tuple(np.arange(1.0, 7.0).tolist())
     """m; heights above the tag that are tried."""
-    most_ranges: ClassVar[int] = 1000
-    """Ranges of one radio that are compared, spread evenly; a place needs no more."""
     splits: ClassVar[int] = 3
     likely: ClassVar[int] = 2
     """Times tried first, spread evenly over an interval's ranges, and divisions from which the search for times goes on."""

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, spread, unique_rows
+from ..arrays import OUTLIER, Bools, Floats, Ints, spread, unique_rows
 from ..config import setting
 from ..graph.robust import Kernel
 
@@ -41,8 +41,6 @@ class RangeNoiseConfig:
     """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
     enough: ClassVar[int] = 30
     """Ranges from which the noise, a correlation, or a covariance of an anchor is learnt."""
-    outlier: ClassVar[float] = 3.0
-    """Robust standard deviations to which residuals are clipped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +96,8 @@ _DISTANCES = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
 """m; bounds of the distances between places of which covariances are compared."""
 _LENGTHS, _MOST_SLOW = np.geomspace(0.3, 8.0, 15), 0.95
 """Correlation lengths that are tried, m, and share of the variance that is slow at most."""
-_MOST_PAIRED = 1000
-"""Most ranges of an anchor whose pairs are counted; more do not change the correlation, and the cost grows with the square."""
+MOST_RANGES = 1000
+"""Ranges of one anchor that are compared, spread evenly: more change neither a place nor a correlation."""
 
 
 def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNoiseConfig) -> RangeNoise:
@@ -115,7 +113,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     if not config.learn or kept.sum() < config.enough:
         return assumed(config)
     p, e = positions[kept], residuals[kept] - np.median(residuals[kept])
-    most = config.outlier * max(spread(e), config.min_sigma)
+    most = OUTLIER * max(spread(e), config.min_sigma)
     e = np.clip(e, -most, most)
     variance = max(float(e @ e) / len(e), config.min_sigma**2)
     covariance, pairs = _covariance_by_distance(p, e, _DISTANCES)
@@ -129,7 +127,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
 
 def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats, Floats]:
     """Return mean products of residuals (b,) and pair counts (b,) by distance between the places."""
-    stride = -(-len(e) // _MOST_PAIRED)
+    stride = -(-len(e) // MOST_RANGES)
     p, e = p[::stride], e[::stride]
     tree = cKDTree(p)
     # Both trees at once count pairs by the thousand; each pair comes twice and each place with itself once, at distance 0.

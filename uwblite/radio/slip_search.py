@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table, best_run
+from ..arrays import OUTLIER, Floats, Ints, Table, best_run
 from ..graph.robust import Kernel
 from ..odometry.slips import EVERY, LASTS, SPEED
 from ..problem.alternatives import EvidencePolicy
@@ -28,7 +28,7 @@ class SlipSearchPolicy:
     """Time over which the motion is sought, in mean durations of a slip: six in seven are shorter."""
     stride: ClassVar[float] = 0.5
     """Time between moments that are tried, in mean durations of a slip."""
-    kernel: ClassVar[Kernel] = Kernel("geman-mcclure", 3.0)
+    kernel: ClassVar[Kernel] = Kernel("geman-mcclure", OUTLIER)
     """Of ranges, in standard deviations."""
     bursts: ClassVar[int] = 3
     """Runs of ranges at a time at which a slip is tried."""

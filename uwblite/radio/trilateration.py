@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, TINY, Floats, row_medians
+from ..arrays import MAD_TO_SIGMA, OUTLIER, TINY, Floats, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
 
@@ -35,8 +35,6 @@ class TrilaterationConfig:
     """Longer readings are no ranges of such a radio, m."""
     bias_sigma: float = setting(0.6, above=0.0)
     """Plausible size of one anchor's constant error, m."""
-    outlier: ClassVar[float] = 3.0
-    """Standard deviations beyond which a range counts as an outlier when hypotheses are compared; also those of a bias."""
     ambiguity: float = setting(0.2, advanced=True)
     """An anchor is ambiguous where a second hypothesis costs less than this more: of 100 ranges, a likelihood ratio of e^10."""
     looked_at: ClassVar[int] = 200
@@ -68,7 +66,7 @@ class AnchorHypothesis:
     sigma: float
     """Robust standard deviation of the ranges about it, m."""
     cost: float
-    """Mean truncated squared residual, in units of the best hypothesis' variance; 0 perfect, outlier^2 hopeless."""
+    """Mean truncated squared residual, in units of the best hypothesis' variance; 0 perfect, OUTLIER^2 hopeless."""
     position_sigma: float
     """Larger standard deviation of the position were the errors independent, m."""
 
@@ -126,7 +124,7 @@ def _of_one_size(
     for k, (path, own) in enumerate(picked):
         own_refined = tuple(values[each == k] for values in refined)
         floor = max(float(own_refined[2].min()), 0.5 * drift, 0.5 * config.finest)
-        apart, distinct = max(config.outlier * floor, 0.5 * searched[k][2]), list[AnchorHypothesis]()
+        apart, distinct = max(OUTLIER * floor, 0.5 * searched[k][2]), list[AnchorHypothesis]()
         for hypothesis in _scored(path, own, own_refined, floor, config):
             if all(np.hypot(*(hypothesis.position - other.position)) > apart for other in distinct):
                 distinct.append(hypothesis)
@@ -143,7 +141,7 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     # Single precision is enough to choose cells, and takes half the time.
     across, along = (((axis[:, None] - place) ** 2).astype(np.float32) for axis, place in zip(axes, path.T, strict=True))
     error = ranges.astype(np.float32) - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
-    bias = np.clip(row_medians(error), -config.bias_sigma - step, config.outlier * config.bias_sigma + step)
+    bias = np.clip(row_medians(error), -config.bias_sigma - step, OUTLIER * config.bias_sigma + step)
     error -= bias[:, None]
     error /= config.shrinking * step
     cost = np.minimum(np.square(error, out=error), 1.0, out=error).mean(axis=1)
@@ -211,7 +209,7 @@ def _scored(
     states, covariances, own = refined
     offset, bias = states[:, :2, None] - path.T, states[:, 2]
     error = ranges - np.hypot(offset[:, 0], offset[:, 1]) - bias[:, None]
-    cost = np.minimum((error / sigma) ** 2, config.outlier**2).mean(axis=1) + (bias / config.bias_sigma) ** 2 / len(ranges)
+    cost = np.minimum((error / sigma) ** 2, OUTLIER**2).mean(axis=1) + (bias / config.bias_sigma) ** 2 / len(ranges)
     spread = own * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0.0))
     order = np.argsort(cost, kind="stable").tolist()
     return [AnchorHypothesis(states[k, :2], float(bias[k]), float(own[k]), float(cost[k]), float(spread[k])) for k in order]
