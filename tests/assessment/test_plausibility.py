@@ -285,3 +285,16 @@ def test_a_scale_that_another_unit_explains_is_a_doubt_where_no_lidar_says_whose
     notices = stages.doubts if doubted else stages.warnings
     assert [("yards" in n.text, n.kind) for n in notices] == [(scale > 0.09, "unusual-calibration")]
     assert len(stages.doubts) + len(stages.warnings) == 1
+
+
+@pytest.mark.parametrize("of", ["range_scale", "odometry_scale", "heading_scale"])
+@pytest.mark.parametrize(("off", "state", "severity"), [
+    (0.149, "estimated", "warning"), (0.151, "estimated", "doubt"), (-0.151, "estimated", "doubt"), (0.151, "prior", None),
+])  # fmt: skip
+def test_lengths_that_differ_by_more_than_15_percent_are_a_doubt(of, off, state, severity):
+    """Of ranges or wheels; turns are no lengths, and what the recording does not show is no finding."""
+    key = UnknownKey(of)
+    value = CalibrationEstimate(key, off, 0.01, "1", "relative error of all lengths", state)
+    found = [(f.severity, f.kind) for f in check_calibration([value], {key: Unknown(key, 0.02, "1", "")}, task_of(lidar=True))]
+    doubted = severity == "doubt" and of != "heading_scale"
+    assert found == ([] if severity is None else [("doubt", "scales") if doubted else ("warning", "unusual-calibration")])

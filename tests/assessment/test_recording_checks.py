@@ -134,8 +134,8 @@ def test_clocks_that_have_nothing_in_common(sound):
 
 
 def test_missing_sensors_and_notes_of_the_reader(without_scans):
-    assert_named(without_scans.without(uwb=True), "note", "no UWB ranges")
-    assert_named(without_scans, "note", "no laser scans")
+    assert_named(without_scans.without(uwb=True), "warning", "no UWB ranges")
+    assert_named(without_scans, "warning", "no lidar in use")
     notes = LogNotes(lines=1000, broken=30, broken_lines=((17, "not a number"),), warnings=("3 messages out of order",))
     noted = replace(without_scans, notes=notes)
     assert_named(noted, "warning", "30 of 1000 lines are broken and were skipped (line 17: not a number)")

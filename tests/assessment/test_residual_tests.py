@@ -6,23 +6,21 @@ import numpy as np
 import pytest
 from helpers.laser_walks import chained
 from helpers.planted_graphs import plain_ranges
-from helpers.planted_tasks import estimate_of, recordings_of, standing, task_of
+from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.assessment.residual_tests import (
     check_odometry,
     check_range_scatter,
-    check_scales,
     check_support,
 )
 from uwblite.graph.calibration import scan_indices
-from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.mapping import build_map
-from uwblite.sensor_log import OdometryBreaks, Screening
 
 
 @pytest.fixture(scope="module")
@@ -140,21 +138,6 @@ def test_a_slip_is_the_longest_way_and_turn_of_all_steps_that_slipped():
     assert "at t = 10, 20 s" in notice.text
 
 
-@pytest.mark.parametrize(("ratios", "said"), [
-    ((), None), ((np.nan, 1.0), None), ((1.0, 1.16), 1.16), ((0.84, 2.0), 0.84), ((1.14, 0.86), None),
-])  # fmt: skip
-def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
-    """By the first such recording; recordings that compare nothing do not count."""
-    task = task_of(standing(len(ratios) + 1, lidar=True, each=[screened(ratio) for ratio in ratios]))
-    found = check_scales(estimate_of(Graph(np.zeros((3, 3)))), task)
-    assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])
-
-
-def screened(ratio):
-    """Return what a recording has of a screening whose lidar measures so many times the distance of the wheels."""
-    return {"screening": Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)}
-
-
 @pytest.mark.parametrize(("poses", "edges", "alive", "doubted"), [
     (3, (), None, True), (2, (), None, False), (3, (), False, True), (3, (), True, False), (3, ("ties",), None, False),
 ])  # fmt: skip
@@ -168,28 +151,6 @@ def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, ali
     graph = Graph(np.zeros((poses, 3)), np.zeros((1, 2)), edges=(ties,) * len(edges))
     found = check_support(estimate_of(graph, ranges=ranges), task_of())
     assert [n.kind for n in found if n.severity == "doubt"] == (["odometry-alone"] if doubted else [])
-
-
-@pytest.mark.parametrize(("scale", "placed", "lidar", "said"), [
-    (1.149, True, True, None), (1.151, True, True, "1.15 times the distances on the map: lidar or radio has a wrong unit"),
-    (0.849, True, False, "0.85 times the distances on the map: a radio measures time of flight"), (2.0, False, True, None),
-])  # fmt: skip
-def test_ranges_of_another_scale_are_named_where_anchors_are_placed(scale, placed, lidar, said):
-    calibration = Calibration((UnknownKey("bias", "A"), UnknownKey("range_scale")), np.array([5.0, scale - 1.0]))
-    graph, task = Graph(np.zeros((3, 3)), np.zeros((1, 2)), calibration=calibration), task_of(lidar=lidar)
-    doubts = [n for n in check_scales(estimate_of(graph, placed=[placed]), task) if n.severity == "doubt"]
-    assert [n.figures["range_scale"] for n in doubts] == ([] if said is None else [scale])
-    assert all(f"the ranges are {said}" in n.text for n in doubts)
-    biased = Graph(graph.poses, graph.anchors, calibration=Calibration((UnknownKey("bias", "A"),), np.array([5.0])))
-    assert list(check_scales(estimate_of(biased, placed=[placed]), task)) == []
-
-
-@pytest.mark.parametrize(("placed", "outcome"), [(True, "the ranges are 0.77 times the"), (False, "no ranges measure the")])
-def test_what_ranges_say_of_the_scale_of_wheels_and_lidar_is_said(placed, outcome):
-    calibration = Calibration((UnknownKey("range_scale"),), np.array([1.0 / 1.3 - 1.0]))
-    estimate = estimate_of(Graph(np.zeros((3, 3)), np.zeros((1, 2)), calibration=calibration), placed=[placed])
-    *_, notice = check_scales(estimate, task_of(standing(lidar=True, each=[screened(1.3)])))
-    assert f"measures 1.30 times the distance that the wheels count, and {outcome} distances on the map" in notice.text
 
 
 @pytest.mark.parametrize(("off", "steps", "said"), [

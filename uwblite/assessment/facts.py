@@ -78,8 +78,6 @@ class _Words(Formatter):
 class Text:
     """What is said of a fact."""
 
-    says: str
-    """What the finding is about, for docs/findings.md."""
     text: str
     """For people, with the fact's figures in braces."""
     severity: str = WARNING
@@ -98,170 +96,138 @@ class Text:
 
 TEXTS: Mapping[str, Text] = {
     "made-up-stamps": Text(
-        "Warn of stamps on a grid too coarse for a sensor's clock: they were made by counting messages.",
         "odometry and scans are stamped exactly every {period:g} s: these stamps were generated, not measured, so speeds, "
         "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock",
     ),
     "stamps-of-receipt": Text(
-        "Warn of stamps that are times of receipt behind a queue: no clock offset can be estimated against them.",
         "the stamps of {sensors:names} come in bursts: they are times of receipt behind a queue, not of measurement, "
         "so no clock offset is estimated, and speeds mean little; stamp each reading when it is measured",
     ),
     "clock-set-back": Text(
-        "Doubt a recording in which a sensor's clock was set back: its readings are in another order than they were made.",
         "the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there",
         DOUBT,
         "{sensor}",
     ),
     "clock-jump": Text(
-        "Warn of a clock that was set forward, as the ends of the sensors show; the stamps were moved back.",
         "the clock of the {clock} was set forward by {by:.1f} s at t = {at:.0f} s, as the ends of the sensors show: the "
         "{sensor}'s later stamps were moved by {moved:+.1f} s",
     ),
     "late-ranges": Text(
-        "Doubt ranges whose clock is off by seconds, as the path by the wheels shows: what is left of that bends the map.",
         "the ranges are stamped about {late:.0f} s late for the odometry, whose path they fit then: their stamps were "
         "corrected by that; use one clock",
         DOUBT,
         "radio",
     ),
     "stamps-in-bursts": Text(
-        "Warn of readings that share a stamp because they waited in a buffer; they were spread over the time since the last.",
         "{readings} come in bursts of about {size:.0f} with one stamp, every {period:.2f} s: they were spread over the time "
         "since the previous burst; stamp each reading when it is made",
     ),
     "repeated-odometry": Text(
-        "Warn of readings of the odometry that are in the log twice.",
         "odometry readings that are in the log twice: {count}; one of each was left out",
     ),
     "odometry-glitches": Text(
-        "Warn of readings of the odometry whose removal makes the path continuous again.",
         "{count} odometry readings lie far from the path (the first at t = {first:.1f} s) and were left out",
     ),
     "odometry-breaks": Text(
-        "Warn of steps of the odometry that no motion explains: the path was joined there by the motion before and after.",
         "the odometry jumps at t = {at:times} s (by up to {largest:.2f} m): only other sensors connect the path before and "
         "after",
     ),
     "odometry-gap": Text(
-        "Warn of a silence of the odometry in which the robot drove on: the pose after it counts, with the noise of the way.",
         "the odometry is silent for {seconds:.0f} s from t = {begin:.0f} s, while the robot drove on; ranges and scans of "
         "that time were left out",
     ),
     "hardly-moving": Text(
-        "Doubt a recording of a robot that stands: nothing can be placed from one spot.",
         "the robot hardly moves: {way:.2f} m in {seconds:.0f} s (turning {turned:.1f} rad); does the base "
         "report its wheels, in metres? Drive through the building",
         DOUBT,
     ),
     "laser-turned-away": Text(
-        "Warn of a laser that looks elsewhere than its pose says, by the motion that it and the wheels measure.",
         "the laser's direction differs by {degrees:+.0f} degrees from its given pose, by the motion that both "
         "measure; corrected: `mounting.T_base_laser={pose[0]:.3f},{pose[1]:.3f},{pose[2]:.3f}`",
     ),
     "late-scans": Text(
-        "Warn of scans that a queue delivered late: between neighbours that agree with the odometry, they show another place.",
         "{count} of {total} scans came late: they show where the robot was before, as their neighbours prove; their "
         "poses are those that they show",
     ),
     "scans-do-not-match": Text(
-        "Doubt a recording whose scans a short time apart hardly ever match: the readings are noise.",
         "successive scans do not match (nine of ten pairs share less than {share:.0%} of their "
         "points): the readings are noise, or beam order or angles are not as stated; check the lidar's driver",
         DOUBT,
     ),
     "repeated-ranges": Text(
-        "Warn of an anchor whose range stands still while the robot moves, more often than noise allows.",
         "anchor {anchor} repeats one range while the robot moves ({stretches:spans}); these were left out",
         anchor="{anchor}",
     ),
     "shared-name": Text(
-        "Warn of a name that two anchors have: its ranges alternate between two distances while the robot drives on.",
         "two anchors seem to have the name {anchor}: its ranges jump between two distances "
         "({jumps} of {total} times by more than the robot drove); they were left out, give each anchor its own name",
         anchor="{anchor}",
     ),
     "heading-against-path": Text(
-        "Warn of a heading that turns against the path: its sign was inverted, as the lidar shows where there is one.",
         "the odometry's heading turns against its path: {inverted} was inverted"
         "{settled:|; nothing in the recording shows whether the map is mirrored, so compare it with the building}",
     ),
     "laser-turned-over": Text(
-        "Doubt a recording whose laser and wheels turn in opposite directions: one of the two is the other way round.",
         "laser and wheels turn in opposite directions: the laser was taken as mounted {flipped:upside down|upright}, not as "
         "given; if the wheels are swapped instead, the map is mirrored: settle it by {flipped:|leaving out }"
         "`mounting.laser_flipped`, or by the odometry's sign",
         DOUBT,
     ),
     "repeated-scans": Text(
-        "Warn of scans that repeat the one before to the last digit.",
         "{count} of {total} scans equal the scan before ({stretches:spans}): "
         "{often:the driver sends scans again|the lidar or its driver was stuck}; they were left out",
     ),
     "repeated-readings": Text(
-        "Warn of a reading of the lidar that stands for no distance: it is the same wherever the robot is.",
         "{count} of {total} readings of the lidar are exactly {value:g} m, wherever the robot is: "
         "{reach:the lidar reports its reach where it sees nothing|a code, or a part of the robot in view}; "
         "they are not taken as walls",
     ),
     "anchor-heights": Text(
-        "Doubt a map without lidar where the ranges do not decide how high the anchors are, and the map depends on it.",
         "the ranges fit anchors {height:.1f} m above the tag about as well as low ones: taken as {taken:high|low}; if they "
         "are {taken:low|high}, the trajectory differs by {apart:.1f} m (rms); give the anchors' heights "
         "(`mounting.anchor_height`)",
         DOUBT,
     ),
     "landmark-distance": Text(
-        "Warn of a measured distance between landmarks that all other measurements contradict.",
         "the distance {landmarks} is {map:.3f} m in the map, not the {measured:.3f} m that were measured: "
         "all other measurements contradict it",
     ),
     "clock-offset": Text(
-        "Warn of an offset of the lidar's clock that each correction only makes larger.",
         "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
     ),
     "free-space-violation": Text(
-        "Doubt a map in which points of one visit to a place stand in the free space of another visit, by more than what moves "
-        "explains.",
         "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space, and within one visit "
         "only {moving:.0%}: parts of the map are misplaced to each other; look at the closures in report.html",
         DOUBT,
     ),
     "wheels-stand-still": Text(
-        "Warn of wheels that count nothing while other sensors move, where scans replace them; doubt where ranges alone do.",
         "the wheels count nothing from t = {begin:.0f} to {end:.0f} s while the robot moves: {by_scans:the motion between "
         "scans is used instead|the trajectory there rests on ranges alone}",
         "{by_scans:warning|doubt}",
     ),
     "own-body": Text(
-        "Warn of beams that see the robot itself: the same nearby at all places and headings.",
         "{count} of {total} beams of the lidar (at {sectors:sectors} degrees) see the same nearby however the robot is "
         "turned: the robot itself; they were left out",
     ),
     "new-anchor": Text(
-        "Warn of an anchor to which recordings before the first with ranges (1, 2, ...) should have ranges.",
         "anchor {anchor} has ranges only from recording {recording} on: {silent:recordings} drove within its reach "
         "without hearing it, so it is new or was off",
         anchor="{anchor}",
     ),
     "absent-anchor": Text(
-        "Warn of an anchor to which recordings after the last with ranges (1, 2, ...) should have ranges.",
         "anchor {anchor} has no ranges after recording {recording}: {silent:recordings} drove within its reach without "
         "hearing it, so it was taken away or is off",
         anchor="{anchor}",
     ),
     "turn-scale": Text(
-        "Warn of a scale of turns that the lidar's steps contradict: single turns of the odometry are wrong.",
         "from step to step the lidar turns {by_steps:factor} \u00b1 {sigma:.2f} times as much as the odometry, but the whole "
         "fits best with {by_all:factor}: single turns of the odometry are wrong; the steps' scale is used",
     ),
     "scans-astray": Text(
-        "Doubt a map of which scans lie so far from the others that no grid can hold both.",
         "{scans} scans are so far from the {used} others that no grid can hold both; they are not drawn",
         DOUBT,
     ),
     "open-loops": Text(
-        "Doubt a map in which stretches that may show the same place are still too uncertain for any search.",
         "the scans at t = {first:.0f} s and at t = {second:.0f} s may show the same place, but their relative position is "
         "known to {sigma:.1f} m only and no scan match confirms it ({pairs} such pairs): drive there once more in the same "
         "direction, or force the closure",

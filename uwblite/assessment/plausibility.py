@@ -23,10 +23,13 @@ from .certainty import check_certainty, check_drifts, check_other_side
 from .facts import check_recordings, say
 from .range_agreement import DISAGREE, check_range_agreement, check_wheels_against_lidar
 from .residual_tests import check_range_scatter, check_residuals
+from .sensor_checks import check_sensors
 from .untied_parts import check_untied_parts, check_untied_recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate gets a warning."""
+_OTHER_LENGTH = 0.15
+"""Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _LOST_WAY = 0.03
 """Share of the distance that, by the ranges, the wheels missed, from which on a map is too short."""
@@ -67,7 +70,7 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: check_anchors(view.anchors),
     lambda view: check_range_agreement(view.anchors, view.table, view.task),
     lambda view: check_moved_together(view.anchors, view.table, view.task),
-    lambda view: check_sensors(view.grid, view.task),
+    lambda view: check_sensors([recording.log for recording in view.task.recordings.each]),
     lambda view: check_closures(view.estimate, view.grid),
     lambda view: check_calibration(view.calibrated, view.usual, view.task),
     lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
@@ -167,18 +170,6 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
             return
 
 
-def check_sensors(grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
-    """Warn of sensors without data."""
-    logs = [recording.log for recording in task.recordings.each]
-    if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
-        yield warning("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
-    if grid is None:
-        text = "no lidar in use: no map, and only the odometry's turns show that trajectory and anchors are not mirrored"
-        yield warning("no-lidar", text)
-    elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
-        yield warning("empty-scans", "no scan has a reading: the map is empty")
-
-
 def check_closures(estimate: Estimate, grid: OccupancyGrid | None) -> Iterator[Finding]:
     """Warn of a map without loop closures: how far it has drifted, its uncertainty says (see check_certainty)."""
     candidates = estimate.closures.candidates
@@ -190,11 +181,12 @@ def check_closures(estimate: Estimate, grid: OccupancyGrid | None) -> Iterator[F
 def check_calibration(
     calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task
 ) -> Iterator[Finding]:
-    """Warn of each calibration value far outside its usual size.
+    """Warn of each calibration value far outside its usual size; doubt lengths of wheels or radio that are not the map's.
 
-    Ranges that are too long where the wheels counted nothing are a doubt: scans along a bare wall show only some of
-    such stretches, and a map that lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar
-    shows whether the unit is that of the wheels or of the radio.
+    The map has the lidar's lengths, and without one those of the radio, which measures times of flight. Ranges that are too
+    long where the wheels counted nothing are a doubt: scans along a bare wall show only some of such stretches, and a map that
+    lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar shows whether the unit is that
+    of the wheels or of the radio.
 
     Parameters
     ----------
@@ -202,14 +194,15 @@ def check_calibration(
     """
     said = kinds(task.stages.findings)
     for value in calibrated:
-        scale = value.key.kind == RANGE_SCALE
+        scale, length = value.key.kind == RANGE_SCALE, value.key.kind in (RANGE_SCALE, "odometry_scale")
         sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
         clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma)
         if value.state != "estimated" or value.key.kind == HEIGHT or not clear:
             continue
         unit = "" if value.unit == "1" else f" {value.unit}"
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
-        unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
+        kind = "scales" if length and abs(value.value) > _OTHER_LENGTH else "unusual-calibration"
+        unit_of = likely_unit(1.0 + value.value) if length else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
         text = (
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
@@ -217,8 +210,8 @@ def check_calibration(
         )
         if short:
             text += "; the wheels missed some of the travelled distance: the map may be too short"
-        add, figures = doubt if short or unclear else warning, {"value": value.value, "sigma": value.sigma, "usual": sigma}
-        yield add("unusual-calibration", text, name=value.name, **figures)
+        add = doubt if short or unclear or kind == "scales" else warning
+        yield add(kind, text, name=value.name, value=value.value, sigma=value.sigma, usual=sigma)
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:

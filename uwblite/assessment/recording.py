@@ -126,14 +126,11 @@ def _check_sensors(view: RecordingView) -> Iterator[Finding]:
     if repaired is not None and not any(sensor is not None and len(sensor.stamps) > 1 for sensor in sensors):
         text = "neither ranges nor scans are left to constrain the trajectory"
         yield Finding("odometry-alone", DOUBT, text, "odometry alone drifts", "log")
-    if "uwb" not in view.figures:
-        cure = "the map rests on wheels and lidar; check the tag if that is not meant"
-        if notes.unread:
+    for finding in sensor_checks.check_sensors([view.log]):
+        if finding.kind == "no-ranges" and notes.unread:
             cure = f"there may be some in what was not read: {', '.join(notes.unread)}; `mappings` say where (see above)"
-        yield Finding("no-ranges", NOTE, "there are no UWB ranges", cure, "radio")
-    if "lidar" not in view.figures:
-        cure = "there will be a trajectory and anchors, but no map"
-        yield Finding("no-lidar", NOTE, "there are no laser scans", cure, "lidar")
+            finding = replace(finding, cure=cure)
+        yield finding
 
 
 def _check_each_sensor(view: RecordingView) -> Iterator[Finding]:

@@ -12,7 +12,6 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, spread_about_median
 from ..findings import Finding, doubt, warning
-from ..graph.calibration import RANGE_SCALE
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..pipeline.estimate import Estimate, Task
@@ -33,8 +32,6 @@ _JUMP, _CARRIED = 20.0, 0.5
 """Standard deviations that a step of wheels on the floor never exceeds; and the size, m or rad, too large for slip."""
 _MEASURED = 1.0
 """Steps more uncertain than wheels that slip, m, are no measurements."""
-_SCALE = 0.15
-"""Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
 
 
 def seconds(recordings: Recordings, keyframe: int) -> float:
@@ -61,10 +58,9 @@ def between_keyframes(finding: Finding, recordings: Recordings, *spans: tuple[in
 
 
 def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
-    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, contradict."""
+    """Doubt a map that the residuals of ranges and odometry contradict."""
     yield from check_range_scatter(estimate, residuals, grid, task)
     yield from check_odometry(estimate, task)
-    yield from check_scales(estimate, task)
     yield from check_support(estimate, task)
 
 
@@ -149,28 +145,6 @@ def _slips(at: Ints, whitened: Floats, wheels: OdometryEdges, recordings: Record
     add = doubt if max(way, turn) > _CARRIED else warning
     spans = [(int(wheels.i[k]), int(wheels.j[k])) for k in at]
     return between_keyframes(add("odometry-slips", text, way=way, turn=turn), recordings, *spans)
-
-
-def check_scales(estimate: Estimate, task: Task) -> Iterator[Finding]:
-    """Compare the lengths that odometry, lidar and radio measure."""
-    calibration, lidar = estimate.graph.calibration, task.recordings.have_scans
-    place = calibration.index(RANGE_SCALE)
-    scale = 1.0 + (float(calibration.values[place]) if place >= 0 else 0.0)
-    if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
-        text = f"the ranges are {scale:.2f} times the distances on the map: " + (
-            "lidar or radio has a wrong unit" if lidar else "a radio measures time of flight, so the odometry has a wrong unit"
-        )
-        yield doubt("scales", text, range_scale=scale)
-    screenings = [recording.log.screening for recording in task.recordings.each]
-    ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
-    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _SCALE)]
-    if len(off):
-        outcome = f"the ranges are {scale:.2f} times" if estimate.placed.any() else "no ranges measure"
-        text = (
-            f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and {outcome} the distances on the "
-            "map, which has the lidar's scale; check the units of both"
-        )
-        yield doubt("scales", text, lidar_by_wheels=float(off[0]))
 
 
 def check_support(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -1,6 +1,6 @@
 """Figures of wheels, radio and lidar as a log has them, before a map is made, and the rules over these figures."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,6 +35,18 @@ class CheckPolicy:
     """s; anchors within it are in reach at one time."""
     sigmas: ClassVar[float] = 5.0
     """Standard deviations beyond which nothing is noise."""
+
+
+def check_sensors(logs: Sequence[SensorLog]) -> Iterator[Finding]:
+    """Warn of sensors without data in all of some recordings."""
+    if not any(log.ranges is not None and len(log.ranges.stamps) for log in logs):
+        yield Finding("no-ranges", WARNING, "no UWB ranges in use: the map rests on odometry and lidar", sensor="radio")
+    scans = [log.scans for log in logs if log.scans is not None and len(log.scans.stamps)]
+    if not scans:
+        text = "no lidar in use: no map, and only the odometry's turns show that trajectory and anchors are not mirrored"
+        yield Finding("no-lidar", WARNING, text, sensor="lidar")
+    elif not any(np.isfinite(each.ranges).any() for each in scans):
+        yield Finding("empty-scans", WARNING, "no scan has a reading: the map is empty", sensor="lidar")
 
 
 def rhythm(stamps: Floats, *, expected_gap: float, repeated: float | None = None) -> Figures:
