@@ -64,9 +64,9 @@ def rules() -> tuple[Rule, ...]:
     """Return the rules of the package, in the order of kinds."""
     found: dict[tuple[str, str], Rule] = {}
     for kind, row in TEXTS.items():
-        # Of a choice the first text, of a figure an ellipsis.
-        text = re.sub(r"{[^{}:]+:([^{}|]*)\|[^{}]*}", r"\1", row.text)
-        text = re.sub(r"{[^{}]+}", "...", text)
+        # Of a figure an ellipsis, of a choice the first text.
+        text = re.sub(r"{[^{}|]+}", "...", row.text)
+        text = re.sub(r"{[^{}:]+:([^{}|]*)\|[^{}]*}", r"\1", text)
         severity = "warning or doubt" if "{" in row.severity else row.severity
         found[kind, ""] = Rule(kind, severity, "assessment/facts.py", "", text)
     sources = ((path, path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py")))

@@ -27,6 +27,12 @@ CHUNK = 1 << 14
 """Rows that are processed together, so that they stay in the processor's cache; bounds the memory, too."""
 TINY = 1e-9
 """Length, m, or share below which a value is rounding error."""
+MOST = 0.9
+"""Share of values that is nearly all of them, also as a quantile."""
+ENOUGH = 20
+"""Values whose median or share is a figure, and that are not alike by chance."""
+BEYOND_NOISE = 5.0
+"""Standard deviations that noise does not exceed."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
 OUTLIER = 3.0

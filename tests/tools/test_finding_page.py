@@ -31,7 +31,7 @@ def check(estimate):
 
 
 def test_kinds_of_all_rooms_are_on_the_page_with_what_to_do():
-    kinds = {rule.kind for rule in finding_page.rules()} - {"anchor-x", "x-outside-odometry"}
+    kinds = {rule.kind for rule in finding_page.rules()} - {"anchor-x"}
     assert {"loose-links", "wheels-against-lidar", "clock-set-back", "free-space-violation", "not-localized"} <= kinds
     page, short = finding_page.page(), finding_page.short_form()
     paragraphs = {text.partition("\n")[0]: text for text in page.split("\n## ")[1:]}

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from string import Formatter
 from typing import Any, ClassVar
 
-from ..findings import DOUBT, WARNING, Fact, Finding, doubt, warning
+from ..findings import DOUBT, WARNING, Fact, Finding, warning
 from ..screening.units import likely_unit
 from ..sensor_log import SensorLog
 
 Rule = Callable[..., Finding]
+_LISTED = 3
+"""Stretches and sectors that a text names."""
 
 
 def say(facts: Iterable[Fact]) -> Iterator[Finding]:
@@ -42,9 +44,9 @@ def listed(times: Sequence[float], digits: int = 0, most: int = 5) -> str:
 
 
 def spans(stretches: Sequence[tuple[float, float]]) -> str:
-    """Return the first three stretches, s, as words, and how many more there are."""
-    more = f", and {len(stretches) - 3} more stretches" if len(stretches) > 3 else ""
-    words = (f"t = {a:.0f} to {b:.0f} s" if round(a) < round(b) else f"t = {a:.0f} s" for a, b in stretches[:3])
+    """Return the first stretches, s, as words, and how many more there are."""
+    more = f", and {len(stretches) - _LISTED} more stretches" if len(stretches) > _LISTED else ""
+    words = (f"t = {a:.0f} to {b:.0f} s" if round(a) < round(b) else f"t = {a:.0f} s" for a, b in stretches[:_LISTED])
     return ", ".join(words) + more
 
 
@@ -55,15 +57,17 @@ def _recordings(numbers: Sequence[int]) -> str:
 
 
 class _Words(Formatter):
-    """Formats figures; beside Python's formats there are `times`, `spans`, `names`, `recordings` and `sectors` of lists,
-    `factor` of what is added to 1, and `yes|no` of a truth."""
+    """Formats figures; beside Python's formats there are `times`, `whole` times, `spans`, `names`, `list`, `recordings` and
+    `sectors` of lists, `factor` of what is added to 1, and `yes|no` of a truth, in which other figures may stand."""
 
     FORMATS: ClassVar[Mapping[str, Callable[[Any], str]]] = {
         "times": lambda times: listed(times, 1),
+        "whole": listed,
+        "list": ", ".join,
         "spans": spans,
         "names": lambda names: " and ".join(map(str, names)),
         "recordings": _recordings,
-        "sectors": lambda parts: ", ".join(f"{a:.0f} to {b:.0f}" for a, b in parts[:3]) + " ..." * (len(parts) > 3),
+        "sectors": lambda parts: ", ".join(f"{a:.0f} to {b:.0f}" for a, b in parts[:_LISTED]) + " ..." * (len(parts) > _LISTED),
         "factor": lambda value: f"{1.0 + value:.2f}",
     }
 
@@ -93,6 +97,12 @@ class Text:
         text, severity, sensor, anchor = (_Words().vformat(each, (), figures) for each in words)
         return Finding(kind, severity, text, sensor=sensor, anchor=anchor)
 
+
+_OUTSIDE = Text(
+    "{count} of {total} {sensor} were stamped outside the odometry's time and left out: "
+    "{most:the clocks differ by about {off:.0f} s; |}start the odometry first and stop it last, and use one clock",
+    "{most:doubt|warning}",
+)
 
 TEXTS: Mapping[str, Text] = {
     "made-up-stamps": Text(
@@ -233,6 +243,25 @@ TEXTS: Mapping[str, Text] = {
         "direction, or force the closure",
         DOUBT,
     ),
+    "exchanged-names": Text(
+        "from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
+        "wheels, but {exchanged:those of {anchors:list} fit the places of others|fit no places at all}: check the anchors' ids "
+        "in the radio and in what reads them",
+        sensor="radio",
+    ),
+    "ranges-outside-odometry": _OUTSIDE,
+    "scans-outside-odometry": _OUTSIDE,
+    "carried": Text(
+        "{silent:the odometry is silent for {silent:.0f} s from t = {at:whole} s, but the robot was moved meanwhile|"
+        "at t = {at:whole} s the robot is suddenly elsewhere: it was carried, or the log was cut}; only other sensors connect "
+        "the path before and after",
+        DOUBT,
+    ),
+    "marked-ranges": Text(
+        "{count} of {total} ranges are exactly {value:g} m, wherever the robot is: the radio reports this value where it has "
+        "no measurement; they were left out",
+        "{alone:doubt|warning}",
+    ),
 }
 """By the kind of fact, where one text says it."""
 
@@ -252,17 +281,6 @@ def _rule(function: Rule) -> Rule:
 
 
 @_rule
-def exchanged_names(begin: float, at: float, end: float, what: str, anchors: Sequence[str]) -> Finding:
-    """Warn of ranges that fit the path by the wheels under other names from a moment on, or under none."""
-    which = f"those of {', '.join(anchors)} fit the places of others" if what == "exchanged" else "fit no places at all"
-    text = (
-        f"from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
-        f"wheels, but {which}: check the anchors' ids in the radio and in what reads them"
-    )
-    return Finding("exchanged-names", WARNING, text, sensor="radio")
-
-
-@_rule
 def wheels_against_ranges(begin: float, at: float, end: float, what: str, value: float) -> Finding:
     """Warn of wheels that the ranges to the anchors contradict, more than clocks, names and moved anchors would explain."""
     text = {
@@ -272,38 +290,6 @@ def wheels_against_ranges(begin: float, at: float, end: float, what: str, value:
         "turns": f"about t = {at:.0f} s no path that the wheels count fits: one of them, or the heading, is stuck or slips",
     }[what]
     return Finding("wheels-against-ranges", WARNING, f"{text}, by the ranges to the anchors in reach", sensor="odometry")
-
-
-@_rule
-def outside_odometry(sensor: str, count: int, total: int, off: float) -> Finding:
-    """Warn of readings outside the odometry's time; doubt a recording of which most are: its clocks differ."""
-    most = 2 * count > total
-    text = (
-        f"{count} of {total} {sensor} were stamped outside the odometry's time and left out: "
-        f"{f'the clocks differ by about {off:.0f} s; ' if most else ''}"
-        "start the odometry first and stop it last, and use one clock"
-    )
-    return Finding(f"{sensor}-outside-odometry", DOUBT if most else WARNING, text)
-
-
-@_rule
-def carried(at: Sequence[float], silent: float = 0.0) -> Finding:
-    """Doubt a recording in which the robot is suddenly elsewhere: it was carried, or the log was cut.
-
-    Other sensors find it at another place after a silence of the odometry in which the wheels stood, or from one reading to
-    the next.
-    """
-    if silent:
-        text = (
-            f"the odometry is silent for {silent:.0f} s from t = {at[0]:.0f} s, but the robot was moved meanwhile; only other "
-            "sensors connect the path before and after"
-        )
-        return doubt("carried", text)
-    text = (
-        f"at t = {listed(at)} s the robot is suddenly elsewhere: it was carried, or the log was cut; only other sensors "
-        "connect the path before and after"
-    )
-    return doubt("carried", text)
 
 
 @_rule
@@ -330,16 +316,6 @@ def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]],
             "than elsewhere; cut that part off, or drive it again"
         )
     return Finding("wheels-against-lidar", WARNING if slips else DOUBT, text, stretches=tuple(stretches))
-
-
-@_rule
-def marked_ranges(count: int, total: int, value: float, lidar: bool) -> Finding:
-    """Warn of a value that a radio reports where it has no measurement; doubt where most are so and there is no lidar."""
-    text = (
-        f"{count} of {total} ranges are exactly {value:g} m, wherever the robot is: the radio reports "
-        "this value where it has no measurement; they were left out"
-    )
-    return Finding("marked-ranges", DOUBT if not lidar and 2 * count > total else WARNING, text)
 
 
 @_rule

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import Floats, white_noise
+from ..arrays import BEYOND_NOISE, Floats, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.repeats import RepeatPolicy
@@ -33,8 +33,6 @@ class CheckPolicy:
     """Hz; ranges and rays between odometry readings that are farther apart are placed badly at usual speeds."""
     window: ClassVar[float] = 2.0
     """s; anchors within it are in reach at one time."""
-    sigmas: ClassVar[float] = 5.0
-    """Standard deviations beyond which nothing is noise."""
 
 
 def check_sensors(logs: Sequence[SensorLog]) -> Iterator[Finding]:
@@ -183,7 +181,7 @@ def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
     windows = np.lib.stride_tricks.sliding_window_view(values, 5)
     noise = white_noise(values)
     around = np.median(np.delete(windows, 2, axis=1), axis=1)
-    limit = travelled[4:] - travelled[:-4] + CheckPolicy.sigmas * max(noise, RepeatPolicy.usual_noise)
+    limit = travelled[4:] - travelled[:-4] + BEYOND_NOISE * max(noise, RepeatPolicy.usual_noise)
     return int(np.sum(np.abs(windows[:, 2] - around) > limit)), noise
 
 

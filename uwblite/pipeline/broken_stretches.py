@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Ints
+from ..arrays import BEYOND_NOISE, Bools, Ints
 from ..findings import Fact
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..lidar.object_likelihood import ObjectLikelihood
@@ -24,8 +24,6 @@ from .broken_steps import BreakPolicy, BrokenStep, broken_steps, range_evidence
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise
 
-_SUDDEN = 5.0
-"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
 _NOISE_ROUNDS = 2
 """Number of solutions before clouds are matched anew; each begins with an estimate of the ranges' noise."""
 _AROUND = 2.0
@@ -69,7 +67,7 @@ _SYMPTOMS = ("moved-anchor", "path-displaced")
 
 def _off(estimate: Estimate) -> Bools:
     """Return which steps (e,) of the odometry contradict the path."""
-    return np.asarray(np.abs(estimate.odometry.residuals(estimate.graph)).max(axis=1) > _SUDDEN)
+    return np.asarray(np.abs(estimate.odometry.residuals(estimate.graph)).max(axis=1) > BEYOND_NOISE)
 
 
 def _suspects(estimate: Estimate, task: Task) -> Ints:
@@ -107,7 +105,7 @@ def _released(estimate: Estimate, task: Task, step: BrokenStep, stretch: tuple[i
         other = with_range_noise(other, task.config).solved(rough(task.config.solver))[0]
     other = lidar_stages.refine_jointly(replace(other, joint=None), task)
     edges = other.closures.edges
-    agrees = np.abs(edges.residuals(other.graph)).max(axis=1, initial=0.0) <= _SUDDEN
+    agrees = np.abs(edges.residuals(other.graph)).max(axis=1, initial=0.0) <= BEYOND_NOISE
     reasons = ["leads across a broken step of the path"] * len(edges)
     return replace(other, closures=other.closures.without(agrees, "contradicts-graph", reasons))
 

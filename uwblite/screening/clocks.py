@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, Bools, Floats, weighted_median
+from ..arrays import BEYOND_NOISE, ENOUGH, MAD_TO_SIGMA, Bools, Floats, weighted_median
 from ..errors import DataError
 from ..findings import Fact
 from ..lidar.scan_odometry import scan_steps
@@ -14,8 +14,6 @@ from ..sensor_log import LaserScans, Odometry, SensorLog, UwbRanges, odometry_in
 from ..sensor_log import in_bursts as stamps_in_bursts
 from .wheel_motion import PairPolicy
 
-_ENOUGH = 20
-"""Stamps that may be equal by chance, or too few to show a rhythm."""
 _COARSE, _EXACT = 0.4, 1e-4
 """s; sensors of moving robots are faster than the one, and no clock is more regular than the other."""
 _JUMP = 10.0
@@ -26,8 +24,6 @@ _SOME = 0.02
 """Share of scans outside the odometry's time from which on it is reported."""
 _BURST, _LEAST_BURSTS = 4, 5
 """Readings with one stamp that make a burst (two or three are a coarse clock), and bursts that must be."""
-_SIGMAS = 5.0
-"""Typical differences between lidar and odometry over a step, beyond which a scan is elsewhere."""
 
 
 def refuse_without_stamps(log: SensorLog) -> None:
@@ -45,7 +41,7 @@ def refuse_without_stamps(log: SensorLog) -> None:
 
 def made_up(log: SensorLog) -> list[Fact]:
     """Report stamps on a grid too coarse for a sensor's clock: they were made by counting messages."""
-    if log.scans is None or min(len(log.scans.stamps), len(log.odometry.stamps)) < _ENOUGH:
+    if log.scans is None or min(len(log.scans.stamps), len(log.odometry.stamps)) < ENOUGH:
         return []
     steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
     period = min(float(np.median(s)) for s in steps)
@@ -114,7 +110,7 @@ def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
 
     A jump replaces a usual step: the one in which half of the time passes, between bursts where readings come in bursts.
     """
-    if len(stamps) < _ENOUGH or stamps[-1] - end < _JUMP:
+    if len(stamps) < ENOUGH or stamps[-1] - end < _JUMP:
         return None
     steps = np.diff(stamps)
     longest = int(np.argmax(steps))
@@ -138,7 +134,8 @@ def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         if isinstance(sensor, LaserScans):
             log = replace(log, scans=sensor.rows(~outside))
         off = float(np.median(sensor.stamps) - 0.5 * (first + last))
-        facts.append(Fact.of("outside-odometry", sensor=name, count=int(outside.sum()), total=len(outside), off=off))
+        figures = {"sensor": name, "count": int(outside.sum()), "total": len(outside), "off": off, "most": share > 0.5}
+        facts.append(Fact.of(f"{name}-outside-odometry", **figures))
     return log, facts
 
 
@@ -178,7 +175,7 @@ def displaced(off: Floats) -> Bools:
     What is left in the sum of both steps is at most half of either; a turn moves what a scan sees, two metres away.
     """
     off = off * np.array([1.0, 1.0, 2.0])
-    limit = _SIGMAS * MAD_TO_SIGMA * float(np.linalg.norm(np.median(np.abs(off), axis=0)))
+    limit = BEYOND_NOISE * MAD_TO_SIGMA * float(np.linalg.norm(np.median(np.abs(off), axis=0)))
     into, out = off[:-1], off[1:]
     least = np.minimum(np.linalg.norm(into, axis=1), np.linalg.norm(out, axis=1))
     return np.asarray((least > limit) & (np.linalg.norm(into + out, axis=1) < 0.5 * least))

@@ -12,12 +12,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import MOST, Bools, Floats, Ints
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, in_free_space, scan_steps
 from ..sensor_log import Odometry, OdometryBreaks, SensorLog
 from . import range_motion
-from .wheel_motion import show_motion
+from .wheel_motion import show_motion, usual_period
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ def cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks,
     ends = stamps[np.minimum(np.searchsorted(stamps, others, "right"), len(stamps) - 1)]
     near = (times[:, None] > others - CutPolicy.one_cut) & (times[:, None] < ends + CutPolicy.one_cut)
     times = times[~near.any(axis=1)]
-    facts = [Fact.of("carried", at=(times - stamps[0]).tolist())] if len(times) else []
+    facts = [Fact.of("carried", at=(times - stamps[0]).tolist(), silent=0.0)] if len(times) else []
     return _anywhere(stamps[np.clip(np.searchsorted(stamps, times) - 1, 0, len(stamps) - 1)]), facts
 
 
@@ -174,8 +174,8 @@ def _by_lidar(log: SensorLog) -> Floats:
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(change, half, mode="edge"), 2 * half + 1).copy()
     windows[:, half] = 0.0
     span = np.diff(scans.stamps)
-    change = np.where(span > CutPolicy.silence * max(float(np.median(span)), 1e-3), 0.0, change)
-    jumps = np.flatnonzero((change > CutPolicy.least_change) & (change > 2.0 * np.quantile(windows, 0.9, axis=1)))
+    change = np.where(span > CutPolicy.silence * usual_period(scans.middles), 0.0, change)
+    jumps = np.flatnonzero((change > CutPolicy.least_change) & (change > 2.0 * np.quantile(windows, MOST, axis=1)))
     jumps = np.sort(jumps[np.argsort(-change[jumps], kind="stable")[: CutPolicy.tested]])
     if not len(jumps):
         return np.zeros(0)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import ENOUGH, Bools, Floats
 from ..errors import DataError
 from ..findings import Fact
 from ..sensor_log import Odometry, OdometryBreaks
-from .units import FASTEST
+from .units import IMPOSSIBLE
 
 _LEAST_JUMP = (0.3, 0.5)
 """A shorter step, m, and a smaller turn, rad, are never a jump."""
@@ -26,7 +26,7 @@ _LEAST_SPEED = (0.5, 2.0)
 _GLITCH_SECONDS = 1.0
 """A chain that is continuous again after so long was interrupted by wrong readings, s."""
 _INTERLEAVED = 0.05
-"""Share of jumping steps, of 20 at least, from which on two sources were written into one log."""
+"""Share of jumping steps from which on two sources were written into one log."""
 _NEIGHBOURS = 6
 """Steps on either side of a break by which the motion across it is predicted."""
 
@@ -53,7 +53,7 @@ class Motion:
             moving = (size > 1e-4) & (span > 0.0)
             usual = float(np.quantile(size[moving] / span[moving], 0.75)) if moving.any() else 0.0
             most.append(max(_TIMES_USUAL * usual, least))
-        return Motion(steps, sizes, span, np.minimum(most, (3.0 * FASTEST, np.inf)))
+        return Motion(steps, sizes, span, np.minimum(most, (IMPOSSIBLE, np.inf)))
 
     def jumps(self) -> Bools:
         """Return which steps (n-1,) no motion explains."""
@@ -75,7 +75,7 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Fact]]:
     """
     motion, stamps = Motion.of(odometry), odometry.stamps
     jumps = np.flatnonzero(motion.jumps())
-    if len(jumps) > max(20, _INTERLEAVED * len(stamps)):
+    if len(jumps) > max(ENOUGH, _INTERLEAVED * len(stamps)):
         begin, end = stamps[jumps[[0, -1]]] - stamps[0]
         raise DataError(
             f"the odometry jumps {len(jumps)} times in {len(stamps)} readings, from t = {begin:.1f} to {end:.1f} s: "

@@ -315,8 +315,8 @@ class Moment:
         nowhere = max(float(side.sum(axis=1).max()) for side in unordered)
         prior, kind = float(np.log(PathPolicy.fault)) - null, "exchanged-names"
         if changed:
-            yield Explanation(gain + prior, kind, {"what": "exchanged", "anchors": changed}, names=names)
-        yield Explanation(nowhere + prior, kind, {"what": "no distances", "anchors": changed})
+            yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
+        yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
 
 
 def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:

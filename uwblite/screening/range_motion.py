@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats, white_noise
+from ..arrays import BEYOND_NOISE, ENOUGH, MOST, Bools, Floats, white_noise
 from ..findings import Fact
 from ..sensor_log import SensorLog, plausible
 from .odometry_chain import usual_speed
@@ -32,29 +32,25 @@ class MotionPolicy:
     """Factor by which wheels may count too little."""
     margin: ClassVar[float] = 0.5
     """Change, m, that a blocked line of sight explains."""
-    sigmas: ClassVar[float] = 5.0
-    """Error that neither a median nor a leap of single readings has, in standard deviations of one reading."""
     votes: ClassVar[int] = 2
     """Anchors that must agree, where so many are in reach."""
     apart: ClassVar[float] = 10.0
     """Cuts nearer than this in time are one, s."""
-    enough: ClassVar[int] = 20
     way: ClassVar[float] = 2.0
-    """Readings of an anchor, and length of the stretches, m, in which their change is compared with the distance."""
+    """Length of the stretches, m, in which the change of ranges is compared with the distance."""
     leaps: ClassVar[int] = 12
     leaping: ClassVar[float] = 0.1
     """Least number of jumps, and their least share of the ranges' differences, for two places; one place has 3 % at most."""
     near: ClassVar[float] = 0.6
     """Distance, m, over which a jump is compared with the next one."""
-    steady: ClassVar[float] = 0.9
     varies: ClassVar[float] = 0.7
-    """Share of leaps whose ends are where the next one's are, and by how much all differ (10 to 90 %, by their median). Two
-    places have 0.97 and 1.2 at least; exponential detours in 40 % of the ranges 0.74 at most, constant ones vary by 0.34."""
+    """By how much leaps differ (10 to 90 %, by their median): of two places by 1.2 at least, of constant detours by 0.34. The
+    ends of 97 % of the leaps of two places are where the next one's are, and of 74 % at most of exponential detours."""
 
 
 def _most_change(way: Floats | float, noise: float) -> Floats:
     """Return by how much ranges to one place differ at most between two points of the way (n,), m."""
-    return np.asarray(MotionPolicy.stretch * way + MotionPolicy.margin + MotionPolicy.sigmas * noise)
+    return np.asarray(MotionPolicy.stretch * way + MotionPolicy.margin + BEYOND_NOISE * noise)
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
@@ -114,7 +110,7 @@ def change_by_way(log: SensorLog) -> float:
     """
     found = []
     for stamps, ranges in _by_anchor(log):
-        if len(ranges) < MotionPolicy.enough:
+        if len(ranges) < ENOUGH:
             continue
         way = log.odometry.travelled_at(stamps)[1:-1]
         level = np.median(np.lib.stride_tricks.sliding_window_view(ranges, MotionPolicy.window), axis=1)
@@ -123,8 +119,8 @@ def change_by_way(log: SensorLog) -> float:
         last = last[first]
         driven = way[last] - way[first]
         rate = (np.abs(level[last] - level[first]) / driven)[driven < 1.5 * MotionPolicy.way]
-        if len(rate) >= MotionPolicy.enough:
-            found.append(np.quantile(rate, [0.5, 0.9]))
+        if len(rate) >= ENOUGH:
+            found.append(np.quantile(rate, [0.5, MOST]))
     usual, most = np.median(found, axis=0) if found else (np.nan, np.nan)
     return float(most) if usual > 0.5 * most else float("nan")
 
@@ -207,7 +203,7 @@ def _two_distances(values: Floats, driven: Floats, leaps: Bools, noise: float) -
     ends = np.sort(np.column_stack([values[at], values[at + 1]]), axis=1)
     way = np.diff(0.5 * (driven[at] + driven[at + 1]))
     steady = np.abs(np.diff(ends, axis=0)).max(axis=1) < _most_change(way, noise)
-    low, middle, high = np.quantile(ends[:, 1] - ends[:, 0], [0.1, 0.5, 0.9])
+    low, middle, high = np.quantile(ends[:, 1] - ends[:, 0], [1.0 - MOST, 0.5, MOST])
     steady = steady[way < MotionPolicy.near]
-    enough = len(steady) >= MotionPolicy.leaps and steady.mean() > MotionPolicy.steady
+    enough = len(steady) >= MotionPolicy.leaps and steady.mean() > MOST
     return bool(enough and high - low > MotionPolicy.varies * middle)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Ints, runs_of, white_noise
+from ..arrays import ENOUGH, MOST, Bools, Floats, Ints, runs_of, white_noise
 from ..findings import Fact
 from ..sensor_log import LaserScans, SensorLog
 
@@ -36,11 +36,10 @@ class RepeatPolicy:
     """Noise of radios, m, where the recording does not show it, and the least that is assumed."""
     often: ClassVar[float] = 0.1
     """Share of repeated scans from which on even single ones are no chance: of seven real recordings one has any, 0.5 %."""
-    marks: ClassVar[int] = 20
     mark_share: ClassVar[float] = 0.03
     times_others: ClassVar[float] = 8.0
-    """Readings (of a lidar: scans) of one value at different places, their share of all, and how much more frequent than others
-    a value is that stands for no distance; no value of seven lidars, in steps of 1 to 10 mm, is more than 0.7 %."""
+    """Share of all readings at different places, and how much more frequent than others a value is that stands for no distance;
+    no value of seven lidars, in steps of 1 to 10 mm, is more than 0.7 %."""
     sector: ClassVar[float] = float(np.deg2rad(30.0))
     """Turn after which walls are elsewhere in a scan, rad."""
     sectors: ClassVar[int] = 8
@@ -148,7 +147,7 @@ def quiet_noise(each: list[Floats], resolution: float) -> float:
 def without_marks(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     """Leave out a value that stands for no distance: what a radio reports beyond its reach, or when it missed its partner."""
     ranges = log.ranges
-    if ranges is None or len(ranges.stamps) < RepeatPolicy.marks:
+    if ranges is None or len(ranges.stamps) < ENOUGH:
         return log, []
     # A robot that stands may repeat its readings.
     place = np.floor(log.odometry.travelled_at(ranges.stamps) / RepeatPolicy.moved)
@@ -157,7 +156,8 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     wrong = ranges.ranges == mark
     if mark is None or len(np.unique(ranges.anchor[wrong])) < 2:  # one that is stuck
         return log, []
-    fact = Fact.of("marked-ranges", count=int(wrong.sum()), total=len(wrong), value=mark, lidar=log.scans is not None)
+    alone = log.scans is None and float(np.mean(wrong)) > 0.5
+    fact = Fact.of("marked-ranges", count=int(wrong.sum()), total=len(wrong), value=mark, alone=alone)
     return replace(log, ranges=ranges.rows(~wrong)), [fact]
 
 
@@ -170,7 +170,7 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     apart = scans.ranges[np.unique(place, return_index=True)[1]]
     holds = scans.hits(apart)
     mark = _mark(apart[holds])
-    if mark is None or np.any(apart == np.float32(mark), axis=1).sum() < RepeatPolicy.marks:
+    if mark is None or np.any(apart == np.float32(mark), axis=1).sum() < ENOUGH:
         return log, []
     wrong, farthest = scans.ranges == np.float32(mark), mark == float(apart[holds].max())
     fact = Fact.of("repeated-readings", count=int(wrong.sum()), total=wrong.size, value=mark, reach=farthest)
@@ -185,8 +185,8 @@ def _mark(values: Floats | NDArray[np.float32]) -> float | None:
     if len(distinct) < 2:
         return None
     most = int(np.argmax(counts))
-    others = RepeatPolicy.times_others * np.quantile(np.delete(counts, most), 0.9)
-    frequent = counts[most] >= max(RepeatPolicy.marks, RepeatPolicy.mark_share * counts.sum(), others)
+    others = RepeatPolicy.times_others * np.quantile(np.delete(counts, most), MOST)
+    frequent = counts[most] >= max(ENOUGH, RepeatPolicy.mark_share * counts.sum(), others)
     return float(distinct[most]) if frequent else None
 
 

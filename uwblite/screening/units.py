@@ -4,12 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import MOST, TINY, Floats
 from ..errors import DataError
 from ..sensor_log import LONGEST_RANGE, Odometry, SensorLog
 
-FASTEST = 3.0
-"""Largest speed of a ground robot that maps a building, m/s; none has three times as much for long."""
+FASTEST, IMPOSSIBLE = 3.0, 9.0
+"""m/s; largest speed of a ground robot that maps a building, and one that none has for long."""
 _USUAL_SPEED, _USUAL_DISTANCE = 0.3, 3.0
 """m/s; and m of ranges and readings: of two units the one that gives about as much is meant."""
 _LONGEST_READING = 150.0
@@ -28,7 +28,7 @@ _SELDOM, _OFTEN, _RAPID = 1.0, 0.005, 0.002
 """Limits of the time between readings, s, within which stamps are taken as seconds; no odometry is faster than the last."""
 _TURN_RATE = 3.0
 """Mean turn rate, rad/s, that no robot keeps; a third of it is fast."""
-_PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, 3.0 * FASTEST)
+_PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, IMPOSSIBLE)
 """Times between readings, s, and highest usual speeds, m/s, of a robot: what the right unit of time gives."""
 _AGREEMENT = 0.7
 """Agreement of heading and direction of motion below which the heading is not the path's."""
@@ -48,7 +48,7 @@ def refuse_wrong_lengths(log: SensorLog) -> None:
     found = [
         _length(
             _speeds(log.odometry),
-            3.0 * FASTEST,
+            IMPOSSIBLE,
             _USUAL_SPEED,
             "the odometry's positions",
             "usual speed would be {:.0f} m/s",
@@ -87,7 +87,7 @@ def _speeds(odometry: Odometry) -> Floats:
     second = np.clip(np.searchsorted(stamps, stamps[first] + 1.0), first + 1, len(first))
     span = stamps[second] - stamps[first]
     length = np.hypot(*(odometry.poses[second] - odometry.poses[first])[:, :2].T)
-    moving = (length > 1e-6) & (span > 0.5)
+    moving = (length > TINY) & (span > 0.5)
     return np.asarray(length[moving] / span[moving])
 
 
@@ -104,10 +104,10 @@ def _odometry_stamps(odometry: Odometry) -> str:
     """
     span, steps = float(np.ptp(odometry.stamps)), np.abs(np.diff(odometry.poses, axis=0))
     length, times = np.hypot(steps[:, 0], steps[:, 1]), np.diff(odometry.stamps)
-    moving = (length > 1e-6) & (times > 0.0)
+    moving = (length > TINY) & (times > 0.0)
     if span <= 0.0 or moving.sum() < _ENOUGH:
         return ""
-    period, speed = span / len(steps), float(np.quantile(length[moving] / times[moving], 0.9))
+    period, speed = span / len(steps), float(np.quantile(length[moving] / times[moving], MOST))
     spin = float(np.minimum(steps[:, 2] % (2.0 * np.pi), -steps[:, 2] % (2.0 * np.pi)).sum()) / span
     rapid = period < _OFTEN and speed > FASTEST and (spin > _TURN_RATE or period < _RAPID)
     fits = [
@@ -186,7 +186,7 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     """
     xy, heading, way = odometry.poses[:, :2], np.unwrap(odometry.poses[:, 2]), odometry.travelled
     # A fifth of a metre at a time, or a part of a path whose unit is not known.
-    piece = np.floor(way / min(0.2, max(float(way[-1]) / 100.0, 1e-9)))
+    piece = np.floor(way / min(0.2, max(float(way[-1]) / 100.0, TINY)))
     apart = np.flatnonzero(np.diff(piece, prepend=-1.0) > 0)
     if len(apart) <= _ENOUGH:
         return 1.0, False
@@ -194,7 +194,7 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     # As complex numbers: of squares the sign does not count.
     along = (move[:, 0] + 1j * move[:, 1]) ** 2 / np.maximum(np.hypot(*move.T), np.finfo(float).tiny)
     weight, half = float(np.abs(along).sum()), 0.5 * (heading[apart[1:]] + heading[apart[:-1]])
-    return float(np.abs(np.sum(along * np.exp(-2j * factor * half)))) / weight, bool(np.abs(along.sum()) < 0.9 * weight)
+    return float(np.abs(np.sum(along * np.exp(-2j * factor * half)))) / weight, bool(np.abs(along.sum()) < MOST * weight)
 
 
 class HeadingReading(NamedTuple):
@@ -221,7 +221,7 @@ def refuse_degrees(odometry: Odometry) -> None:
     """Raise DataError where the odometry's heading is clearly in degrees."""
     reading = heading_reading(odometry)
     turn, span = np.abs(np.diff(odometry.poses[:, 2])), np.diff(odometry.stamps)
-    turning = (turn > 1e-6) & (span > 0)
+    turning = (turn > TINY) & (span > 0)
     rate = float(np.median(turn[turning] / span[turning])) if turning.sum() >= _ENOUGH else 0.0
     large = rate > _TURN_RATE / 3.0 or float(np.ptp(odometry.poses[:, 2])) > 2.0 * np.pi
     if large and not reading.sound and reading.degrees > max(reading.plain, reading.mirrored) + CLEARLY:

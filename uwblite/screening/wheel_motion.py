@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, runs_of
+from ..arrays import ENOUGH, MOST, Bools, Floats, Ints, Table, runs_of
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
@@ -23,8 +23,7 @@ class PairPolicy:
     """Comparison of wheels and lidar over pairs of scans."""
 
     beams: ClassVar[int] = 30
-    scans: ClassVar[int] = 20
-    """Least number of beams and scans that show motion."""
+    """Least number of beams that show motion."""
     pairs: ClassVar[int] = 250
     """Compared over the whole recording."""
     per_stand: ClassVar[int] = 8
@@ -41,8 +40,6 @@ class PairPolicy:
     """Shorter stands do not matter, s."""
     matching: ClassVar[float] = 0.6
     """Pairs that share less of their points measure nothing."""
-    clear_share: ClassVar[float] = 0.9
-    """Pairs that match so well from the wheels' guess are not also matched from zero motion."""
     gain: ClassVar[float] = 0.03
     """Share by which rest must explain a pair better than the wheels do."""
     noise_share: ClassVar[float] = 0.4
@@ -65,8 +62,8 @@ class PairPolicy:
     replaced: ClassVar[float] = 0.25
     """Time between the scans whose motion replaces the wheels, s."""
     step_sigma: ClassVar[tuple[float, float, float]] = (0.02, 0.02, 0.01)
-    unknown_sigma: ClassVar[tuple[float, float, float]] = (0.3, 0.3, 0.3)
-    """Standard deviations of such a step, m, m, rad, and of one where scans do not match either."""
+    unknown_sigma: ClassVar[float] = 0.3
+    """Standard deviations of such a step, m, m, rad, and of one where scans do not match either, m and rad."""
     searches: ClassVar[int] = 100
     """Steps of a stretch that are searched for, where they match badly."""
 
@@ -144,7 +141,7 @@ def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[
 
 def show_motion(scans: LaserScans | None) -> bool:
     """Return whether scans are enough, and have beams enough, to show motion."""
-    return scans is not None and len(scans.stamps) >= PairPolicy.scans and scans.ranges.shape[1] >= PairPolicy.beams
+    return scans is not None and len(scans.stamps) >= ENOUGH and scans.ranges.shape[1] >= PairPolicy.beams
 
 
 def compare(log: SensorLog) -> Pairs | None:
@@ -158,8 +155,9 @@ def compare(log: SensorLog) -> Pairs | None:
         return None
     wheels = log.odometry.motion(middle[first], middle[second])
     by_wheels, good = scan_steps(scans, log.mounting, first, second, wheels)
-    poor = np.flatnonzero(good < PairPolicy.clear_share)
-    by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], np.zeros((len(poor), 3)))
+    # Pairs that match so well from the wheels' guess are not also matched from zero motion.
+    poor = np.flatnonzero(good < MOST)
+    by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], 0.0 * wheels[poor])
     better = rest > good[poor] + PairPolicy.gain
     better[better] = _fit_better(log, first[poor[better]], second[poor[better]], by_rest[better], by_wheels[poor[better]])
     by_wheels[poor[better]], good[poor[better]] = by_rest[better], rest[better]
@@ -190,7 +188,7 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
     """Choose the pairs: some everywhere, some in every stretch in which the wheels stand."""
     odometry = log.odometry
     inside = (middle >= odometry.stamps[0]) & (middle <= odometry.stamps[-1])
-    period = _period(middle)
+    period = usual_period(middle)
     apart = max(1, round(_span(odometry) / period))
     first = np.flatnonzero(inside[:-apart] & inside[apart:] & (middle[apart:] - middle[:-apart] < 3.0 * apart * period))
     chosen = [first[:: max(1, len(first) // PairPolicy.pairs)]]
@@ -201,8 +199,9 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
     return first, first + apart
 
 
-def _period(middle: Floats) -> float:
-    return max(float(np.median(np.diff(middle))), 1e-3)
+def usual_period(stamps: Floats) -> float:
+    """Return the usual time between stamps (n,), s, n > 1; a millisecond where many share one."""
+    return max(float(np.median(np.diff(stamps))), 1e-3)
 
 
 def _span(odometry: Odometry) -> float:
@@ -277,7 +276,7 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
 def unmatched(pairs: Pairs) -> list[Fact]:
     """Tell where scans a short time apart hardly ever match; pairs with too few readings do not count."""
     seen = pairs.share[pairs.share > 0.0]
-    if len(seen) < 2 * PairPolicy.enough or (most := float(np.quantile(seen, 0.9))) >= PairPolicy.noise_share:
+    if len(seen) < 2 * PairPolicy.enough or (most := float(np.quantile(seen, MOST))) >= PairPolicy.noise_share:
         return []
     return [Fact.of("scans-do-not-match", share=most)]
 
@@ -289,7 +288,7 @@ def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odom
     stamps, breaks, middle = odometry.stamps, [OdometryBreaks.none()], scans.middles
     for a, b in stretches:
         begin, end = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
-        inside = np.append(np.arange(begin, end, max(1, round(PairPolicy.replaced / _period(middle)))), end)
+        inside = np.append(np.arange(begin, end, max(1, round(PairPolicy.replaced / usual_period(middle)))), end)
         inside = inside[(middle[inside] >= stamps[0]) & (middle[inside] <= stamps[-1])]
         if len(inside) < 2:
             continue
