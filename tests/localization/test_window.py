@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization.walls import Rays
-from uwblite.localization.window import Window, WindowLook
+from uwblite.localization.window import Window, WindowLook, WindowRange
 
 
 @pytest.mark.parametrize(("parts", "kept"), [(1, 9), (2, 4), (4, 2)])
@@ -20,6 +20,17 @@ def test_the_newest_part_of_a_window_is_of_its_time(parts, kept):
 def look(way, stamp):
     rays = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
     return WindowLook(rays, np.zeros(3), way, stamp)
+
+
+def test_scans_alone_and_ranges_alone_are_forgotten_after_ten_metres():
+    window = Window()
+    for way in np.arange(0.0, 30.0, 0.5):
+        window.add_look(look(way, way))
+    assert [k.way for k in window.looks] == list(np.arange(19.5, 30.0, 0.5))
+    for way in np.arange(30.0, 60.0, 0.5):
+        window.add_range(WindowRange(0, 1.0, np.zeros(3), np.zeros(2), way, way))
+    assert not window.looks
+    assert window.ranges[0].way == 49.5
 
 
 def test_a_robot_that_stands_keeps_a_scan_of_its_own_where_the_last_one_is_too_old():

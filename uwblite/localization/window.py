@@ -79,12 +79,11 @@ class Window:
         return way - min([way, *(r.way for r in self.ranges[:1]), *(k.way for k in self.looks[:1])])
 
     def add_range(self, entry: WindowRange) -> None:
-        """Keep a range, unless the robot has hardly moved since the last few to the same anchor; forget what is too old."""
+        """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""
         own = [r for r in self.ranges if r.anchor == entry.anchor]
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
-        self.ranges = [r for r in self.ranges if entry.way - r.way <= LENGTH]
-        self.looks = [k for k in self.looks if entry.way - k.way <= LENGTH]
+        self._forget(entry.way)
 
     def wants_look(self, way: float, stamp: float, after: float = -np.inf) -> bool:
         """Return whether a scan is wanted, at a way, m, and a time, s; or the last one is not newer than `after`."""
@@ -97,6 +96,12 @@ class Window:
         if self.looks and look.way - self.looks[-1].way < _STANDING:
             self.looks.pop()
         self.looks.append(look)
+        self._forget(look.way)
+
+    def _forget(self, way: float) -> None:
+        """Remove what is older than LENGTH, where the odometer is `way`, m."""
+        self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
+        self.looks = [k for k in self.looks if way - k.way <= LENGTH]
 
     def seen(self, odom: Floats, way: float, length: float) -> tuple[Rays, Floats]:
         """Return the rays of the last so many metres, in the present frame of the base, and how long ago (p,) each is, m."""
