@@ -66,6 +66,16 @@ def test_a_rival_that_may_be_right_leaves_the_place_open():
         assert (undecided(a_bank(rival), 0, True) == "") is one
 
 
+def test_many_places_that_are_each_unlikely_are_together_as_likely_as_one():
+    """The odds of the best place are against all others together."""
+    for many, one in ((2, True), (40, False)):
+        poses = np.zeros((1 + many, 3))
+        poses[1:, 0] = 3.0 * np.arange(1, 1 + many)
+        bank = hypotheses.started(poses, np.tile(0.001 * np.eye(3), (1 + many, 1, 1)), np.zeros(0))
+        weights = np.append(0.0, np.full(many, -CERTAIN - 2.0))
+        assert (undecided(hypotheses.reweighted(bank, weights), 0, True) == "") is one
+
+
 def test_a_search_that_left_places_out_decides_nothing_and_a_pose_that_is_not_sure_is_the_only_one_all_the_same():
     assert "too many" in undecided(a_bank(), 0, False)
     wide = hypotheses.started(np.zeros((1, 3)), np.diag([0.1, 0.001, 0.001])[None], np.zeros(0))

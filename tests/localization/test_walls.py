@@ -8,7 +8,8 @@ from helpers.localization_room import ODD, cast, grid_of
 from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
-from uwblite.localization.walls import Rays, walls_of
+from uwblite.lidar.object_likelihood import ObjectPolicy
+from uwblite.localization.walls import STRANGE, Rays, walls_of
 
 POSE = np.array([3.0, 2.5, 0.6])
 
@@ -38,16 +39,6 @@ def test_factors_are_the_numeric_gradient_of_the_kernel_s_cost():
     gradient = [(cost(start + s) - cost(start - s)) / 2e-6 for s in np.eye(3) * 1e-6]
     hessian, spurious, found, weight = walls.factors(start[None], rays, scale)
     np.testing.assert_allclose(found[0], gradient, rtol=1e-4, atol=1e-6)
-    rate = rays.ends * [0.3, -0.2]
-    more = walls.factors(start[None], rays, scale, (rate,))
-    np.testing.assert_allclose(more[0][0, :3, :3], hessian[0], rtol=1e-12)
-
-    def stretched(u):
-        off = se2.transform(start, rays.ends[rays.hit] + u * rate[rays.hit]) - points
-        r = (normals * off).sum(axis=1)[good]
-        return 0.5 * np.sum(r**2 / (1.0 + np.square(r / scale)))
-
-    np.testing.assert_allclose(more[2][0, 3], (stretched(1e-6) - stretched(-1e-6)) / 2e-6, rtol=1e-4, atol=1e-6)
     assert np.linalg.eigvalsh(hessian[0] - 2.0 * spurious[0]).min() > 0
     assert 0 < weight[0] <= good.sum()
 
@@ -56,10 +47,35 @@ def test_ends_in_unknown_space_count_for_nothing_in_the_fit():
     grid, rays = grid_of(ODD), rays_from(POSE)
     right = grid.geometry.centre_of(*np.indices(grid.log_odds.shape))[..., 0] > 4.0
     cut = dataclasses.replace(grid, log_odds=np.where(right, 0.0, grid.log_odds).astype(np.float32))
-    whole, half = (walls_of(g).agreement(POSE[None], rays) for g in (grid, cut))
+    whole, half = (walls_of(g).agreement(POSE[None], rays, 15.0) for g in (grid, cut))
     assert half.known[0] < whole.known[0]
     share = half.known[0] / whole.known[0]
     np.testing.assert_allclose(half.odds, share * whole.odds, atol=0.1)
+
+
+def test_what_the_map_lacks_tells_against_a_place_once_however_many_rays_meet_it():
+    """A trolley of a metre before the robot, seen by ever more rays that count as independent."""
+    grid, ends = grid_of(ODD), np.column_stack([np.full(40, 1.0), np.linspace(0.1, 1.1, 40)])
+    rays = Rays(ends, np.zeros_like(ends), np.ones(40, bool))
+    found = [walls_of(grid).agreement(POSE[None], rays, n).log_likelihood[0] for n in (0.1, 1.0, 5.0, 40.0)]
+    # Few rays tell little: each as much as one that lies on no wall.
+    np.testing.assert_allclose(found[0], 0.1 * np.log(STRANGE), rtol=0.15)
+    assert np.all(np.diff(found) < 0.0)
+    np.testing.assert_allclose(found[-1], np.log(ObjectPolicy.moves), rtol=1e-3)
+    # Two things that lie apart tell two.
+    both = Rays(np.concatenate([ends, ends + [0.0, 2.0]]), np.zeros((80, 2)), np.ones(80, bool))
+    np.testing.assert_allclose(walls_of(grid).agreement(POSE[None], both, 80.0).log_likelihood[0], 2.0 * found[-1], rtol=0.2)
+
+
+def test_walls_of_another_unit_are_those_of_a_map_in_it():
+    grid, g = grid_of(ODD), grid_of(ODD).geometry
+    larger = walls_of(dataclasses.replace(grid, geometry=dataclasses.replace(g, resolution=1.1 * g.resolution, origin=1.1 * g.origin)))
+    scaled, rays = walls_of(grid).times(1.1), rays_from(POSE)
+    place = POSE * [1.1, 1.1, 1.0]
+    for one, other in zip(larger.factors(place[None], rays, 0.1), scaled.factors(place[None], rays, 0.1), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.1, atol=0.1 * np.abs(one).max())
+    one, other = (walls.agreement(place[None], rays, 15.0).log_likelihood for walls in (larger, scaled))
+    np.testing.assert_allclose(one, other, atol=0.2)
 
 
 def test_a_thin_wall_has_a_line_on_either_side_and_a_lone_post_is_a_surface_without_one():

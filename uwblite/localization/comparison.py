@@ -124,8 +124,8 @@ class PlaceSearch:
         independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
         if self.walls is not None and len(rays.hit):
             for part in search.units(len(poses), PER_RAY * len(rays.hit)):
-                agreement = self.walls.agreement(poses[part], rays)
-                weight[part], scans[part] = independent * agreement.log_likelihood, independent * agreement.odds
+                agreement = self.walls.agreement(poses[part], rays, independent)
+                weight[part], scans[part] = agreement.log_likelihood, independent * agreement.odds
                 known[part] = agreement.known
                 yield PER_RAY * len(poses[part]) * len(rays.hit)
         errors, each = self._anchors.errors, (range_model.PER_RANGE + range_model.PER_EXPECTED) * len(ranges)

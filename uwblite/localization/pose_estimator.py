@@ -147,8 +147,8 @@ class PoseEstimator:
         if not len(self._bank):
             return
         driven, self._scan_way = self._way - self._scan_way, self._way
-        before, fresh = self._bank, float(np.clip(driven / _FRESH_WAY, _LEAST_FRESH, 1.0))
-        self._bank, found = self._matched(before, walls, rays, some, fresh)
+        before = self._bank
+        self._bank, found = self._matched(before, walls, rays, some, driven)
         if self.tracks and driven <= _STILL:
             # The robot stands, by its wheels; where a place nearby fits and is far likelier, it was pushed, or they are frozen.
             pushed, there = self._matched(hypotheses.moved(self._bank, _STANDS, _UNFELT), walls, rays, some, 1.0)
@@ -159,7 +159,7 @@ class PoseEstimator:
             # A scan that does not agree as a whole must not move the pose: walls that are not in the map lie near others.
             self._bank = before
         if len(self._bank) > 1:
-            self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.log_likelihood)
+            self._bank = hypotheses.reweighted(self._bank, found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
         if self.tracks:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
@@ -216,11 +216,14 @@ class PoseEstimator:
         reason = verdict.vague(covariance) if self.tracks else self._reason
         return LocalizerState(stamp, pose, covariance, quality, odometry, bool(reason), reason, bank.poses[order[1:]], far)
 
-    def _matched(self, bank: Hypotheses, walls: Walls, rays: Rays, some: Rays, fresh: float) -> tuple[Hypotheses, Agreement]:
-        """Return hypotheses corrected by a scan, and how some of its rays, turned as the laser is, agree with the map there."""
-        bank = hypotheses.matched(bank, walls, rays, fresh)
+    def _matched(self, bank: Hypotheses, walls: Walls, rays: Rays, some: Rays, driven: float) -> tuple[Hypotheses, Agreement]:
+        """Return hypotheses corrected by a scan, and how some of its rays, turned as the laser is, agree with the map there.
+
+        Driven is how far the robot has come since its last scan, m.
+        """
+        bank = hypotheses.matched(bank, walls, rays, float(np.clip(driven / _FRESH_WAY, _LEAST_FRESH, 1.0)))
         self.work += len(bank) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
-        return bank, walls.agreement(bank.poses, some)
+        return bank, walls.agreement(bank.poses, some, INDEPENDENT_RAYS * min(driven, 1.0))
 
     def _doubted(self) -> str:
         """Return why the pose counts as lost; "" = it does not.

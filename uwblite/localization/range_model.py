@@ -115,11 +115,6 @@ class Ranges(Table):
     def __len__(self) -> int:
         return len(self.values)
 
-    def times(self, factor: float) -> "Ranges":
-        """Return them measured in a unit that is so many times smaller: all lengths but the anchors' places are larger."""
-        lengths = ("tags", "values", "sigma", "way", "white", "length")
-        return replace(self, **{name: getattr(self, name) * factor for name in lengths})
-
     def spread(self) -> "Ranges":
         """Return FEW of them, evenly spread, for the time that all would take."""
         return self.rows(np.unique(np.linspace(0, len(self) - 1, FEW).astype(np.intp)))

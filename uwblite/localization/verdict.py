@@ -35,11 +35,13 @@ SURE = 4.0
 
 def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
     """Return why another place than the best one may be right; "" = none may."""
-    rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
-    count = 1 + int((rivals > -CERTAIN).sum())
     if not complete:
         return "too many places are as likely; drive on"
-    return f"{count} places are as likely; drive on, around a corner or past another anchor" if count > 1 else ""
+    rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+    if np.logaddexp.reduce(rivals, initial=-np.inf) < -CERTAIN:
+        return ""
+    count = 1 + max(int((rivals > -CERTAIN).sum()), 1)
+    return f"{count} places are as likely; drive on, around a corner or past another anchor"
 
 
 def imprecise(covariance: Floats) -> str:
@@ -115,7 +117,7 @@ def map_odds(scans: float, ends: float, pose: Floats, ranges: Ranges, agreed: fl
 def other_unit(walls: Walls | None, pose: Floats, rays: Rays, independent: float, ranges: Ranges) -> str:
     """Return how the distances of the map differ from the sensors' about a pose (3,); "" = they do not.
 
-    The robot's surroundings as many times larger are compared at the pose that fits them best.
+    The same map as many times smaller is compared at the pose that fits it best.
 
     Parameters
     ----------
@@ -126,12 +128,11 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, independent: float
         return ""
     odds = np.zeros(len(_FACTORS))
     for k, factor in enumerate(_FACTORS):
-        larger = Rays(rays.ends * factor, rays.origins * factor, rays.hit)
-        there = hypotheses.refined(pose[None], ranges.times(factor), seen, larger)
-        # Errors and detours keep their sizes: it is the map that is smaller.
-        smaller = replace(ranges, places=ranges.places / factor)
-        odds[k] = range_likelihood(there / [factor, factor, 1.0], smaller)[0]
-        odds[k] += independent * float(seen.agreement(there, larger).log_likelihood[0]) if seen is not None else 0.0
+        # Where distances are larger than in the map, the map is smaller: errors and detours keep their sizes.
+        smaller, here = replace(ranges, places=ranges.places / factor), None if seen is None else seen.times(1.0 / factor)
+        there = hypotheses.refined(pose[None] / [factor, factor, 1.0], smaller, here, rays)
+        odds[k] = range_likelihood(there, smaller)[0]
+        odds[k] += here.agreement(there, rays, independent).log_likelihood[0] if here is not None else 0.0
     sound = np.abs(_FACTORS - 1.0) < 1.5 * _UNIT
     gain = odds[~sound].max() - odds[sound].max()
     if gain > CERTAIN:

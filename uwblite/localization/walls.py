@@ -16,6 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Table
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid
+from ..lidar.object_likelihood import ObjectPolicy
 from ..lidar.point_cloud import Lines, estimate_normals, make_tree
 
 _Cell = TypeVar("_Cell", np.int8, np.signedinteger[Any])
@@ -75,7 +76,7 @@ class Agreement:
     """How scans agree with the map at poses (h,)."""
 
     log_likelihood: Floats
-    """Mean over the rays, by which places of the map are compared; 0 = all agree with the map."""
+    """Of all rays, by which places of the map are compared; 0 = all agree with the map."""
     odds: Floats
     """Mean log-likelihood of the rays against rays elsewhere, times the share of the ends that lie in known space."""
     on_wall: Floats
@@ -108,6 +109,13 @@ class Walls:
     nearest: NDArray[np.signedinteger]
     """(x, y) nearest wall point of each of its cells, with a line or without one; -1 = none within reach."""
 
+    def times(self, factor: float) -> "Walls":
+        """Return the walls of a map that is so many times larger."""
+        g = self.geometry
+        geometry = replace(g, resolution=factor * g.resolution, origin=factor * g.origin)
+        lengths = {name: factor * getattr(self, name) for name in ("points", "cell", "origin")}
+        return replace(self, geometry=geometry, **lengths)
+
     @property
     def rounding(self) -> float:
         """m; by how much farther from the surface the cells of a coarse map lie than those of a fine one."""
@@ -128,21 +136,18 @@ class Walls:
         q = self.points[near]
         return np.where(near >= 0, np.hypot(x - q[..., 0], y - q[..., 1]), np.inf)
 
-    def factors(
-        self, poses: Floats, rays: Rays, scale: float, rates: tuple[Floats, ...] = ()
-    ) -> tuple[Floats, Floats, Floats, Floats]:
+    def factors(self, poses: Floats, rays: Rays, scale: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the quadratic form of the point-to-line distances about poses (h, 3).
 
         Parameters
         ----------
         scale : m, width of the Geman-McClure kernel on the distance.
-        rates : (p, 2) each; how the ends move with k further unknowns, frame of the rays.
 
         Returns
         -------
-        hessian (h, 3 + k, 3 + k) : sum of w J^T J, J = (n, n . d(R p)/dtheta, n . R rate), as lidar.scan_matching.
-        spurious (h, 3, 3) : the part of the pose's by the scatter of the normals alone, see lidar.degeneracy.
-        gradient (h, 3 + k) : sum of w J^T r. weight (h,) : sum of w.
+        hessian (h, 3, 3) : sum of w J^T J, J = (n, n . d(R p)/dtheta), as lidar.scan_matching.
+        spurious (h, 3, 3) : the part of it by the scatter of the normals alone, see scan_matching.measured_part.
+        gradient (h, 3) : sum of w J^T r. weight (h,) : sum of w.
         """
         ends = rays.ends[rays.hit]
         rx, ry = _turned(poses, ends)
@@ -155,21 +160,21 @@ class Walls:
         good &= (nx * ox + ny * oy > 0.0) | ~self.one_sided.take(near)
         r = nx * dx + ny * dy
         w = good / np.square(1.0 + np.square(r / scale))
-        more = [nx * u + ny * v for u, v in (_turned(poses, rate[rays.hit]) for rate in rates)]
-        jacobian = np.stack([nx, ny, ny * rx - nx * ry, *more], axis=1)
+        jacobian = np.stack([nx, ny, ny * rx - nx * ry], axis=1)
         weighted = jacobian * w[:, None]
         # The tangent (-ny, nx) replaces the normal.
         tangent = np.stack([-ny, nx, nx * rx + ny * ry], axis=1)
         spurious = (tangent * (w * self.normal_variance.take(near))[:, None]) @ tangent.transpose(0, 2, 1)
         return weighted @ jacobian.transpose(0, 2, 1), spurious, np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
 
-    def agreement(self, poses: Floats, rays: Rays) -> Agreement:
-        """Return how rays (p,), p > 0, agree with the map at poses (h, 3).
+    def agreement(self, poses: Floats, rays: Rays, independent: float) -> Agreement:
+        """Return how rays (p,), p > 0, of which so many count as independent, agree with the map at poses (h, 3).
 
         An end on a wall counts log 1, one in free space log 0.1; a ray that passes a wall counts as if it ended in free space.
         Without a reading it has the likelihood of a missing return, to the power of a half: what is dark to one ray is dark to
         its neighbours. One that ends in unknown space is between the two; for the odds it is left out, and the others say so
-        much less.
+        much less. Whatever rays meet a thing that was moved, or that the map lacks, they tell one thing: those that end in one
+        square count together, and against a place no more than a thing that moves by itself (lidar.object_likelihood).
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
         on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
@@ -180,11 +185,20 @@ class Walls:
         ends = np.log(STRANGE + (1.0 - STRANGE) * np.where(passed, 0.0, on_wall))
         value = np.where(rays.hit, ends, np.where(passed, 0.5 * np.log(self.missing), 0.0))
         judged, count = known | passed | ~rays.hit, known.sum(axis=1)
-        likelihood = np.where(judged, value, 0.5 * np.log(STRANGE)).mean(axis=1)
+        each = np.where(judged, value, 0.5 * np.log(STRANGE)) * (independent / len(rays.hit))
+        likelihood = _by_things(each, rays.ends).sum(axis=1)
         fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
         share = (known & (on_wall >= 0.5)).sum(axis=1) / np.maximum(count, 1)
         odds = count / max(rays.hit.sum(), 1) * (fit - ELSEWHERE)
         return Agreement(likelihood, odds, share, count.astype(np.float64))
+
+
+def _by_things(value: Floats, ends: Floats) -> Floats:
+    """Return the log-likelihoods (h, o) of the things on which rays (p,) with log-likelihoods (h, p) and ends (p, 2), m, lie."""
+    _, thing = np.unique(np.floor(ends / ObjectPolicy.long), axis=0, return_inverse=True)
+    order = np.argsort(thing, kind="stable")
+    whole = np.add.reduceat(value[:, order], np.flatnonzero(np.diff(thing[order], prepend=-1)), axis=1)
+    return np.logaddexp(np.log1p(-ObjectPolicy.moves) + whole, np.log(ObjectPolicy.moves))
 
 
 def _turned(poses: Floats, points: Floats) -> tuple[Floats, Floats]:
