@@ -183,7 +183,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     yield nodes[kept].size
     poses = np.column_stack([field.centres(nodes[kept, 1:]), se2.wrap_angle(headings[nodes[kept, 0]])])
     if not len(ranges):
-        return (yield from _distinct(poses, complete))
+        return (yield from _distinct(poses, MOST_PLACES, complete))
     return (yield from _likeliest(poses, share * scores[kept], ranges, complete))
 
 
@@ -194,20 +194,19 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     """
     tried = poses[:_MOST_RIVALS]
     # As many rays, each likelier on a wall than beside it, as count as independent.
-    weight = -INDEPENDENT_RAYS * np.log(STRANGE) * scores[: len(tried)]
-    weight += yield from _ranged(tried, ranges, 0.5 * CELL)
-    order = np.argsort(-weight, kind="stable")
-    order = order[weight[order] >= weight[order[:1]] - 2.0 * CERTAIN]
-    return (yield from _distinct(tried[order], complete and len(tried) == len(poses)))
+    scans = -INDEPENDENT_RAYS * np.log(STRANGE) * scores[: len(tried)]
+    tried = yield from _likely(tried, ranges, 0.5 * CELL, scans)
+    return (yield from _distinct(tried, MOST_PLACES, complete and len(poses) <= _MOST_RIVALS))
 
 
-def _ranged(poses: Floats, ranges: Ranges, wider: float) -> Generator[int, None, Floats]:
-    """Return the log-likelihoods (n,) of some of the ranges at poses (n, 3) of a grid, see range_likelihood."""
-    few, found = ranges.spread(), np.empty(len(poses))
+def _likely(poses: Floats, ranges: Ranges, wider: float, scans: Floats | float = 0.0) -> Generator[int, None, Floats]:
+    """Return the likely ones of poses (n, 3) of a grid, the likeliest first, by some ranges (see range_likelihood) and scans (n,)."""
+    few, weight = ranges.spread(), np.zeros(len(poses)) + scans
     for part in units(len(poses), PER_RANGE * len(few)):
-        found[part] = range_likelihood(poses[part], few, wider)
-        yield PER_RANGE * len(few) * len(found[part])
-    return found
+        weight[part] += range_likelihood(poses[part], few, wider)
+        yield PER_RANGE * len(few) * len(poses[part])
+    order = np.argsort(-weight, kind="stable")
+    return poses[order[weight[order] >= weight[order[:1]] - 2.0 * CERTAIN]]
 
 
 def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
@@ -285,21 +284,21 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     if len(cells) * len(headings) > _MOST_NODES:
         return _UNDECIDED
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
-    weight = yield from _ranged(poses, ranges, np.sqrt(0.5) * step)
-    order = np.flatnonzero(weight >= weight.max(initial=-np.inf) - 2.0 * CERTAIN)
-    order = order[np.argsort(-weight[order], kind="stable")]
-    tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
-    for part in units(len(tried), _PER_REFINED * len(ranges)):
-        tried[part] = refined(tried[part], ranges)
-        yield _PER_REFINED * len(tried[part]) * len(ranges)
-    return (yield from _distinct(tried, 0 < len(order) <= _MOST_RIVALS))
+    likely = yield from _likely(poses, ranges, np.sqrt(0.5) * step)
+    found, few = (yield from _distinct(likely, _MOST_RIVALS, True)), ranges.spread()
+    tried = found.poses
+    for part in units(len(tried), _PER_REFINED * len(few)):
+        tried[part] = refined(tried[part], few)
+        yield _PER_REFINED * len(few) * len(tried[part])
+    tried = yield from _likely(tried, ranges, 0.0)
+    return (yield from _distinct(tried, MOST_PLACES, found.complete))
 
 
-def _distinct(poses: Floats, complete: bool) -> Steps:
-    """Return the first of poses (n, 3), best first, that are not near an earlier one."""
-    kept, left = poses[:0], poses
-    while len(left) and len(kept) < MOST_PLACES:
-        kept = np.concatenate([kept, left[:1]])
+def _distinct(poses: Floats, most: int, complete: bool) -> Steps:
+    """Return the first of poses (n, 3), best first, that are not near an earlier one, at most so many."""
+    kept, left = [poses[:0]], poses
+    while len(left) and len(kept) <= most:
+        kept.append(left[:1])
         yield _PER_PLACE * len(left)
         left = left[apart(left[0], left)]
-    return Places(kept, complete and not len(left))
+    return Places(np.concatenate(kept), complete and not len(left))
