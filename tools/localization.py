@@ -369,7 +369,7 @@ def posterior(on: Bench, begin: float) -> tuple[float, float, int]:
     poses, weights = poses[some], weights[some]
     independent = INDEPENDENT_RAYS * (1.0 + float(ago.max(initial=0.0)))
     for part in np.array_split(np.arange(len(poses)), 1 + len(poses) // 1000):
-        weights[part] += independent * walls.agreement(poses[part], rays).log_likelihood
+        weights[part] += walls.agreement(poses[part], rays, independent).log_likelihood
     share = np.exp(weights - weights.max())
     share /= share.sum()
     near = ~apart(poses[np.argmax(share)], poses)

@@ -29,7 +29,7 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
     for k, pose in enumerate(path):
         for a, place in enumerate(anchors):
             metres = float(np.hypot(*(pose[:2] - place)))
-            window.ranges.append(WindowRange(a, metres, pose, np.zeros(2), 0.2 * k, 0.1 * k))
+            window.entries.append(WindowRange(a, metres, pose, np.zeros(2), 0.2 * k, 0.1 * k))
     places, driven = PlaceSearch(known), np.array([1.0, 0.3, 0.4])
     nobody = hypotheses.none(4)
     places.begin(window, path[-1], 4.0)

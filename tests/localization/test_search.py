@@ -135,10 +135,10 @@ def test_a_cell_holds_the_likelihood_of_its_distance_to_the_nearest_wall(walls, 
     rows, cols = (rng.integers(room.margin - 10, n - room.margin + 10, 400) for n in room.free.shape)
     centres = room.origin + (np.stack([cols, rows], axis=1) + 0.5) * room.cell
     apart = np.hypot(*(centres[:, None] - walls.points[None]).transpose(2, 0, 1)).min(axis=1)
-    expected = 255.0 * np.exp(-0.5 * (apart / 0.15) ** 2)
+    expected = 255.0 * np.exp(-0.5 * (apart / search._SPREAD) ** 2)
     found = room.levels[0][rows, cols].astype(float)
     # The table of nearest walls has cells of 0.05 m: the distance is known to half a diagonal of one.
-    slope = 255.0 * np.exp(-0.5) / 0.15
+    slope = 255.0 * np.exp(-0.5) / search._SPREAD
     assert np.abs(found - expected).max() < slope * 0.5 * np.sqrt(2.0) * walls.cell + 1.0
     assert (found[apart > 0.8] == 0).all()
 

@@ -10,7 +10,7 @@ from uwblite.localization.window import Window, WindowLook, WindowRange
 @pytest.mark.parametrize(("parts", "kept"), [(1, 9), (2, 4), (4, 2)])
 def test_the_newest_part_of_a_window_is_of_its_time(parts, kept):
     rays = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
-    window = Window(looks=[WindowLook(rays, np.zeros(3), 0.4 * k, float(k)) for k in range(9)])
+    window = Window([WindowLook(rays, np.zeros(3), 0.4 * k, float(k)) for k in range(9)])
     assert [look.stamp for look in window.newest(parts).looks] == list(range(9 - kept, 9))
     assert not Window().newest(parts).looks
     assert window.newest(parts).length(4.0) == pytest.approx(4.0 - 0.4 * (9 - kept))
@@ -34,7 +34,7 @@ def test_scans_alone_and_ranges_alone_are_forgotten_after_ten_metres():
 
 
 def test_a_robot_that_stands_keeps_a_scan_of_its_own_where_the_last_one_is_too_old():
-    window = Window(looks=[look(4.0, 5.0)])
+    window = Window([look(4.0, 5.0)])
     assert not window.wants_look(4.0, 5.1)
     assert not window.wants_look(4.0, 5.1, 4.9)
     assert window.wants_look(4.0, 5.1, 5.0)
@@ -42,7 +42,7 @@ def test_a_robot_that_stands_keeps_a_scan_of_its_own_where_the_last_one_is_too_o
 
 
 def test_a_robot_that_stands_keeps_one_scan_the_newest_and_one_that_creeps_keeps_its_place():
-    window = Window(looks=[look(4.0, 5.0)])
+    window = Window([look(4.0, 5.0)])
     assert window.wants_look(4.02, 6.0)
     window.add_look(look(4.02, 6.0))
     assert [kept.stamp for kept in window.looks] == [6.0]

@@ -15,8 +15,9 @@ from .walls import UNIFORM_VARIANCE, Walls, walls_of
 
 _DRAWN = np.diag(np.square((0.014, 0.014, 0.003)))
 """m^2, rad^2; variance of a wall, and of a robot's laser upon it, in cells of 0.05 m: lidars measure a surface by its colour to
-0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell. A map of a room or two that
-does not say how far it is bent is bent by as much."""
+0.01 m, and mountings are known to 0.01 m. In larger cells a wall lies anywhere within half a cell."""
+_ROOM_BENT = _DRAWN
+"""m^2, rad^2; a map of a room or two, which does not say how far it is bent, is bent by no more than its walls are off."""
 _UNBENT = np.zeros((0, 2)), np.zeros((0, *_DRAWN.shape))
 """Shape of a map that does not say it."""
 _SIGMA, _LEAST_SIGMA = 0.1, 0.05
@@ -43,7 +44,7 @@ class KnownMap:
         drawn = _DRAWN + np.diag((cells, cells, 0.0))
         where, bent = self.shape
         if not len(where):
-            return np.broadcast_to(drawn + _DRAWN, (*places.shape[:-1], *drawn.shape))
+            return np.broadcast_to(drawn + _ROOM_BENT, (*places.shape[:-1], *drawn.shape))
         away = np.square(places[..., None, :] - where).sum(axis=-1)
         return np.asarray(drawn + bent[np.argmin(away, axis=-1)])
 

@@ -31,8 +31,8 @@ _STILL = 1e-3
 """m; a robot that has driven less stands."""
 _LEAST_FRESH = 0.02
 """Least share of a scan that is new; those of a robot that stands repeat one another."""
-_SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
-"""m driven and s between two searches."""
+_SEARCH_TIME = 0.5
+"""s between two searches."""
 _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
 """Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
@@ -95,7 +95,7 @@ class PoseEstimator:
         self._window = Window()
         self._parts = 1
         """Number of parts of the window, of which the newest is used for the search."""
-        self._way = self._scan_way = self._search_way = 0.0
+        self._way = self._scan_way = 0.0
         self._noise = anchors.noise
         self._range_way = np.full(len(anchors.ids), -np.inf)
         """(a,) m, odometer at the last range to each anchor."""
@@ -189,9 +189,8 @@ class PoseEstimator:
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
             return
-        due = self._way - self._search_way >= _SEARCH_WAY or now - self._search_stamp >= _SEARCH_TIME
-        if free and due and (not self.tracks or self._running.in_doubt()):
-            self._search_way, self._search_stamp = self._way, now
+        if free and now - self._search_stamp >= _SEARCH_TIME and (not self.tracks or self._running.in_doubt()):
+            self._search_stamp = now
             # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
             # wrong place by chance.
             self._searched = self._window.since(self._running.matched) if self.tracks else self._window.newest(self._parts)

@@ -195,23 +195,26 @@ def _drawn(
     poses: Floats, ranges: Ranges, wider: float = 0.0, expected: Floats | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the errors (h, m) of ranges, m, and their likelihoods (h, m), each drawn anew; in single precision."""
-    c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
-    x, y = ranges.tags.T
-    dx = c * x - s * y + (poses[:, :1] - ranges.places[:, 0])
-    dy = s * x + c * y + (poses[:, 1:2] - ranges.places[:, 1])
+    dx, dy, _, _ = _offsets(poses, ranges)
     error = ranges.values - np.sqrt(dx * dx + dy * dy) - (0.0 if expected is None else expected)
     single, sigma = error.astype(np.float32), (ranges.sigma + wider).astype(np.float32)
     return single, mixture(single, sigma)[1]
 
 
+def _offsets(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return x and y (h, m) from the anchors to the tag, and from the base to the tag, m, at poses (h, 3)."""
+    c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+    x, y = ranges.tags.T
+    lx, ly = c * x - s * y, s * x + c * y
+    return lx + (poses[:, :1] - ranges.places[:, 0]), ly + (poses[:, 1:2] - ranges.places[:, 1]), lx, ly
+
+
 def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Return errors (h, m), m, measured minus expected, and the expected ranges' Jacobian (h, m, 3) by the pose."""
-    lever = se2.rotate(poses[:, None, 2], ranges.tags[None])
-    offset = poses[:, None, :2] + lever - ranges.places
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    unit = offset / np.maximum(distance, _SAME_PLACE)[..., None]
-    turned = unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1]
-    return ranges.values - distance, np.concatenate([unit, turned[..., None]], axis=-1)
+    dx, dy, lx, ly = _offsets(poses, ranges)
+    distance = np.hypot(dx, dy)
+    ux, uy = (d / np.maximum(distance, _SAME_PLACE) for d in (dx, dy))
+    return ranges.values - distance, np.stack([ux, uy, uy * lx - ux * ly], axis=-1)
 
 
 def cauchy(error: Floats, sigma: Floats | float) -> Floats:

@@ -24,14 +24,14 @@ from ..grid.occupancy_grid import FREE
 from .hypotheses import MATCHES, SAME, apart, refined
 from .range_model import PER_RANGE, Ranges, range_likelihood
 from .verdict import CERTAIN, FEW_BESIDE, FEW_ENDS, SURE
-from .walls import INDEPENDENT_RAYS, MOST_CELLS, STRANGE, Rays, Walls
+from .walls import INDEPENDENT_RAYS, MOST_CELLS, ON_WALL, STRANGE, Rays, Walls
 
 CELL = 0.1
 """m; cell of the likelihood field."""
 LEVELS = 3
 """Levels above the field; the coarsest has cells of 0.8 m."""
-_SPREAD = 0.15
-"""m; of a point about its wall: the cell, and 0.05 rad at 3 m."""
+_SPREAD = float(np.hypot(ON_WALL, CELL))
+"""m; of a point about its wall: as everywhere, and within its cell."""
 FARTHEST = 12.0
 """m; points farther away are not matched: 0.05 rad is there 0.6 m."""
 _HEADINGS = 126

@@ -46,17 +46,21 @@ def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
 
 def imprecise(covariance: Floats) -> str:
     """Return why the only place is not found yet, by its covariance (3, 3), m and rad; "" = it is known well enough."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = _FOUND * sigma[:2].max() <= SAME[0] and _FOUND * sigma[2] <= SAME[1]
-    return "" if known else "place or heading is not sure yet; drive on"
+    place, heading = _sigmas(covariance)
+    return "" if _FOUND * place <= SAME[0] and _FOUND * heading <= SAME[1] else "place or heading is not sure yet; drive on"
 
 
 def vague(covariance: Floats) -> str:
     """Return why a pose that is tracked is not known, by its covariance (3, 3), m and rad; "" = it is known."""
-    place, heading = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
+    place, heading = _sigmas(covariance)
     if _VAGUE * place <= SAME[0] and _VAGUE * heading <= SAME[1]:
         return ""
     return f"the pose is known to {place:.1f} m and {heading:.2f} rad only; drive on, past an anchor or a wall"
+
+
+def _sigmas(covariance: Floats) -> tuple[float, float]:
+    """Return the standard deviations of a pose with a covariance (3, 3): along the longest axis of its place, m, and rad."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])), float(np.sqrt(covariance[2, 2]))
 
 
 def too_little(rays: Rays, ranges: Ranges) -> str:

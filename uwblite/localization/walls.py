@@ -38,7 +38,7 @@ _SMOOTH, _ONE_SIDE = 1.5, 0.1
 """Cells, smoothing of free space, and its slope per cell from which on it lies to one side; at a thick wall it is 0.27."""
 MOST_CELLS = 4_000_000
 """Cells of the table of nearest walls (4 bytes each), or of their likelihood; a larger map gets coarser ones."""
-_ON_WALL, _FINE = 0.1, GridConfig().resolution
+ON_WALL, _FINE = 0.1, GridConfig().resolution
 """m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
 STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
@@ -177,7 +177,7 @@ class Walls:
         square count together, and against a place no more than a thing that moves by itself (lidar.object_likelihood).
         """
         (x, y), (ox, oy) = (np.add(_turned(poses, p), poses.T[:2, :, None]) for p in (rays.ends, rays.origins))
-        on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(_ON_WALL, self.rounding)))
+        on_wall = np.exp(-0.5 * np.square(self.distances(x, y) / np.hypot(ON_WALL, self.rounding)))
         known = rays.hit & ((self.state_at(x, y) != UNKNOWN) | (on_wall >= 0.5))
         along, across = x - ox, y - oy
         t = _LOOKS[:, None, None] * np.maximum(1.0 - _BEFORE / np.maximum(np.hypot(along, across), _BEFORE), 0.0)

@@ -60,48 +60,56 @@ class WindowLook:
 
 @dataclass(slots=True)
 class Window:
-    """Measurements of the last metres (mutable)."""
+    """Measurements of the last metres, the oldest first (mutable)."""
 
-    ranges: list[WindowRange] = field(default_factory=list)
-    looks: list[WindowLook] = field(default_factory=list)
+    entries: list[WindowRange | WindowLook] = field(default_factory=list)
+
+    @property
+    def ranges(self) -> list[WindowRange]:
+        """Of all anchors."""
+        return [e for e in self.entries if isinstance(e, WindowRange)]
+
+    @property
+    def looks(self) -> list[WindowLook]:
+        """Scans."""
+        return [e for e in self.entries if isinstance(e, WindowLook)]
 
     def since(self, stamp: float) -> "Window":
         """Return a window of the measurements after a time, s."""
-        return Window([r for r in self.ranges if r.stamp > stamp], [k for k in self.looks if k.stamp > stamp])
+        return Window([e for e in self.entries if e.stamp > stamp])
 
     def newest(self, parts: int) -> "Window":
         """Return the newest of so many parts of the window's time."""
-        stamps = [r.stamp for r in self.ranges] + [k.stamp for k in self.looks]
+        stamps = [e.stamp for e in self.entries]
         return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
 
     def length(self, way: float) -> float:
         """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
-        return way - min([way, *(r.way for r in self.ranges[:1]), *(k.way for k in self.looks[:1])])
+        return way - self.entries[0].way if self.entries else 0.0
 
     def add_range(self, entry: WindowRange) -> None:
         """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""
         own = [r for r in self.ranges if r.anchor == entry.anchor]
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
-            self.ranges.append(entry)
-        self._forget(entry.way)
+            self._add(entry)
 
     def wants_look(self, way: float, stamp: float, after: float = -np.inf) -> bool:
         """Return whether a scan is wanted, at a way, m, and a time, s; or the last one is not newer than `after`."""
-        if not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after:
+        looks = self.looks
+        if not looks or way - looks[-1].way >= _LOOK_EVERY or looks[-1].stamp <= after:
             return True
-        return way - self.looks[-1].way < _STANDING and stamp - self.looks[-1].stamp >= _LOOK_AGAIN
+        return way - looks[-1].way < _STANDING and stamp - looks[-1].stamp >= _LOOK_AGAIN
 
     def add_look(self, look: WindowLook) -> None:
         """Keep a scan; that of a robot that stands replaces the last one."""
-        if self.looks and look.way - self.looks[-1].way < _STANDING:
-            self.looks.pop()
-        self.looks.append(look)
-        self._forget(look.way)
+        looks = self.looks
+        if looks and look.way - looks[-1].way < _STANDING:
+            self.entries.remove(looks[-1])
+        self._add(look)
 
-    def _forget(self, way: float) -> None:
-        """Remove what is older than LENGTH, where the odometer is `way`, m."""
-        self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
-        self.looks = [k for k in self.looks if way - k.way <= LENGTH]
+    def _add(self, entry: WindowRange | WindowLook) -> None:
+        """Keep a measurement, and forget those that are LENGTH before it."""
+        self.entries = [e for e in [*self.entries, entry] if entry.way - e.way <= LENGTH]
 
     def seen(self, odom: Floats, way: float, length: float) -> tuple[Rays, Floats]:
         """Return the rays of the last so many metres, in the present frame of the base, and how long ago (p,) each is, m."""
