@@ -63,13 +63,14 @@ def test_what_the_map_lacks_tells_against_a_place_once_however_many_rays_meet_it
     assert np.all(np.diff(found) < 0.0)
     np.testing.assert_allclose(found[-1], np.log(ObjectPolicy.moves), rtol=1e-3)
     # Two things that lie apart tell two.
-    both = Rays(np.concatenate([ends, ends + [0.0, 2.0]]), np.zeros((80, 2)), np.ones(80, bool))
+    both = Rays(np.concatenate([ends, ends + np.array([0.0, 2.0])]), np.zeros((80, 2)), np.ones(80, bool))
     np.testing.assert_allclose(walls_of(grid).agreement(POSE[None], both, 80.0).log_likelihood[0], 2.0 * found[-1], rtol=0.2)
 
 
 def test_walls_of_another_unit_are_those_of_a_map_in_it():
     grid, g = grid_of(ODD), grid_of(ODD).geometry
-    larger = walls_of(dataclasses.replace(grid, geometry=dataclasses.replace(g, resolution=1.1 * g.resolution, origin=1.1 * g.origin)))
+    geometry = dataclasses.replace(g, resolution=1.1 * g.resolution, origin=1.1 * g.origin)
+    larger = walls_of(dataclasses.replace(grid, geometry=geometry))
     scaled, rays = walls_of(grid).times(1.1), rays_from(POSE)
     place = POSE * [1.1, 1.1, 1.0]
     for one, other in zip(larger.factors(place[None], rays, 0.1), scaled.factors(place[None], rays, 0.1), strict=True):

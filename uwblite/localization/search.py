@@ -200,7 +200,10 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
 
 
 def _likely(poses: Floats, ranges: Ranges, wider: float, scans: Floats | float = 0.0) -> Generator[int, None, Floats]:
-    """Return the likely ones of poses (n, 3) of a grid, the likeliest first, by some ranges (see range_likelihood) and scans (n,)."""
+    """Return the likely ones of poses (n, 3), the likeliest first, by some of the ranges and by scans (n,).
+
+    Of poses of a grid every sigma of a range is wider, see range_likelihood.
+    """
     few, weight = ranges.spread(), np.zeros(len(poses)) + scans
     for part in units(len(poses), PER_RANGE * len(few)):
         weight[part] += range_likelihood(poses[part], few, wider)

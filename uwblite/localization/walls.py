@@ -194,7 +194,7 @@ class Walls:
 
 
 def _by_things(value: Floats, ends: Floats) -> Floats:
-    """Return the log-likelihoods (h, o) of the things on which rays (p,) with log-likelihoods (h, p) and ends (p, 2), m, lie."""
+    """Return the log-likelihoods (h, o) of things by those of the rays (h, p) that meet them; ends (p, 2), m, of the rays."""
     _, thing = np.unique(np.floor(ends / ObjectPolicy.long), axis=0, return_inverse=True)
     order = np.argsort(thing, kind="stable")
     whole = np.add.reduceat(value[:, order], np.flatnonzero(np.diff(thing[order], prepend=-1)), axis=1)
