@@ -31,7 +31,7 @@ from emulators.uwb_boards import BOARDS, UwbBoard
 from emulators.world import RoomWorld, WorldClock
 
 from uwblite.drivers.devices import open_device
-from uwblite.drivers.events import GyroHeading, LaserScan, Lost, OdometryPose, RangeEpoch
+from uwblite.drivers.events import GyroHeading, LaserScan, Lost, Note, OdometryPose, RangeEpoch
 from uwblite.drivers.session import Session
 
 START = 1000.0
@@ -47,10 +47,11 @@ DEVICES = {
     **{name: ("uwb", f"uwb-line:port?{LINES}" if name == "line" else f"{name}:port") for name in BOARDS if name != "line"},
     "uwb-line": ("uwb", f"uwb-line:port?{LINES}"),
 }  # fmt: skip
-PAUSES = {f"{kind}-{seconds:g}": (kind, seconds) for kind in ("stop", "pause") for seconds in (0.3, 0.6, 6.0)}
+PAUSES = {f"{kind}-{seconds:g}": (kind, seconds) for kind in ("stop", "pause", "mute") for seconds in (0.3, 0.6, 6.0)}
 LINKS = ("whole", "bytes", "noise", "loss", "replug", "reset", "slow", *PAUSES)
 """As it comes; byte by byte; 1 byte in 2,000 changed; 1 in 2,000 lost; the cable pulled for 3 s; the device's clock or the
-device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter; the host stopped, or the bytes held back, so many s."""
+device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter; the host stopped, the bytes held back, or what the
+device sends lost, for so many s."""
 HALFWAY = 0.5
 STEP, PAUSE = 0.02, 0.25
 """m or rad by which a pose may leave the truth from one reading to the next; s, of a gyro."""
@@ -178,6 +179,7 @@ def judge_scans(name, got, turns):
     """Return the number of false scans of a spinning lidar and the stamp errors, s; the truth is what the room looks like."""
     world, errors, false = RoomWorld(), [], 0
     duration = sorted(b - a for a, b in pairwise(turns))[len(turns) // 2]
+    turns = [turns[0] - duration, *turns]  # the motor begins at zero
     ahead = -FAR * duration if name.startswith("ydlidar") else 0.0  # its motor's zero stands beside its readings' zero
     for stamp, scan in got:
         errors.append(min(abs(stamp - turn - ahead) for turn in turns))
@@ -245,11 +247,12 @@ def trial(name, link, seconds, seed=0):
     return {
         "device": name, "link": link, "readings": received, "false": false, "missing": missing, "lost": lost,
         "median ms": 1000 * errors[len(errors) // 2], "95 % ms": 1000 * errors[int(0.95 * len(errors))],
+        "worst ms": 1000 * errors[-1], "notes": " ".join(sorted({note.name for note in of_kind(actions, Note)})),
         "CPU %": 100 * session.cpu / seconds, "kB": memory(session.driver, set()) // 1000,
     }  # fmt: skip
 
 
-HEADER = ("device", "link", "readings", "false", "missing", "lost", "median ms", "95 % ms", "CPU %", "kB")
+HEADER = ("device", "link", "readings", "false", "missing", "lost", "median ms", "95 % ms", "worst ms", "CPU %", "kB", "notes")
 
 
 def grid_row(name, rows):

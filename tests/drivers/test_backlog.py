@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from device_trials import trial
 from emulators.kobuki_device import Create2Device, KobukiDevice
 from emulators.uwb_boards import BOARDS, UwbBoard
 from emulators.world import RoomWorld, WorldClock
@@ -128,6 +129,24 @@ def test_a_base_loses_nothing_in_a_pause_and_did_not_restart(kind, seconds, what
     off = np.abs(measured - true[nearest])
     assert off[:, 0].max() < 0.008
     assert off[:, 1:].sum(axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("name", ["scip", "shell", "rplidar", "ydlidar-x4", "lds01"])
+def test_what_comes_while_a_device_is_started_again_counts(name):
+    """A link that holds the bytes back for long makes it be started again, and then hands on all that it had sent."""
+    row = trial(name, "pause-6", 16.0)
+    assert row["false"] == 0
+    assert row["missing"] <= row["lost"] <= (10 if name == "shell" else 1)  # rounds during which its stream was off
+    assert row["worst ms"] < 8.0
+
+
+@pytest.mark.parametrize(("name", "turns"), [("lds01", 3), ("ydlidar-x4", 4)])
+def test_whole_turns_that_are_lost_move_no_scan(name, turns):
+    """The motor stands where it would stand had none been lost."""
+    row = trial(name, "mute-0.6", 12.0)
+    assert row["false"] == 0
+    assert row["lost"] == turns
+    assert row["worst ms"] < 2.0
 
 
 @pytest.mark.parametrize("board", ["makerfabs", "bu01", "makerfabs-at", "bu03"])

@@ -145,6 +145,25 @@ def test_stamps_rise_though_the_process_was_stopped(tmp_path, stops, columns):
     assert all(before < after for before, after in itertools.pairwise(stamps))
 
 
+def test_a_computer_that_stood_still_blames_no_device(tmp_path):
+    ports = {"odometry": ("odometry", "line:/dev/base?columns=-,x,y,theta")}
+    recorder, notes = record(tmp_path, ports, 16.0, lambda url, clock: TalkingPort(clock), stops=[(5.0, 6.0)])
+    assert [note.name for _, note in notes] == ["odometry-connected"]
+    assert not recorder.doubts()
+
+
+def test_what_a_link_held_back_is_no_silence_once_it_has_come(tmp_path):
+    class HeldBack(TalkingPort):
+        def read(self):
+            return super().read() if not 1005.0 < self._clock() < 1011.0 else b""
+
+    ports = {"odometry": ("odometry", "line:/dev/base?columns=-,x,y,theta")}
+    recorder, notes = record(tmp_path, ports, 16.0, lambda url, clock: HeldBack(clock))
+    assert [note.name for _, note in notes] == ["odometry-connected", "odometry-no-data", "odometry-data-again"]
+    assert re.fullmatch(r"odometry: what was late by 6\.\d s has come", notes[-1][1].text)
+    assert not recorder.doubts()
+
+
 def test_a_log_that_is_deleted_meanwhile_keeps_every_line(tmp_path):
     deleted = []
 

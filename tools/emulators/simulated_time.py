@@ -3,13 +3,14 @@
 import math
 
 from uwblite.drivers.events import Reopen, Send, SetBaud
+from uwblite.drivers.link import HANG, SILENCE
 from uwblite.drivers.session import Session
 from uwblite.drivers.transport import CHUNK
 
 
 def simulate(
     session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0, tick=0.0,
-    replug=None, piece=1 << 20, pause=None, stop=None,
+    replug=None, piece=1 << 20, pause=None, stop=None, mute=None,
 ):  # fmt: skip
     """Run a session, or a driver's, against an emulated device in simulated time, with a fault line between them.
 
@@ -18,7 +19,8 @@ def simulate(
     latency : s of a round trip without the device.
     jitter : s that bytes take to the host, called for each piece.
     replug : (s, s); when the cable is pulled, and for how long.
-    pause, stop : (s, s); when the link holds back all bytes, or the host does nothing, and for how long.
+    pause, stop, mute : (s, s); when the link holds back all bytes, the host does nothing, or what the device sends is lost,
+        and for how long.
     piece : bytes that reach the host at once, at most.
     tick : s; bytes reach the host in steps of this length, as an FTDI adapter delivers them.
 
@@ -29,8 +31,8 @@ def simulate(
     """
     session = session if isinstance(session, Session) else Session(session)
     now, end = start, start + seconds
-    actions, to_host, to_device, reopens = [], [], [], 0
-    held, stopped = [(start + span[0], start + sum(span)) if span else (end, end) for span in (pause, stop)]
+    actions, to_host, to_device, reopens, last_data = [], [], [], 0, start
+    held, stopped, muted = [(start + span[0], start + sum(span)) if span else (end, end) for span in (pause, stop, mute)]
     device.power_up(now)
 
     def put(queue, data, due, rate=None):
@@ -39,11 +41,13 @@ def simulate(
         for at in range(0, len(data), size):
             part = data[at : at + size]
             due = max(due, queue[-1][0] if queue else due) + (10 * len(part) / rate if rate else 0.0)
+            if queue is to_host and muted[0] <= due < muted[1]:
+                continue
             due = held[1] if held[0] <= due < held[1] else due
             queue.append((math.ceil(due / tick) * tick if tick and queue is to_host else due, part))
 
     def do(new):
-        nonlocal reopens
+        nonlocal reopens, last_data
         for action in new:
             if isinstance(action, Send):
                 put(to_device, action.data, now + latency / 2)
@@ -51,8 +55,9 @@ def simulate(
                 device.host_rate = action.rate
                 actions.append((now, action))
             elif isinstance(action, Reopen):
-                reopens += 1
-                do(session.start(now))
+                if not SILENCE < now - last_data <= HANG:  # as Link.is_held_up
+                    reopens, last_data = reopens + 1, now
+                    do(session.start(now))
             else:
                 actions.append((now, action))
 
@@ -82,6 +87,7 @@ def simulate(
             if line is not None:
                 data = line.pass_on(data, now - start)
             if data:
+                last_data = now
                 do(session.feed(data, now))
         deadline = session.deadline()
         if deadline is not None and deadline <= now:

@@ -98,7 +98,13 @@ class Backlog:
                 time, came = time + held.period, set()
             came.update(held.members)
             sent.append(time + max((self._places.get(name, 0.0) for name in held.members), default=0.0))
-        last = frames[-1].event.stamp
+        # None came before it was sent.
+        begun = min(held.event.stamp - each for held, each in zip(frames, sent, strict=True))
+        latest = frames[-FAST:]
+        together = latest[-1].event.stamp - latest[0].event.stamp < (sent[-1] - sent[-len(latest)]) * LOOK / FAST
+        if together and begun - self._begun <= max(PAUSE * frames[-1].period, LEAST_PAUSE):
+            begun = min(begun, self._begun)  # nothing shows when the last was sent: they go on from those before the pause
+        last = begun + sent[-1]
         shrink = min(1.0, (last - self._begun) / max(sent[-1], 1e-9))
         times = iter(last - shrink * (sent[-1] - each) for each in sent)
         events = []

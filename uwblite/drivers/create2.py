@@ -15,7 +15,7 @@ import struct
 from dataclasses import dataclass
 
 from ..clocks.clock_map import rhythm_map
-from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
+from .events import Action, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
 from .odometer import BaseDriver, WheelOdometer, way_of
 from .session import Script, Wait
@@ -100,11 +100,11 @@ class Create2Driver(BaseDriver):
             yield Send(START)
             yield from self.sleep(0.05)
             yield Send(STREAM)
-            while (event := (yield Wait(self.now + SILENCE))) is not None:
-                if isinstance(event, Corrupt):
-                    self._new_clock()  # frames were lost: how many is not known
-                else:
-                    yield from self.take(event)
+            while (yield Wait(self.now + SILENCE)) is not None:
+                pass
+
+    def damaged(self) -> None:
+        self._new_clock()
 
     def take(self, event: Encoders) -> list[Action]:
         self.ready, last, self._last = True, self._last, event

@@ -5,6 +5,7 @@ Two ways to read it. *TLV* (default): status until a fix is ready, then the fix 
 that died, is brought round.
 """
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from .continuity import LinkHealth, RangeGuard
@@ -96,6 +97,8 @@ class Dwm1001Driver(Driver):
         self._poller: FixPoller | None = None
         self._health = LinkHealth()
         self._guard = RangeGuard(self._health)
+        self._begun = False
+        """The stream was begun: its lines count, also those that come late, while the tag is looked for again."""
         self._last_line = 0.0
         """s, when the last line of the stream came."""
         self._missed = False
@@ -134,7 +137,15 @@ class Dwm1001Driver(Driver):
         return [event for event in events if not isinstance(event, Corrupt)]
 
     def spacing(self, event: Any) -> float | None:
-        return self.period if self._streaming and isinstance(event, RangeLine) else None
+        return self.period if self._begun and isinstance(event, RangeLine) else None
+
+    def damaged(self) -> None:
+        if self._begun:
+            self._missed = True
+            self._health.damage(self.now)
+
+    def take(self, event: Any) -> Iterable[Action]:
+        return self._take_line(event) if self._begun and isinstance(event, RangeLine) else ()
 
     def stop(self) -> list[Action]:
         noise = self._noise if self._text and self._binary else []
@@ -142,7 +153,12 @@ class Dwm1001Driver(Driver):
 
     def script(self) -> Script[None]:
         """Find the module, learn who it is, and read fixes; begin again when it falls silent."""
-        while (yield from self._find()):
+        while True:
+            if not (yield from self._find()):
+                yield from self._noise
+                yield from self.say_once(UNREADABLE if self._heard else SILENT)
+                yield Reopen("no answer")
+                continue
             yield from (self._ask_shell() if self._shell else self._query())
             self.ready = True
             if not self._stream:
@@ -153,9 +169,6 @@ class Dwm1001Driver(Driver):
                 self._poller = self._poller or FixPoller(self, self.period)
                 yield from self._poller.script()
             yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
-        yield from self._noise
-        yield from self.say_once(UNREADABLE if self._heard else SILENT)
-        yield Reopen("no answer")
 
     # ---- finding out the mode, and changing it
 
@@ -235,24 +248,21 @@ class Dwm1001Driver(Driver):
 
     def _read_lines(self) -> Script[None]:
         """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
-        self._streaming, tries, self._missed = True, 4, True
+        self._streaming = self._begun = self._missed = True
+        tries = 4
         while tries:
             tries -= 1
             yield Send(b"lec\r")
             until, answered = self.now + max(1.0, 3 * self.period), False
             while (event := (yield Wait(until))) is not None:
                 answered = True
-                if isinstance(event, Corrupt):
-                    self._missed = True
-                    self._health.damage(self.now)
-                elif isinstance(event, RangeLine):
+                if isinstance(event, RangeLine):
                     until, tries = self.now + max(3.0, 3 * self.period), 4
-                    yield from self._take_line(event)
             if not answered:  # not even an echo: it is no longer in its shell
                 break
         self._streaming = False
 
-    def _take_line(self, line: RangeLine) -> Script[None]:
+    def _take_line(self, line: RangeLine) -> Iterator[Action]:
         """Log a line. It has no sum: a range that leaps or a new anchor must come again."""
         gap = round((line.stamp - self._last_line) / self.period) - 1 if self._last_line else 0
         if gap > 0 and self._missed:

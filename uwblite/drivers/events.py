@@ -65,7 +65,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Reopen:
-    """The device does not answer any more: close the port and open it again after a pause."""
+    """The device does not answer: close the port and open it again after a pause, unless what it sends may still come."""
 
     why: str
 

@@ -180,18 +180,20 @@ class Link:
 
     # ---- its data
 
-    def received(self, now: float) -> float:
-        """Count a measurement; return the length of the silence that it ends, s, 0 = there was none."""
+    def received(self, stamp: float, now: float) -> str:
+        """Count a measurement made at `stamp` s; return what to say of the silence that it ends, "" = there was none."""
         self.counts.messages += 1
-        pause = now - self.last_message if self.quiet else 0.0
-        self.quiet, self.last_message = False, now
+        pause = max(0.0, stamp - self.last_message) if self.quiet else 0.0
         self.counts.silent_time += pause
-        return pause
+        ended, self.quiet, self.last_message = self.quiet, False, now
+        if not ended:
+            return ""
+        return f"what was late by {now - stamp:.1f} s has come" if now - stamp > SILENCE else f"data again after {pause:.1f} s"
 
     def watch(self, now: float) -> tuple[Note | None, bool]:
         """Return what is to be reported of a device that falls silent, and whether its port should be opened again."""
         silent, note = now - max(self.last_message, self.opened), None
-        if silent > SILENCE and not self.quiet:
+        if silent > SILENCE and not self.quiet and not self.session.is_catching_up:
             self._fall_silent()
             if now - self.session.last_event < SILENCE:
                 why = "it answers, but measures nothing"
@@ -201,6 +203,10 @@ class Link:
                 why = "check power and cable; unplug it and plug it in again"
             note = Note("warning", f"{self.name}-no-data", f"{self.name}: no data for {silent:.0f} s; {why}")
         return note, silent > HANG and now - self.last_data > HANG
+
+    def is_held_up(self, now: float) -> bool:
+        """Return whether a silence may be the link's, which delivers late what the device sends, as a wireless bridge does."""
+        return SILENCE < now - self.last_data <= HANG
 
     def _fall_silent(self) -> None:
         if not self.quiet:

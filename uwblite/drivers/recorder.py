@@ -62,35 +62,36 @@ class Recorder:
                 now = self._now()
                 if until is not None and now >= until:
                     break
+                self._wait(now, next_look if until is None else min(next_look, until))
                 if now >= next_look:
                     self._housekeeping(now)
                     opening = any(link.opening for link in self.links)
                     next_look = now + (OPENING if opening else HOUSEKEEPING)
                     if on_status:
                         on_status()
-                self._wait(next_look if until is None else min(next_look, until))
                 self._text.flush()
         finally:
             self.end = self._now()
             self._finish()
 
-    def _wait(self, until: float) -> None:
-        """Wait for bytes or the next deadline, and serve whatever is due."""
+    def _wait(self, now: float, until: float) -> None:
+        """Wait for bytes or the next deadline, and serve whatever was due at time `now`, s.
+
+        All that had come by then was read: where this computer stood still, no device was silent.
+        """
         blind = [link for link in self.links if link.port is not None and link.port.fileno() is None]
         deadlines = [d for link in self.links if link.port and (d := link.session.deadline()) is not None]
-        now = self._now()
         timeout = max(0.0, min([until, *deadlines]) - now)
         if blind:
             timeout = min(timeout, POLL)
         ready = [key.data for key, _ in self._selector.select(timeout)]
         for link in [*ready, *blind]:
             self._read(link)
-        now = self._now()
         for link in self.links:
             if link.port is not None:
                 deadline = link.session.deadline()
                 if deadline is not None and deadline <= now:
-                    self._do(link, link.session.tick(now), now)
+                    self._do(link, link.session.tick(self._now()), self._now())
 
     def _read(self, link: Link) -> None:
         if link.port is None:
@@ -110,7 +111,7 @@ class Recorder:
         counts = link.counts
         for action in actions:
             if isinstance(action, Measurement):
-                self._message(link, now)
+                self._message(link, action.stamp, now)
                 self._text.write(action, link)
             elif isinstance(action, Send | SetBaud | SetDtr):
                 if not self._send(link, action):
@@ -125,7 +126,7 @@ class Recorder:
                 self._note(link, link.named(action))
             elif isinstance(action, Param):
                 self._text.param(link.param_name(action.name), action.value)
-            elif isinstance(action, Reopen):
+            elif isinstance(action, Reopen) and not link.is_held_up(now):
                 self._down(link, action.why)
                 return
 
@@ -136,10 +137,9 @@ class Recorder:
             self._down(link, str(error))
         return link.port is not None
 
-    def _message(self, link: Link, now: float) -> None:
-        pause = link.received(now)
-        if pause:
-            self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
+    def _message(self, link: Link, stamp: float, now: float) -> None:
+        if ended := link.received(stamp, now):
+            self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: {ended}"))
             link.stated.clear()
 
     # ---- the log

@@ -201,9 +201,9 @@ class RpLidarDriver(SlamtecDriver):
     def _stream(self) -> Script[bool]:
         yield from self.ask(PERIODS, answers(PERIODS_REPLY), 0.2)
         yield Send(motor(USUAL_SPEED))
-        if self._express and (yield from self.ask(EXPRESS, answers(EXPRESS_REPLY), 0.5, 2)) is not None:
+        if self._express and (yield from self.begin_stream(EXPRESS, EXPRESS_REPLY)):
             return True
-        return (yield from self.ask(STANDARD, answers(STANDARD_REPLY), 0.5, 2)) is not None
+        return (yield from self.begin_stream(STANDARD, STANDARD_REPLY))
 
     def stop(self) -> list[Action]:
         return [Send(STOP), Send(motor(0)), *super().stop()]

@@ -51,6 +51,8 @@ class ScipDriver(ScipUnit):
         self._scans, self._stream = request or ScanRequest(), stream
         self._rates_tried: set[int] = set()
         self._rounds = 0
+        self._greeted = False
+        """It is known how to read its scans, also those that come late, while it is started again."""
         self._series = Continuity(_follows, "scan whose time", summed=True)
 
     def stop(self) -> list[Action]:
@@ -59,12 +61,12 @@ class ScipDriver(ScipUnit):
     def script(self) -> Script[None]:
         """Find the unit, learn who it is, and read scans; begin again when none come."""
         self._rounds = 0
-        while self._rounds <= MAX_ROUNDS:
+        while True:
             if not (yield from self._find()):
-                return
+                continue
             yield from self._greet()
             self._scans.command(self.geometry)  # steps that the unit does not have are the user's mistake: say so now
-            self.ready = True
+            self.ready = self._greeted = True
             if not self._stream:
                 return
             yield from self._tie_clock()
@@ -73,7 +75,9 @@ class ScipDriver(ScipUnit):
             self._rounds += 1
             if why:
                 yield Note("warning", "lidar-restart", f"lidar: {why}; starting it again")
-        yield Reopen("the laser does not start")
+            if self._rounds > MAX_ROUNDS:
+                self._rounds = 0
+                yield Reopen("the laser does not start")
 
     # ---- scans
 
@@ -98,7 +102,6 @@ class ScipDriver(ScipUnit):
                 good, why, self._rounds = self.now, "", 0
                 durations.append(self.now - event.stamp)
                 until = self.now + max(SCAN_PATIENCE, 10 * self.period, 3 * durations[-1])
-                yield from self._series.confirmed(event, 1, self._timed)
                 if len(durations) == 2 and (yield from self._fit_line(min(durations))):
                     return ""
             elif isinstance(event, Reply) and event.command[0] == "M":
@@ -167,6 +170,10 @@ class ScipDriver(ScipUnit):
             yield Note("info", "lidar-faster-line", text)
             return True
         return False
+
+    def take(self, event: Any) -> list[Action]:
+        is_scan = isinstance(event, Distances) and event.command[0] == "M"
+        return self._series.confirmed(event, 1, self._timed) if is_scan and self._greeted else []
 
     def _timed(self, scan: Distances) -> Iterator[Action]:
         """Log a scan. One whose time leaps, and the first, count only if the next one goes on from it."""

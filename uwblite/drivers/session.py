@@ -8,12 +8,13 @@ gets back an event of the protocol, or None when the time is over::
         yield Send(b"QT\\n")
         reply = yield Wait(self.now + 0.4)
 
-A device that only talks needs no script of its own, only `take`. Nothing here opens a port or reads a clock: the caller
-brings `now`, seconds of a monotonic clock.
+Measurements that the device sends unasked are handled by `take`, whatever the script waits for: they may come late, while the
+script already looks for a device that had fallen silent. A device that only talks needs no script of its own. Nothing here
+opens a port or reads a clock: the caller brings `now`, seconds of a monotonic clock.
 """
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -81,7 +82,7 @@ class Driver:
         self.protocol.reset()
 
     def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return the events that bytes complete; Corrupt is counted, and shown to the script as well."""
+        """Return the events that bytes complete."""
         return self.protocol.feed(data, now)
 
     def spacing(self, event: Any) -> float | None:
@@ -92,16 +93,16 @@ class Driver:
         """Return what a frame contains of a round that has each once, such as anchors; none = each frame is a round."""
         return ()
 
-    def script(self) -> Script[None]:
-        """Hold the conversation; by default, listen."""
-        while True:
-            event = yield Wait(None)
-            if not isinstance(event, Corrupt):
-                yield from self.take(event)
+    def take(self, event: Any) -> Iterable[Action]:
+        """Return what an event means that the device may send unasked."""
+        return ()
 
-    def take(self, event: Any) -> list[Action]:
-        """Return what an event of a device that talks unasked means; a device with a script of its own needs none."""
-        return []
+    def damaged(self) -> None:
+        """Note that bytes were damaged: frames may have been lost with them, how many is not known."""
+
+    def script(self) -> Script[None]:
+        """Hold the conversation; by default, send nothing."""
+        yield Wait(None)
 
     def stop(self) -> list[Action]:
         """Return what to send so that the device falls quiet."""
@@ -183,6 +184,11 @@ class Session:
         held = self._backlog.deadline()  # the script does not know yet that they came
         return self._due if held is None else held
 
+    @property
+    def is_catching_up(self) -> bool:
+        """Frames that came after a pause wait for those behind them."""
+        return self._backlog.deadline() is not None
+
     def stop(self) -> list[Action]:
         """Return what to send so that the device falls quiet."""
         return [*self._handle(self._backlog.release()), *self.driver.stop()]
@@ -190,7 +196,11 @@ class Session:
     def _handle(self, events: list[Any]) -> list[Action]:
         actions: list[Action] = []
         for event in events:
-            actions += [event] if isinstance(event, Corrupt) else []
+            if isinstance(event, Corrupt):
+                self.driver.damaged()
+                actions.append(event)
+            else:
+                actions += self.driver.take(event)
             actions += self._resume(event)
         return actions
 

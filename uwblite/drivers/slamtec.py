@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from .events import Note, Param, Send
+from .events import Action, Note, Param, Send
 from .session import Identity, Script
 from .spinning import SpinningDriver
 
@@ -74,6 +74,10 @@ def answers(kind: int) -> Callable[[Any], bool]:
 class SlamtecDriver(SpinningDriver):
     """What RPLIDAR and YDLIDAR share: who are you, how are you."""
 
+    def take(self, event: Any) -> list[Action]:
+        """Return the scans of a lidar that is known; before, they are those of a dead host's stream."""
+        return super().take(event) if self.facts else []
+
     def greet(self, info: bytes, health: bytes) -> Script[bool]:
         """Ask for model and health; False = nobody answers."""
         reply = yield from self.ask(info, answers(INFO_REPLY), 0.5, 2)
@@ -96,6 +100,11 @@ class SlamtecDriver(SpinningDriver):
             return ()
         text = f"lidar: it reports its health as {health}: see that nothing holds the motor, power it down and up"
         return (Note(health, "lidar-health", text),)
+
+    def begin_stream(self, command: bytes, kind: int) -> Script[bool]:
+        """Ask for a stream, which goes on from no reading before it; False = none is announced."""
+        self.is_new_stream = (yield from self.ask(command, answers(kind), 0.5, 2)) is not None
+        return self.is_new_stream
 
     def quiet(self, stop: bytes) -> Script[None]:
         """Stop the stream of a dead host and let it drain."""

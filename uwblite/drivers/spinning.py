@@ -16,6 +16,7 @@ from typing import Any
 
 from ..clocks.clock_map import rhythm_map
 from ..clocks.device_clock import DeviceClock
+from .backlog import LEAST_PAUSE
 from .events import Action, LaserScan, Lost, Reopen, SetDtr
 from .framing import FrameReader
 from .session import Driver, Identity, Script, Wait
@@ -159,9 +160,8 @@ def _resample(samples: list[tuple[float, float]], rays: int, spacing: float) -> 
 SILENCE = 3.0
 """s without a reading after which the lidar is started again."""
 LONG = 0.6
-"""Turns without a reading after which, by the motor's place alone, it is unknown how many went by."""
-PAUSE = 1.0
-"""s without bytes after which the motor's place shows nothing, even where it seems to go on."""
+"""Turns without a reading after which, by the motor's place alone, it is unknown how many went by; where it seems to go on,
+in pauses that `Backlog` fills."""
 
 
 class SpinningDriver(Driver):
@@ -180,6 +180,8 @@ class SpinningDriver(Driver):
         self.facts = dict[str, str]()
         self._clock, self._map = clock, rhythm_map()
         self._assembler = SweepAssembler(fan)
+        self.is_new_stream = False
+        """It was asked for a stream; readings that come next do not go on from those before."""
         self._received: Samples | None = None
         self._last: Samples | None = None
         self._time = 0.0
@@ -220,7 +222,6 @@ class SpinningDriver(Driver):
         while (event := (yield Wait(until))) is not None:
             if isinstance(event, Samples):
                 until = self.now + SILENCE
-                yield from self.take(event)
 
     def stop(self) -> list[Action]:
         return [] if self.dtr is None else [SetDtr(not self.dtr)]
@@ -230,7 +231,9 @@ class SpinningDriver(Driver):
 
     # ---- readings
 
-    def take(self, event: Samples) -> list[Action]:
+    def take(self, event: Any) -> list[Action]:
+        if not isinstance(event, Samples):
+            return []
         self.ready = True
         last, lost = self._host_time(event) if self._clock is None else self._device_time(event, self._clock)
         count = len(event.ranges)
@@ -255,12 +258,12 @@ class SpinningDriver(Driver):
         if before is not None:
             silence, turn = samples.stamp - before.stamp, _turn(samples)
             elapsed, follows = _elapsed(before, samples)
-            if silence > PAUSE or (silence > LONG * turn and not follows):
-                lost = max(1, round(silence / turn))
+            if self.is_new_stream or (silence > LONG * turn and not (follows and silence < LEAST_PAUSE)):
+                lost = round(silence / turn)
                 self._forget()
             else:
                 self._time += elapsed
-        self._last = samples
+        self._last, self.is_new_stream = samples, False
         self._map.add(self._time, samples.stamp)
         return self._map.host(self._time), lost
 

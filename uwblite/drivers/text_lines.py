@@ -12,7 +12,7 @@ from ..errors import ConfigError
 from .continuity import WITNESSES, Continuity, LinkHealth
 from .events import Action, Corrupt, Lost, corrupt
 from .framing import LineReader
-from .session import ByteProtocol, Driver, Script, Wait
+from .session import ByteProtocol, Driver
 
 EARLY = 0.02
 """s by which a line may come earlier than any before: the quickest way is known to that after a few lines."""
@@ -119,24 +119,27 @@ class LineDriver(Driver, ABC):
         super().__init__(protocol, title)
         self.baud, self.clock, self.health = baud, clock, LinkHealth()
         self._series = Continuity(self.follows, "line that")
+        self._cut = False
 
     def spacing(self, event: Line | Corrupt) -> float | None:
         """Return that the time between two lines without a time of their own is learnt."""
         return 0.0 if isinstance(event, Line) and self.time_of(event.content) is None else None
 
-    def script(self) -> Script[None]:
-        """Pass over the first line, of which the port may have shown only the end; then listen."""
-        if not self.first_is_whole:
-            yield Wait(None)
-        while True:
-            event = yield Wait(None)
-            if isinstance(event, Corrupt):
-                self.health.damage(self.now)
-            else:
-                yield from self.take(event)
+    def begin(self) -> None:
+        """Discard half a line, and pass over the first one, of which the port may have shown only the end."""
+        super().begin()
+        self._cut = not self.first_is_whole
+
+    def damaged(self) -> None:
+        if not self._cut:
+            self.health.damage(self.now)
+        self._cut = False
 
     def take(self, event: Line) -> list[Action]:
         """Turn a line into what was measured. One that leaps counts only if the next one goes on from it."""
+        if self._cut:
+            self._cut = False
+            return []
         return self._series.confirmed(event, WITNESSES[self.health.is_damaged(event.stamp)], self.measured)
 
     @abstractmethod

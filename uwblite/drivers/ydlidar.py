@@ -18,7 +18,7 @@ from operator import xor
 from .events import Action, Send
 from .framing import PacketReader, to_next
 from .session import Script
-from .slamtec import DESCRIPTOR, SYNC, Reply, SlamtecDriver, answers, decode_reply, reply_size, request
+from .slamtec import DESCRIPTOR, SYNC, Reply, SlamtecDriver, decode_reply, reply_size, request
 from .spinning import Fan, Samples, SpinningDriver
 
 BAUD_X4, BAUD_X2 = 128000, 115200
@@ -107,7 +107,7 @@ class YdLidarX4Driver(SlamtecDriver):
         yield from self.quiet(STOP)
         if not (yield from self.greet(INFO, HEALTH)):
             return False
-        return (yield from self.ask(START, answers(STREAM), 0.5, 2)) is not None
+        return (yield from self.begin_stream(START, STREAM))
 
     def stop(self) -> list[Action]:
         return [Send(STOP), *super().stop()]
