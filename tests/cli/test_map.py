@@ -391,6 +391,12 @@ def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path,
     assert "is the map itself" in capsys.readouterr().err
     assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(part)]) == 1
     assert "name a folder" in capsys.readouterr().err
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    (pictures / "path.png").write_bytes(b"mine")
+    assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(pictures), "--force"]) == 1
+    assert "path.png was not written by uwblite" in capsys.readouterr().err
+    assert contents(pictures) == {"path.png": b"mine"}
     assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(out)]) == 0
     assert "lie on walls of the map" in capsys.readouterr().out
     assert set(contents(out)) == {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"}

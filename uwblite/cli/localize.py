@@ -4,11 +4,12 @@ import argparse
 import os
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 from ..errors import ConfigError, UsageError
 from ..io.files import write_text
-from ..io.folders import replacing_folder
+from ..io.folders import refuse_foreign, replacing_folder, unmarked
 from ..io.formats import refuse_existing
 from ..io.png import write_png
 from ..io.result_text import covariance_csv, json_lines
@@ -77,6 +78,8 @@ def _write(places: dict[str, str], localization: Localization, picture: Any, rep
 
 _OWN = {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"}
 """What a folder of a localisation holds."""
+_REPORT = '{\n "source": '
+"""Beginning of its report, by which it is known."""
 
 
 def _files(args: argparse.Namespace) -> dict[str, str]:
@@ -90,6 +93,7 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
     if os.path.exists(os.path.join(args.out, "map.yaml")):
         raise ConfigError(f"{args.out} holds a map, which a localisation does not replace; choose another folder")
     names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
+    refuse_foreign(unmarked(Path(args.out), _OWN, "report.json", _REPORT))
     files = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
     return files | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
 
