@@ -10,6 +10,7 @@ import pytest
 from uwblite import SensorLog, build_map
 from uwblite.arrays import (
     MAD_TO_SIGMA,
+    Table,
     array_fields,
     as_array,
     concatenated,
@@ -102,20 +103,25 @@ def test_medians_of_rows_are_numpys_to_the_last_bit(columns):
     assert np.array_equal(row_medians(values), np.median(values, axis=1))
 
 
-def test_dataclasses_of_arrays_are_concatenated_field_by_field():
+def test_tables_are_concatenated_field_by_field():
     @dataclass(frozen=True)
-    class Inner:
-        rows: np.ndarray
+    class Inner(Table):
+        places: np.ndarray
 
     @dataclass(frozen=True)
-    class Outer:
+    class Outer(Table):
+        SHARED = ("common",)
         inner: Inner
         flags: np.ndarray
+        common: np.ndarray
+        unknown: np.ndarray
 
-    parts = [Outer(Inner(np.full((n, 2), n)), np.full(n, n > 1)) for n in (1, 0, 2)]
+    parts = [Outer(Inner(np.full((n, 2), n)), np.full(n, n > 1), np.full(2, n), np.zeros(0)) for n in (1, 0, 2)]
     whole = concatenated(parts)
-    assert whole.inner.rows.tolist() == [[1, 1], [2, 2], [2, 2]]
-    assert whole.flags.tolist() == [False, True, True]
+    for table in (whole, whole.rows(np.arange(3))):
+        assert table.inner.places.tolist() == [[1, 1], [2, 2], [2, 2]]
+        assert table.flags.tolist() == [False, True, True]
+        assert (table.common.tolist(), len(table.unknown)) == ([1, 1], 0)
 
 
 KINDS = [

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from functools import cache
-from typing import Any, Self, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .errors import DataError
 
-_Joined = TypeVar("_Joined")
+_Joined = TypeVar("_Joined", bound="Table")
 _Number = TypeVar("_Number", np.float64, np.intp, np.int64)
 
 Floats = NDArray[np.float64]
@@ -40,21 +40,28 @@ OUTLIER = 3.0
 
 
 class Table:
-    """A dataclass of arrays, each with a row per entry."""
+    """A dataclass of arrays, each with a row per entry; an empty one may stand for values that are not known."""
 
     __slots__ = ()
 
+    SHARED: ClassVar[tuple[str, ...]] = ()
+    """Names of the arrays that all entries share."""
+
+    def columns(self) -> dict[str, Any]:
+        """Return the arrays, and tables within it, with a row per entry by their names."""
+        every = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return {name: c for name, c in every.items() if isinstance(c, np.ndarray | Table) and name not in self.SHARED}
+
     def rows(self, which: slice | Ints | Bools) -> Self:
-        """Return some of the entries, of tables within it, too; fields that are neither are kept."""
+        """Return some of the entries; fields that are no columns are kept."""
         # Flags are searched once, and `take` needs half the time of an index for tables of two columns.
         numbers = np.flatnonzero(which) if isinstance(which, np.ndarray) and which.dtype == np.bool_ else which
         chosen: dict[str, Any] = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            column = getattr(self, f.name)
+        for name, column in self.columns().items():
             if isinstance(column, Table):
-                chosen[f.name] = column.rows(numbers)
-            elif isinstance(column, np.ndarray):
-                chosen[f.name] = column[numbers] if isinstance(numbers, slice) else column.take(numbers, axis=0)
+                chosen[name] = column.rows(numbers)
+            elif len(column):
+                chosen[name] = column[numbers] if isinstance(numbers, slice) else column.take(numbers, axis=0)
         return replace(self, **chosen)  # type: ignore[type-var]
 
 
@@ -101,14 +108,12 @@ def unique_rows(rows: NDArray[_Number]) -> tuple[NDArray[_Number], Ints]:
 
 
 def concatenated(parts: Sequence[_Joined]) -> _Joined:
-    """Return dataclasses of arrays, all of one kind, as one: the rows of each part after those of the one before.
-
-    A field may be such a dataclass itself.
-    """
+    """Return tables of one kind as one: the rows of each part after those of the one before; the first one's other fields."""
     if len(parts) == 1:
         return parts[0]
-    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}  # type: ignore[arg-type]
-    whole = {n: np.concatenate(c) if isinstance(c[0], np.ndarray) else concatenated(c) for n, c in columns.items()}
+    each = [part.columns() for part in parts]
+    columns = {name: [part[name] for part in each] for name in each[0]}
+    whole = {n: concatenated(c) if isinstance(c[0], Table) else np.concatenate(c) for n, c in columns.items()}
     return replace(parts[0], **whole)  # type: ignore[type-var]
 
 

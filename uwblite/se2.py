@@ -15,8 +15,10 @@ Angles are kept in (-pi, pi].
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import Floats
+from .arrays import Floats, chunks
 
+POSE: tuple[int, ...] = (3,)
+"""Shape of a pose; POSE * 2 is that of its information."""
 _ABOVE_MINUS_PI = np.nextafter(-np.pi, 0.0)
 
 
@@ -58,7 +60,7 @@ def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
 def rotation(theta: ArrayLike) -> Floats:
     """Return blockdiag(R(theta), 1), (..., 3, 3): it turns errors of poses; its first two rows and columns turn vectors."""
     c, s = cos_sin(theta)
-    matrix = np.zeros((*c.shape, 3, 3))
+    matrix = np.zeros((*c.shape, *POSE, *POSE))
     matrix[..., 0, 0] = matrix[..., 1, 1] = c
     matrix[..., 1, 0], matrix[..., 0, 1] = s, -s
     matrix[..., 2, 2] = 1.0
@@ -76,8 +78,7 @@ def rotate_each(theta: Floats, owner: NDArray[np.signedinteger], vectors: ArrayL
     cosine, sine = cos_sin(theta)
     vectors = np.asarray(vectors)
     turned = np.empty((len(vectors), 2))
-    for first in range(0, len(vectors), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
+    for part in chunks(len(vectors)):
         c, s = cosine.take(owner[part]), sine.take(owner[part])
         x, y = vectors[part].astype(np.float64).T
         turned[part, 0] = c * x - s * y
@@ -85,15 +86,11 @@ def rotate_each(theta: Floats, owner: NDArray[np.signedinteger], vectors: ArrayL
     return turned
 
 
-_AT_ONCE = 1 << 15
-"""Vectors turned at once; a bound on the memory."""
-
-
 def transform_each(poses: Floats, owner: NDArray[np.signedinteger], points: ArrayLike) -> Floats:
     """Express points (p, 2), each given in the frame of its own one (p,) of the poses (k, 3), as transform does."""
     moved = rotate_each(poses[:, 2], owner, points)
-    for first in range(0, len(moved), _AT_ONCE):
-        moved[first : first + _AT_ONCE] += poses[:, :2].take(owner[first : first + _AT_ONCE], axis=0)
+    for part in chunks(len(moved)):
+        moved[part] += poses[:, :2].take(owner[part], axis=0)
     return moved
 
 
@@ -149,7 +146,7 @@ def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> F
     """
     query = np.asarray(query, dtype=np.float64)
     if len(stamps) == 1:
-        return np.broadcast_to(poses[0], (*query.shape, 3)).copy()
+        return np.broadcast_to(poses[0], (*query.shape, *POSE)).copy()
     left = np.clip(np.searchsorted(stamps, query, side="right") - 1, 0, len(stamps) - 2)
     span = stamps[left + 1] - stamps[left]
     since = query - stamps[left]
@@ -169,7 +166,7 @@ def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     c, s = cos_sin(a[..., 2])
     d = rotate(-a[..., 2], b[..., :2] - a[..., :2])
-    db = np.zeros((*a.shape[:-1], 3, 3))
+    db = np.zeros((*a.shape[:-1], *POSE, *POSE))
     db[..., 0, 0] = db[..., 1, 1] = c
     db[..., 0, 1], db[..., 1, 0] = s, -s
     db[..., 2, 2] = 1.0

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import TINY, Bools, Floats, Ints
 from ..errors import DataError
 from ..se2 import align
 
@@ -190,7 +190,7 @@ def stretches(positions: Floats, delta: float) -> Ints:
     while after < len(way):
         ends.append(after)
         # Rounding of the running sum must not make a stretch of exactly delta one sample longer.
-        after = max(int(np.searchsorted(way, way[after] + (1.0 - 1e-9) * delta)), after + 1)
+        after = max(int(np.searchsorted(way, way[after] + (1.0 - TINY) * delta)), after + 1)
     return np.array(ends, dtype=np.intp)
 
 

@@ -12,10 +12,11 @@ from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU, splu
 
+from .. import se2
 from ..arrays import WIDE, Floats, Ints, Table
 from ..errors import SINGULAR, SolverError
 from .elimination import Ordering
-from .graph import POSE, WIDTHS
+from .graph import WIDTHS
 from .schwarz_cg import Pieces, TwoLevelFactor
 from .work import ENTRIES, FACTORISATIONS, Work
 
@@ -130,7 +131,7 @@ class Blocks(Table):
 
     def entries(self) -> tuple[Ints, Ints, Ints]:
         """Return row, column and place of every value in the lower triangle."""
-        i, j = np.indices(POSE * 2)[..., None]
+        i, j = np.indices(se2.POSE * 2)[..., None]
         i, j, block = np.nonzero((i < self.height) & (j < self.width) & (self.row + i >= self.column + j))
         return self.row[block] + i, self.column[block] + j, self.start[block] + i * self.width[block] + j
 

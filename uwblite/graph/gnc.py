@@ -19,8 +19,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import chdtri
 
+from .. import se2
 from ..arrays import Bools, Floats
-from .graph import POSE, Edges, Graph, Linearization, PriorEdges, linearize
+from .graph import Edges, Graph, Linearization, PriorEdges, linearize
 from .normal_equations import NormalEquations
 from .pose_edges import RelativePoseEdges
 from .problem_checks import check
@@ -199,4 +200,4 @@ def misfit(graph: Graph) -> Misfit:
     i, j = (np.concatenate([getattr(e, end) for e in loops]) for end in ("i", "j"))
     norms = np.concatenate([np.linalg.norm(e.residuals(graph), axis=1) for e in loops])
     worst = int(np.argmax(norms))
-    return Misfit(len(norms), int(np.count_nonzero(norms > _threshold(POSE[0]))), (int(i[worst]), int(j[worst])))
+    return Misfit(len(norms), int(np.count_nonzero(norms > _threshold(se2.POSE[0]))), (int(i[worst]), int(j[worst])))

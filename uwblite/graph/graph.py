@@ -10,23 +10,21 @@ chart of g2o, e = Z^-1 (Xi^-1 Xj). What a MapResult states about ranges is measu
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import compress
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Shape, array_fields, require_index, require_type, settle
+from ..arrays import Bools, Floats, Ints, Shape, Table, array_fields, concatenated, require_index, require_type, settle
 from ..config import documented
 from ..errors import DataError
 from .robust import SQUARED, Kernel
 from .work import Work
 
-WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
+WIDTHS = {"poses": se2.POSE[0], "anchors": 2, "calibration": 1}
 """Blocks of unknowns, and the scalars of one unknown."""
-POSE: tuple[int, ...] = (WIDTHS["poses"],)
-"""Shape of a pose; POSE * 2 is that of its information."""
 Block = tuple[str, Ints, Floats]
 """(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
 
@@ -43,16 +41,13 @@ class Linearization:
 
 @documented
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Edges:
+class Edges(Table):
     """A kind of edges: a dataclass of arrays with a row per edge."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {}
     """Block of the unknowns whose indices an array holds, by the array's name; the first one has an index per edge."""
     ROWS: ClassVar[Mapping[str, Shape]] = {}
     """Shape of a row of each array whose rows are no single numbers."""
-    SHARED: ClassVar[tuple[str, ...]] = ()
-    """Names of the arrays that all edges share; they are one row."""
-
     kernel: Kernel = SQUARED
     """Robust kernel applied to each edge's squared whitened norm."""
     weights: Floats | None = None
@@ -81,19 +76,12 @@ class Edges:
         """Which edges (e,) count."""
         return self.own_weights > 0.0
 
-    def rows(self, which: Ints | Bools) -> Self:
-        """Return some of the edges."""
-        some: dict[str, Any] = {name: values[which] for name, values in self.by_edge().items() if len(values)}
-        return replace(self, **some)
-
     def followed_by(self, *others: Self) -> Self:
         """Return these edges followed by others of their kind; the values that all edges share are taken from these."""
-        tables = (self, *others)
-        names = [name for name in self.by_edge() if name != "weights"]
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tables]) for name in names}
+        tables = [self, *others]
         if any(t.weights is not None for t in tables):
-            arrays["weights"] = np.concatenate([t.own_weights for t in tables])
-        return replace(self, **arrays)
+            tables = [replace(t, weights=t.own_weights) for t in tables]
+        return concatenated(tables)
 
     def linearize(self, graph: "Graph") -> Linearization:
         """Return whitened residuals and Jacobians."""
@@ -102,11 +90,6 @@ class Edges:
     def residuals(self, graph: "Graph") -> Floats:
         """Return whitened residuals (e, d)."""
         return self.linearize(graph).residuals
-
-    def by_edge(self) -> dict[str, Any]:
-        """Return the arrays with a row per edge by their names; those that are left out are empty."""
-        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: v for name, v in own.items() if isinstance(v, np.ndarray) and name not in self.SHARED}
 
 
 class UnknownKey(NamedTuple):
@@ -179,8 +162,8 @@ class Graph:
     """To which the operations on this graph, and on all that are made from it, are added; see graph/work.py."""
 
     def __post_init__(self) -> None:
-        rows: dict[str, Shape] = {"poses": ("n", *POSE), "anchors": ("a", 2), "fixed_poses": ("n",), "fixed_anchors": ("a",)}
-        settle(self, "Graph", rows)
+        estimates: dict[str, Shape] = {"poses": ("n", *se2.POSE), "anchors": ("a", 2)}
+        settle(self, "Graph", {**estimates, "fixed_poses": ("n",), "fixed_anchors": ("a",)})
         require_type(self.calibration, "Graph.calibration", Calibration)
         values = self.calibration.values
         if len(values) != len(self.calibration.keys):

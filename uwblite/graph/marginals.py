@@ -15,10 +15,10 @@ from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import TINY, Floats, Ints, chunks
 from ..errors import SINGULAR, SolverError
 from .eliminated import TRACE, Blocks, WithBlocks, rows_of
-from .graph import POSE, Edges, Graph, edge_weights
+from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
@@ -30,16 +30,12 @@ class MarginalsPolicy:
 
     dependent: ClassVar[float] = 1e-13
     """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
-    rounding: ClassVar[float] = 1e-9
-    """Share of an unknown's effect on the residuals below which what others leave of it is rounding error."""
     open: ClassVar[float] = 1e12
     """m^2; variance of an anchor that no edge touches."""
     variances: ClassVar[Floats] = np.geomspace(1e-4, 4.0, 12)[:, None]
     """Of common errors, from a hundredth to twice the size that is expected."""
     columns_at_once: ClassVar[int] = 16
     """Columns of an inverse, each of which has the length of all unknowns."""
-    pairs_at_once: ClassVar[int] = 1 << 14
-    """Pairs of poses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,9 +180,8 @@ class Marginals:
 
     def among(self, numbers: Ints) -> Floats:
         """Return the covariance (m, m) of scalars with each other; that of fixed ones (-1) is 0."""
-        step = MarginalsPolicy.columns_at_once
-        parts = [numbers[first : first + step] for first in range(0, max(len(numbers), 1), step)]
-        return np.concatenate([self.columns(part)[numbers] for part in parts], axis=1)
+        parts = [self.columns(numbers[part])[numbers] for part in chunks(len(numbers), MarginalsPolicy.columns_at_once)]
+        return np.concatenate([np.zeros((len(numbers), 0)), *parts], axis=1)
 
 
 def _factor(normal: NormalEquations, further: Blocks | None) -> SuperLU | WithBlocks:
@@ -228,14 +223,13 @@ class JointCovariance:
         whole = _end_of_inverse(cast(SuperLU, _factor(normal, None)), normal.unknowns.number["poses"][poses].ravel())
         self._graph, self._row = graph, np.full(len(graph.poses), -1)
         self._row[poses] = np.arange(len(poses))
-        self._blocks = whole.reshape(len(poses), *POSE, len(poses), *POSE).swapaxes(1, 2)
+        self._blocks = whole.reshape(len(poses), *se2.POSE, len(poses), *se2.POSE).swapaxes(1, 2)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.intp)), np.atleast_1d(np.asarray(j, dtype=np.intp))
-        found = np.empty((len(i), *POSE, *POSE))
-        for first in range(0, len(i), MarginalsPolicy.pairs_at_once):
-            part = slice(first, first + MarginalsPolicy.pairs_at_once)
+        found = np.empty((len(i), *se2.POSE, *se2.POSE))
+        for part in chunks(len(i)):
             by_a, by_b = se2.between_jacobians(self._graph.poses[i[part]], self._graph.poses[j[part]])
             a, b = self._row[i[part]], self._row[j[part]]
             mixed = by_a @ self._blocks[a, b] @ by_b.transpose(0, 2, 1)
@@ -306,6 +300,6 @@ def added_unknown(graph: Graph, edges: Edges, shifts: Floats) -> tuple[Floats, F
     total, explained, score = marginals(graph).score(edges, sparse.csr_matrix(shifts.reshape(len(shifts), -1).T))
     whole = np.diagonal(total)
     left = whole - np.diagonal(explained)
-    seen = left > MarginalsPolicy.rounding * whole
+    seen = left > TINY * whole
     divisor = np.where(seen, left, 1.0)
     return np.where(seen, -score / divisor, 0.0), np.where(seen, 1.0 / np.sqrt(divisor), np.inf)

@@ -12,8 +12,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, Shape
 from ..config import documented
-from .calibration import LASER, WHEELS
-from .graph import POSE, Block, Edges, Graph, Linearization
+from .calibration import LASER, ODOMETRY, TURNING, WHEELS
+from .graph import Block, Edges, Graph, Linearization
 
 _LEAST_SCALE = 0.1
 """Least scale that errors are divided by: odometry is not ten times too long."""
@@ -70,7 +70,7 @@ class RelativePoseEdges(Edges):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses"}
-    ROWS: ClassVar[Mapping[str, Shape]] = {"T_i_j": POSE, "sqrt_information": POSE * 2}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"T_i_j": se2.POSE, "sqrt_information": se2.POSE * 2}
 
     i: Ints
     """(e,) index of the pose measured from."""
@@ -104,7 +104,7 @@ class OdometryEdges(Edges):
     """
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
-    ROWS: ClassVar[Mapping[str, Shape]] = {"motion": POSE, "sqrt_information": POSE * 2, "calibration": (len(WHEELS),)}
+    ROWS: ClassVar[Mapping[str, Shape]] = {"motion": se2.POSE, "sqrt_information": se2.POSE * 2, "calibration": (len(WHEELS),)}
 
     i: Ints
     j: Ints
@@ -159,7 +159,7 @@ class OdometryEdges(Edges):
 
     def _turning_point(self, graph: Graph) -> Floats:
         """Return the frame (e, 3) on the base whose motion the wheels measure."""
-        p = np.append(graph.calibration.values, 0.0)[self.calibration[:, 4]]
+        p = np.append(graph.calibration.values, 0.0)[self.calibration[:, WHEELS.index(TURNING)]]
         return np.stack([-p, np.zeros_like(p), np.zeros_like(p)], axis=1)
 
     def linearize(self, graph: Graph) -> Linearization:
@@ -183,7 +183,7 @@ class OdometryEdges(Edges):
             by_delta = axes[0] * (my + half * ny) - axes[1] * (mx + half * nx) - axes[2]
             by_turn = by_delta * self.motion[:, 2] - (error.residuals - shift) * around
             columns = [by_scale, by_turn, by_delta * self.length, by_delta * self.duration]
-            if used[4:].any():
+            if used[len(ODOMETRY) :].any():
                 cos, sin = (before - after for before, after in zip(se2.cos_sin(xi[2]), se2.cos_sin(xj[2]), strict=True))
                 columns.append(error.along(cos, sin))
                 # The middle of the step is turned by (delta + dtheta) / 2.
@@ -207,8 +207,8 @@ class ScanEdges(Edges):
 
     UNKNOWNS: ClassVar[Mapping[str, str]] = {"i": "poses", "j": "poses", "calibration": "calibration"}
     ROWS: ClassVar[Mapping[str, Shape]] = {
-        **dict.fromkeys(("T_i_j", "twist_i", "twist_j"), POSE),
-        "sqrt_information": POSE * 2,
+        **dict.fromkeys(("T_i_j", "twist_i", "twist_j"), se2.POSE),
+        "sqrt_information": se2.POSE * 2,
         "calibration": (len(LASER),),
     }
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)

@@ -41,7 +41,7 @@ def what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
 
 def _why_not_finite(edges: Edges, number: int) -> str:
     """Return which value of an edge is not finite, or is a sigma of 0; empty where all are sound."""
-    for name, values in edges.by_edge().items():
+    for name, values in edges.columns().items():
         if len(values) and not (np.isfinite(values[number]).all() and (name != "sigma" or values[number] > 0.0)):
             return f", its {name} is {values[number].tolist()}"
     return ""

@@ -18,8 +18,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import expit
 
+from .. import se2
 from ..arrays import Floats, Ints, concatenated
-from ..graph.graph import POSE
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
@@ -83,7 +83,7 @@ class ObjectLikelihood:
     def of(cls, raster: CloudRasters, sigma: float, pairs: CloudPairs, poses: Floats) -> "ObjectLikelihood":
         """Return that of a raster's clouds, what matches by chance learnt from pairs that lie about at poses (e, 3)."""
         nearest = nearest_by_bearing(raster.clouds)
-        free = free_space(np.zeros((len(nearest), *POSE)), nearest).ranges
+        free = free_space(np.zeros((len(nearest), *se2.POSE)), nearest).ranges
         return cls(raster, sigma, matched_by_chance(raster, pairs, poses), free, *objects(raster.clouds, ObjectPolicy.gap))
 
     @property

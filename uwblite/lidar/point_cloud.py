@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from ..arrays import WIDE, Bools, Floats, Ints, Wides, as_array, require_finite, require_shape, run_starts, stable_order
+from ..arrays import WIDE, Bools, Floats, Ints, Table, Wides, as_array, require_finite, require_shape, run_starts, stable_order
 
 
 def make_tree(points: Floats) -> cKDTree:
@@ -77,7 +77,7 @@ def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lines:
+class Lines(Table):
     """The straight line fitted to the surroundings of each point."""
 
     centers: Floats

@@ -17,7 +17,6 @@ from scipy.special import chdtri, expit, logit
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
-from ..graph.graph import POSE
 from ..odometry.slips import FalseMotions
 from . import correlative_matching
 from .correlative_matching import CorrelativeConfig
@@ -33,7 +32,7 @@ class RegistrationConfig:
     """Matches from which on a pose is measured: twice its unknowns."""
     useless: ClassVar[float] = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
-    contradicts: ClassVar[float] = float(chdtri(*POSE, 1e-3))
+    contradicts: ClassVar[float] = float(chdtri(*se2.POSE, 1e-3))
     """Squared Mahalanobis distance beyond which two poses are not the same; one in a thousand exceeds it by chance."""
     doubtful: ClassVar[float] = 0.02
     """Probability of a slip from which on it is searched for."""

@@ -305,7 +305,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Aligned:
+class Aligned(Table):
     """Final relative poses of pairs."""
 
     pose: Floats

@@ -13,7 +13,7 @@ from scipy.special import chdtri, logit
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..graph.graph import POSE, Graph
+from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
@@ -43,7 +43,7 @@ class TrackingConfig:
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     sigma: ClassVar[float] = 0.02
     """Standard deviation of a match that clouds cannot fall below, m: walls are no straighter."""
-    median: ClassVar[float] = float(chdtri(*POSE, 0.5))
+    median: ClassVar[float] = float(chdtri(*se2.POSE, 0.5))
     """Of chi2 with three degrees of freedom."""
     laps: ClassVar[int] = 3
     """Times that steps with slips tell their neighbours."""

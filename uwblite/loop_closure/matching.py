@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds
@@ -45,7 +45,7 @@ class MatchingPolicy:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClosureMatches:
+class ClosureMatches(Table):
     """How candidates (c,) fit."""
 
     best: Aligned

@@ -108,7 +108,7 @@ class Recording:
         order = np.argsort(moments, kind="stable")
         frames = keyframes.at(self.log, moments[order], np.ones(len(order), dtype=bool))
         keyframe = np.concatenate([own, keyframe])[order]
-        since = np.concatenate([np.zeros((len(own), 3)), since])[order]
+        since = np.concatenate([np.zeros((len(own), *se2.POSE)), since])[order]
         return replace(self, between=PosesBetween(frames, keyframe, since))
 
     @property

@@ -189,7 +189,7 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
 def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, MeasuredSurfaces]:
     """Return the graph and the surfaces after Gauss-Newton steps with the rays on these; unchanged without rays."""
     joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
-    certainty, rules = np.zeros((0, 3, 3)), SurfacePolicy
+    certainty, rules = np.zeros((0, *se2.POSE, *se2.POSE)), SurfacePolicy
     assert joint is not None
     report = task.stages.reporter("surfaces")
     report(0, rules.steps + 1)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats, Table, concatenated, require_finite, require_index, require_type
 from ..config import documented
 from ..errors import DataError
@@ -54,7 +55,7 @@ class OdometryBreaks(Table):
     @staticmethod
     def none() -> "OdometryBreaks":
         """Return no breaks."""
-        return OdometryBreaks(np.zeros(0), np.zeros((0, 3)))
+        return OdometryBreaks(np.zeros(0), np.zeros((0, *se2.POSE)))
 
     @staticmethod
     def of_all(parts: "Sequence[OdometryBreaks]") -> "OdometryBreaks":

@@ -24,7 +24,7 @@ class Odometry(Table):
     """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
 
     def __post_init__(self) -> None:
-        settle(self, "odometry", {"stamps": ("n",), "poses": ("n", 3)})
+        settle(self, "odometry", {"stamps": ("n",), "poses": ("n", *se2.POSE)})
 
     @property
     def travelled(self) -> Floats:
@@ -159,7 +159,7 @@ class LaserScans(Table):
 class SensorMounting:
     """Mounting of the sensors on the base."""
 
-    T_base_laser: Floats = field(default_factory=lambda: np.zeros(3))
+    T_base_laser: Floats = field(default_factory=lambda: np.zeros(se2.POSE))
     """(3,) x, y, theta of the laser on the base."""
     laser_flipped: bool = False
     """Laser mounted upside down: its rays run clockwise."""
@@ -176,7 +176,7 @@ class SensorMounting:
     is then where it is said to be, and the wheels may measure the motion of another point."""
 
     def __post_init__(self) -> None:
-        settle(self, "mounting", {"T_base_laser": (3,), "tag_position": (3,), "more_tags": ("t", 3)})
+        settle(self, "mounting", {"T_base_laser": se2.POSE, "tag_position": (3,), "more_tags": ("t", 3)})
 
     @property
     def tags(self) -> Floats:
