@@ -200,7 +200,7 @@ def range_text(limits: Mapping[str, float]) -> str:
     return " and ".join(f"{_COMPARED[name][0]} {limit:g}" for name, limit in limits.items())
 
 
-_SMALLEST, _LARGEST, _MOST_COUNTED = 1e-15, 1e6, 10**9
+_SMALLEST, _LARGEST, _MOST_COUNTED = 1e-15, 1e6, int(1e9)
 """In whatever unit, no setting of an algorithm means anything beyond, though a stamp or a place may; squares of what is within
 do not overflow. The last is of what is counted."""
 

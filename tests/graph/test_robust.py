@@ -48,16 +48,15 @@ def test_rho_grows_and_never_exceeds_the_square(name, scale):
     assert np.all(rho <= s * (1.0 + 1e-12) + 1e-15 * scale**2)
 
 
-@pytest.mark.parametrize(("name", "limit"), [("geman-mcclure", 9.0), ("tukey", 3.0)])
-def test_redescending_kernels_are_bounded(name, limit):
-    kernel = Kernel(name, 3.0)
-    assert kernel.rho(np.array(1e12)) == pytest.approx(limit)
+def test_a_redescending_kernel_is_bounded():
+    kernel = Kernel("geman-mcclure", 3.0)
+    assert kernel.rho(np.array(1e12)) == pytest.approx(9.0)
     assert kernel.weight(np.array(1e12)) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_closed_forms_at_twice_the_scale():
     at = np.array(4.0)  # norm 2 at scale 1
-    expected = {"none": 4.0, "huber": 3.0, "cauchy": np.log(5.0), "geman-mcclure": 0.8, "tukey": 1.0 / 3.0}
+    expected = {"none": 4.0, "huber": 3.0, "cauchy": np.log(5.0), "geman-mcclure": 0.8}
     for name, value in expected.items():
         assert Kernel(name, 1.0).rho(at) == pytest.approx(value)
 

@@ -28,6 +28,11 @@ def as_complex(vectors: Floats) -> Complexes:
     return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
 
 
+def turns(angles: Floats) -> Complexes:
+    """Return exp(i theta) (...) of angles (...), rad."""
+    return np.asarray(np.exp(1j * angles))
+
+
 def chordal_start(graph: Graph) -> Graph | None:
     """Return the graph with poses from its relative poses alone, None where these close no loop or leave a pose open, or
     connect so many poses with so many others that the matrix would fill up.
@@ -41,13 +46,13 @@ def chordal_start(graph: Graph) -> Graph | None:
         return None
     i, j, T = (np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j"))
     information = np.concatenate([np.sum(e.sqrt_information**2, axis=1) * e.own_weights[:, None] for e in relative])
-    z: Complexes = np.exp(1j * graph.poses[:, 2])
+    z = turns(graph.poses[:, 2])
     places = as_complex(graph.poses)
     try:
-        z = _solved((i, j), np.exp(1j * T[:, 2]), np.zeros(len(i)), information[:, 2], z, free)
+        z = _solved((i, j), turns(T[:, 2]), np.zeros(len(i), complex), information[:, 2], z, free)
         z /= np.maximum(np.abs(z), np.finfo(np.float64).tiny)
         step = z[i] * as_complex(T)
-        places = _solved((i, j), np.ones(len(i)), step, information[:, :2].mean(axis=1), places, free)
+        places = _solved((i, j), np.ones(len(i), complex), step, information[:, :2].mean(axis=1), places, free)
     except SolverError:
         return None
     poses = np.column_stack([places.real, places.imag, np.angle(z)])
@@ -56,7 +61,9 @@ def chordal_start(graph: Graph) -> Graph | None:
     return replace(graph, poses=np.where(free[:, None], poses, graph.poses))
 
 
-def _solved(ends: tuple[Ints, Ints], factor: Floats, step: Floats, weight: Floats, values: Complexes, free: Bools) -> Complexes:
+def _solved(
+    ends: tuple[Ints, Ints], factor: Complexes, step: Complexes, weight: Floats, values: Complexes, free: Bools
+) -> Complexes:
     """Return the complex numbers (n,) with x_j = factor x_i + step (e,) in least squares, those that are not free as given."""
     (i, j), e, root = ends, np.arange(len(weight)), np.sqrt(weight)
     entries = np.concatenate([root + 0j, -root * factor]), (np.concatenate([e, e]), np.concatenate([j, i]))

@@ -100,7 +100,7 @@ def optimize_gnc(
     plain = replace(graph, edges=edges)
     linearized = linearize(plain)
     normal = NormalEquations(plain, linearized)
-    mu = 1.0 / max(2.0 * min(_worst(plain, thresholds), OutlierPolicy.reach**2) - 1.0, 1e-3)
+    mu = 1.0 / max(2.0 * min(_worst(plain, thresholds), OutlierPolicy.reach**2) - 1.0, 1.0 / OutlierPolicy.strict)
     few = replace(solver, max_iterations=1)
     most = max(1, int(np.ceil(np.log(OutlierPolicy.strict / mu) / np.log(OutlierPolicy.factor))))
     current, spent = plain, 0.0

@@ -7,12 +7,9 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Shape
+from ..arrays import TINY, Floats, Ints, Shape
 from ..config import documented
 from .graph import Edges, Graph, Linearization, whiten
-
-_LEAST = 1e-6
-"""Least distance, m: for smaller ones the direction is not defined."""
 
 
 @documented
@@ -74,7 +71,8 @@ class PointDistanceEdges(Edges):
 
 def _distance_error(edges: AnchorDistanceEdges | PointDistanceEdges, offset: Floats) -> tuple[Floats, Floats]:
     """Return whitened residuals (e, 1) and their derivatives (e, 2) by the offset (e, 2) of two points."""
-    length = np.maximum(np.hypot(*offset.T), _LEAST)
+    # The direction of smaller distances is not defined.
+    length = np.maximum(np.hypot(*offset.T), TINY)
     return ((length - edges.distance) / edges.sigma)[:, None], offset / (length * edges.sigma)[:, None]
 
 

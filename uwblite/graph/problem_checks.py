@@ -2,15 +2,12 @@
 
 import numpy as np
 
-from ..arrays import Bools, Ints, connected
+from ..arrays import TINY, Bools, Ints, connected
 from ..errors import SolverError
 from .graph import Edges, Graph, Linearization, PriorEdges
 from .point_edges import LandmarkEdges, PointDistanceEdges
 from .range_edges import RangeEdges
 from .unknowns import free_unknowns
-
-_SINGULAR = 1e-12
-"""Determinant, as a share of the product of the diagonal, up to which the rank of an information is found."""
 
 
 def check(graph: Graph) -> None:
@@ -55,7 +52,7 @@ def independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:
         jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
         gram = jacobians @ jacobians.transpose(0, 2, 1)
         total += gram.shape[0] * gram.shape[1]
-        doubtful = gram[np.abs(np.linalg.det(gram)) <= _SINGULAR * np.prod(np.einsum("eii->ei", gram), axis=1)]
+        doubtful = gram[np.abs(np.linalg.det(gram)) <= TINY * np.prod(np.einsum("eii->ei", gram), axis=1)]
         total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
     return total
 

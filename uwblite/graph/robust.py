@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import ConfigError
 
-KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey")
+KERNELS = ("none", "huber", "cauchy", "geman-mcclure")
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Kernel:
     """A robust kernel and its scale."""
 
     name: str = "none"
-    """none, huber, cauchy, geman-mcclure or tukey."""
+    """none, huber, cauchy or geman-mcclure."""
     scale: float = 1.0
     """Whitened norm (in standard deviations) at which the kernel departs from the square."""
 
@@ -37,8 +37,6 @@ class Kernel:
             return k2 * np.log1p(s / k2)
         if self.name == "geman-mcclure":
             return s / (1.0 + s / k2)
-        if self.name == "tukey":
-            return np.where(s <= k2, k2 / 3.0 * (1.0 - (1.0 - s / k2) ** 3), k2 / 3.0)
         return s
 
     def weight(self, s: Floats) -> Floats:
@@ -50,8 +48,6 @@ class Kernel:
             return 1.0 / (1.0 + s / k2)
         if self.name == "geman-mcclure":
             return 1.0 / (1.0 + s / k2) ** 2
-        if self.name == "tukey":
-            return np.where(s <= k2, (1.0 - s / k2) ** 2, 0.0)
         return np.ones_like(s)
 
 

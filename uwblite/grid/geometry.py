@@ -11,6 +11,7 @@ from ..errors import ConfigError
 
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
+MEGA = 1e6
 _STRIP = 256
 """Rows of a map that are processed at a time."""
 _OUTER = 0.01
@@ -43,7 +44,7 @@ class GridGeometry:
     @property
     def megabytes(self) -> float:
         """Memory of a map of this size while it is made, MB."""
-        return self.cells * BYTES_PER_CELL / 1e6
+        return self.cells * BYTES_PER_CELL / MEGA
 
     @property
     def corner(self) -> Floats:

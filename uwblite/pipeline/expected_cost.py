@@ -7,6 +7,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..grid.geometry import MEGA
 from ..grid.occupancy_grid import GridConfig
 from ..sensor_log import SensorLog
 
@@ -16,44 +17,31 @@ _GRID = GridConfig()
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md.
+    """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md."""
 
-    Per metre of driving, range, reading of the laser, and cell of the grid, while which is counted half of the graph's memory
-    is free again.
-    """
-
-    seconds_per_metre: float
-    seconds_per_range: float
-    seconds_per_reading: float
-    bytes_per_metre: float
-    bytes_per_reading: float
-    bytes_per_cell: float
+    seconds: tuple[float, float, float]
+    """Per metre of driving, range, and reading of the laser."""
+    bytes: tuple[float, float, float]
+    """Per metre of driving, reading, and cell of the grid, while which is counted half of the graph's memory is free again."""
 
 
-WITH_LIDAR = Rates(0.045, 1.5e-4, 2e-7, 0.2e6, 2.0, 8.0)
-RANGES_ALONE = Rates(0.0005, 8e-4, 0.0, 0.09e6, 0.0, 0.0)
+WITH_LIDAR = Rates((0.045, 1.5e-4, 2e-7), (0.2e6, 2.0, 8.0))
+RANGES_ALONE = Rates((0.0005, 8e-4, 0.0), (0.09e6, 0.0, 0.0))
 """Ranges alone hold the trajectory, and an optimisation takes more steps."""
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files."""
-BYTES_AT_LEAST = 105e6
+BYTES_AT_LEAST = 105 * MEGA
 """Numpy, scipy, and what small recordings take."""
-_MEGA = 1e6
 _SCANS = 500
 """Looked at, at most, for the size of the map."""
 
 
-def work_seconds(log: SensorLog) -> float:
-    """Return the time that the map of a recording takes on the computer of docs/lab/performance.md, s."""
-    path = float(log.odometry.travelled[-1])
+def model_seconds(log: SensorLog) -> float:
+    """Return the wall time of a map on the computer of docs/lab/performance.md, s."""
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     readings = 0 if log.scans is None else log.scans.ranges.size
     rates = WITH_LIDAR if readings else RANGES_ALONE
-    return rates.seconds_per_metre * path + rates.seconds_per_range * ranges + rates.seconds_per_reading * readings
-
-
-def model_seconds(log: SensorLog) -> float:
-    """Return the wall time of a map on the computer of docs/lab/performance.md, s."""
-    return SECONDS_AT_LEAST + work_seconds(log)
+    return SECONDS_AT_LEAST + float(np.dot(rates.seconds, (log.odometry.travelled[-1], ranges, readings)))
 
 
 def seen_size(log: SensorLog) -> Floats:
@@ -88,13 +76,12 @@ def expected_cost(log: SensorLog, grid: GridConfig = _GRID) -> dict[str, float]:
 
 def together(costs: Sequence[dict[str, float]]) -> dict[str, float]:
     """Return the time and memory of one map of several recordings."""
-    once = {"seconds": SECONDS_AT_LEAST, "megabytes": BYTES_AT_LEAST / _MEGA}
+    once = {"seconds": SECONDS_AT_LEAST, "megabytes": BYTES_AT_LEAST / MEGA}
     return {name: sum(cost[name] for cost in costs) - (len(costs) - 1) * least for name, least in once.items()}
 
 
 def expected_megabytes(path: float, scans: int, beams: int, cells: int) -> float:
     """Return the expected peak memory of a map, MB."""
-    rates = WITH_LIDAR if scans else RANGES_ALONE
-    graph = rates.bytes_per_metre * path
-    largest = max(graph, 0.5 * graph + rates.bytes_per_cell * cells)
-    return (BYTES_AT_LEAST + rates.bytes_per_reading * scans * beams + largest) / _MEGA
+    per_metre, per_reading, per_cell = (WITH_LIDAR if scans else RANGES_ALONE).bytes
+    largest = max(per_metre * path, 0.5 * per_metre * path + per_cell * cells)
+    return (BYTES_AT_LEAST + per_reading * scans * beams + largest) / MEGA

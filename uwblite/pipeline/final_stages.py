@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import TINY, Floats
 from ..graph.calibration import HEIGHT, with_free
 from ..graph.graph import Graph
 from ..graph.marginals import Covariances, Marginals, marginals
@@ -14,7 +14,7 @@ from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns
 from ..graph.work import RAYS
-from ..grid.geometry import GridGeometry
+from ..grid.geometry import MEGA, GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
 from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
@@ -42,12 +42,8 @@ class FinalPolicy:
     """Poses along the trajectory whose joint covariance represents the whole trajectory."""
     shortest: ClassVar[float] = 0.05
     """s; shortest step whose variance grows in proportion to its time."""
-    none: ClassVar[float] = 1e-6
-    """Least square root of an information."""
     fastest: ClassVar[float] = 1.0
     """m/s and rad/s, at which a robot with wheels that measure nothing moves at most."""
-
-_MILLION = 1e6
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
@@ -103,7 +99,7 @@ def _between_scan_and_keyframe(graph: Graph, task: Task) -> Floats:
             time[recording.rows] = time_to_scans(recording, task.config.keyframes)
     time[graph.fixed_poses] = 0.0
     for wheels in (e for e in graph.edges if isinstance(e, OdometryEdges)):
-        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), FinalPolicy.none)
+        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), TINY)
         for ends in (wheels.i, wheels.j):
             np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, FinalPolicy.shortest)[:, None])
     variance = np.minimum(rate * time[:, None], np.square(FinalPolicy.fastest * time)[:, None])
@@ -159,7 +155,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     def announce(geometry: GridGeometry) -> None:
         """Report what a large grid will take; the caller may still stop."""
         if geometry.cells >= FinalPolicy.large_grid:
-            detail = f"of {geometry.cells / _MILLION:.0f} million cells, about {geometry.megabytes:.0f} MB"
+            detail = f"of {geometry.cells / MEGA:.0f} million cells, about {geometry.megabytes:.0f} MB"
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)
 
     reporter = stages.reporter("occupancy grid")
@@ -168,7 +164,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     if grid.scans_astray:
         stages.note("scans-astray", scans=grid.scans_astray, used=grid.scans_used)
     if grid.geometry.resolution > config.grid.resolution:
-        cells = config.grid.max_cells / _MILLION
+        cells = config.grid.max_cells / MEGA
         stages.note("coarse-grid", resolution=grid.geometry.resolution, asked=config.grid.resolution, cells=cells)
     if config.crop is not None:
         grid = cropped(grid, config.crop)
