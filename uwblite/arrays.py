@@ -22,6 +22,7 @@ WIDE = np.int64
 """Element type of numbers that may exceed 32 bits, such as ids of files and row * columns + column; never an index."""
 Wides = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Complexes = NDArray[np.complex128]
 
 CHUNK = 1 << 14
 """Rows that are processed together, so that they stay in the processor's cache; bounds the memory, too."""

@@ -15,7 +15,7 @@ Angles are kept in (-pi, pi].
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import Floats, chunks
+from .arrays import Complexes, Floats, chunks
 
 POSE: tuple[int, ...] = (3,)
 """Shape of a pose; POSE * 2 is that of its information."""
@@ -44,6 +44,16 @@ def bearing(vectors: ArrayLike) -> Floats:
     """Return the direction (...) of vectors (..., 2), rad in (-pi, pi]; of contiguous copies, see cos_sin."""
     vectors = np.asarray(vectors, dtype=np.float64)
     return np.arctan2(np.array(vectors[..., 1], order="C"), np.array(vectors[..., 0], order="C"))
+
+
+def as_complex(vectors: Floats) -> Complexes:
+    """Return x + i y (...) of vectors or poses (..., 2 or 3)."""
+    return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
+
+
+def unit_complex(angle: ArrayLike) -> Complexes:
+    """Return exp(i theta) (...) of angles (...), rad: it turns vectors that are complex numbers."""
+    return np.asarray(np.exp(1j * np.asarray(angle, dtype=np.float64)))
 
 
 def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:

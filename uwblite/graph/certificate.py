@@ -31,9 +31,9 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Bools, Floats, Ints
+from .. import se2
+from ..arrays import Bools, Complexes, Floats, Ints
 from ..errors import SolverError
-from .chordal_start import Complexes, as_complex, turns
 from .elimination import work_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
@@ -76,7 +76,7 @@ class TangentForm:
         n, a = len(graph.poses), len(graph.anchors)
         # The origin is moved to the middle of the places, so that numbers are small for any map frame.
         places = np.concatenate([graph.poses[:, :2], graph.anchors]) - graph.poses[:, :2].mean(axis=0)
-        self.x: Complexes = np.concatenate([as_complex(places), turns(graph.poses[:, 2]), [1.0]])
+        self.x: Complexes = np.concatenate([se2.as_complex(places), se2.unit_complex(graph.poses[:, 2]), [1.0]])
         """(2 n + a + 1,) places of poses and anchors, headings of poses and of the map."""
         self.places = n + a
         """How many of them are places."""
@@ -100,8 +100,8 @@ class TangentForm:
                 parts = ((self._anchor + edges.i, 1.0), (self._anchor + edges.j, -1.0))
             else:
                 one, other = (
-                    (self.places + edges.i, as_complex(edges.point_i)),
-                    (self.places + edges.j, -as_complex(edges.point_j)),
+                    (self.places + edges.i, se2.as_complex(edges.point_i)),
+                    (self.places + edges.j, -se2.as_complex(edges.point_j)),
                 )
                 parts = ((edges.i, 1.0), one, (edges.j, -1.0), other)
             self._add_square(weights / edges.sigma**2 * (1.0 - edges.distance / distances(edges, graph)), parts)
@@ -124,7 +124,7 @@ class TangentForm:
     def _carried(self, pose: Ints, arm: Floats) -> tuple[Ints, Complexes]:
         """Return the part of a point that is fixed to a pose, given by its offset from the pose in the map frame (e, 2)."""
         heading = self.places + pose
-        return heading, as_complex(arm) * np.conj(self.x[heading])
+        return heading, se2.as_complex(arm) * np.conj(self.x[heading])
 
     def _add(self, row: Ints, column: Ints, value: Complexes) -> None:
         """Add 2 Re(conj(x_row) value x_column)."""
@@ -143,7 +143,7 @@ class TangentForm:
         """Add the tangents of |r|^2, r = L (place in the frame, turned back (e,), then heading) whitened (e, d)."""
         tau, kappa = _largest_below(L)
         g = np.einsum("eji,ej->ei", L, r)
-        self._add_offset(tau, as_complex(g) * turns(turned), frame, ends)
+        self._add_offset(tau, se2.as_complex(g) * se2.unit_complex(turned), frame, ends)
         if end_heading is not None:
             self._add_turn(kappa, g[:, 2], frame, end_heading)
 
@@ -163,7 +163,7 @@ class TangentForm:
         if np.any(np.abs(delta) >= np.pi) or np.any((kappa <= 0) & (np.abs(g) > 0)):
             raise SolverError("an angle is half a turn off, or tied to places by singular information")
         slope = kappa / np.sinc(delta / np.pi)
-        self._add(i, j, -slope * turns(delta) * self.x[i] * np.conj(self.x[j]))
+        self._add(i, j, -slope * se2.unit_complex(delta) * self.x[i] * np.conj(self.x[j]))
 
 
 def _weighted(graph: Graph, edges: RelativePoseEdges | LandmarkEdges | PriorEdges, weights: Floats) -> tuple[Floats, Floats]:

@@ -9,28 +9,16 @@ F. Dellaert, Initialization techniques for 3D SLAM, ICRA 2015.)
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from ..arrays import Bools, Floats, Ints
+from .. import se2
+from ..arrays import Bools, Complexes, Floats, Ints
 from ..errors import SolverError
 from .elimination import fills_up, work_of
 from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
 from .unknowns import free_unknowns
-
-Complexes = NDArray[np.complex128]
-
-
-def as_complex(vectors: Floats) -> Complexes:
-    """Return x + i y (...) of vectors or poses (..., 2 or 3)."""
-    return np.asarray(vectors[..., 0] + 1j * vectors[..., 1])
-
-
-def turns(angles: Floats) -> Complexes:
-    """Return exp(i theta) (...) of angles (...), rad."""
-    return np.asarray(np.exp(1j * angles))
 
 
 def chordal_start(graph: Graph) -> Graph | None:
@@ -46,12 +34,12 @@ def chordal_start(graph: Graph) -> Graph | None:
         return None
     i, j, T = (np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j"))
     information = np.concatenate([np.sum(e.sqrt_information**2, axis=1) * e.own_weights[:, None] for e in relative])
-    z = turns(graph.poses[:, 2])
-    places = as_complex(graph.poses)
+    z = se2.unit_complex(graph.poses[:, 2])
+    places = se2.as_complex(graph.poses)
     try:
-        z = _solved((i, j), turns(T[:, 2]), np.zeros(len(i), complex), information[:, 2], z, free)
+        z = _solved((i, j), se2.unit_complex(T[:, 2]), np.zeros(len(i), complex), information[:, 2], z, free)
         z /= np.maximum(np.abs(z), np.finfo(np.float64).tiny)
-        step = z[i] * as_complex(T)
+        step = z[i] * se2.as_complex(T)
         places = _solved((i, j), np.ones(len(i), complex), step, information[:, :2].mean(axis=1), places, free)
     except SolverError:
         return None

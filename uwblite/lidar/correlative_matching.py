@@ -103,7 +103,7 @@ def score_grid(
         place = se2.transform([*T_target_source[:2], heading], source.points) - raster.origin[0]
         cell = np.floor(place / config.resolution).astype(np.intp)[:, ::-1]
         inside = np.all((cell >= -reach) & (cell < field.shape + reach), axis=1)
-        cell, turned = cell[inside], (normals[inside] * np.exp(-1j * heading)).astype(np.complex64)
+        cell, turned = cell[inside], (normals[inside] * se2.unit_complex(-heading)).astype(np.complex64)
         if one_by_one:
             target.work[SCORES] += len(cell) * scores[k].size
             scores[k] = np.tensordot(turned, windows[tuple((cell + reach).T)], axes=1).real

@@ -79,7 +79,7 @@ def align(
     config = config or IcpConfig()
     target = target if isinstance(target, cKDTree) else make_tree(as_points(target, "target"))
     source, pose = as_points(source, "source"), as_array(T_target_source, "T_target_source").copy()
-    require_shape(pose, "T_target_source", (3,))
+    require_shape(pose, "T_target_source", se2.POSE)
     require_finite(pose, "T_target_source")
     for name, size in (("target", target.n), ("source", len(source))):
         if size < config.min_matches:

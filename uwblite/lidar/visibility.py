@@ -104,7 +104,7 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
 
 def free_around(clouds: Clouds) -> list[FreeSpace]:
     """Return the free space around the base of each cloud, as this cloud shows it."""
-    return [free_space(np.zeros((1, 3)), nearest[None]) for nearest in nearest_by_bearing(clouds)]
+    return [free_space(np.zeros((1, *se2.POSE)), nearest[None]) for nearest in nearest_by_bearing(clouds)]
 
 
 def _bins(x: Floats, y: Floats, many: int) -> Ints:

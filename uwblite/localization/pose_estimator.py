@@ -37,7 +37,7 @@ _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
 """Most hypotheses, and log-weight below which one is removed."""
 _MOST_PARTS = 4
 """Most parts of the window: a quarter of ten metres is enough for a start."""
-_STANDS = np.zeros(3)
+_STANDS = np.zeros(se2.POSE)
 _SCANS_DIFFER = "the scans do not fit the walls any more"
 
 

@@ -113,7 +113,7 @@ class Places:
 
 Steps = Generator[int, None, Places]
 """A running search; it yields the operations of every unit of work and returns its result."""
-_UNDECIDED = Places(np.zeros((0, 3)), False)
+_UNDECIDED = Places(np.zeros((0, *se2.POSE)), False)
 
 
 def units(count: int, each: int) -> Iterator[slice]:

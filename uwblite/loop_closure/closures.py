@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats
 from ..config import setting
 from ..graph.pose_edges import RelativePoseEdges
@@ -89,13 +90,13 @@ def collected(records: Sequence[LoopClosure], sqrt_information: Floats) -> Closu
     good = np.array([closure.accepted for closure in records], dtype=bool)
     kept = [closure for closure in records if closure.accepted]
     i, j = (np.array([getattr(closure, end) for closure in kept], dtype=np.intp) for end in ("i", "j"))
-    T_i_j = np.array([closure.T_i_j for closure in kept]).reshape(-1, 3)
+    T_i_j = np.array([closure.T_i_j for closure in kept]).reshape(-1, *se2.POSE)
     return Closures(RelativePoseEdges(i, j, T_i_j, sqrt_information[good]), tuple(records))
 
 
 def no_closures() -> Closures:
     """Return the empty collection."""
-    return collected((), np.zeros((0, 3, 3)))
+    return collected((), np.zeros((0, *se2.POSE, *se2.POSE)))
 
 
 def merged(one: Closures, other: Closures) -> Closures:

@@ -50,7 +50,7 @@ def find(
         results += part
         if progress is not None:
             progress(len(results), len(target))
-    information = np.array([found.information / config.correlation for found in results]).reshape(-1, 3, 3)
+    information = np.array([found.information / config.correlation for found in results]).reshape(-1, *se2.POSE, *se2.POSE)
     pairs = zip(i.tolist(), j.tolist(), results, information, strict=True)
     return collected([_record(*pair) for pair in pairs], _root(information))
 

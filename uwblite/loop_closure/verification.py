@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import TINY, Floats
 from ..graph.gnc import tightened
 from ..graph.graph import Graph
 from ..graph.robust import Kernel
@@ -28,8 +28,6 @@ from .candidates import Candidates
 from .closures import Closures, LoopClosureConfig, collected, no_closures
 from .matching import ClosureMatches, fit
 
-_SINGULAR = 1e-9
-"""Share of the largest eigenvalue of an information up to which another one is none."""
 _ROUGH = 1e-4
 """Relative decrease of chi2 that ends a search with one scale of the kernel."""
 _TIGHTER = 3.0
@@ -70,12 +68,12 @@ def _judge(
     result, searched = fits.best, candidates.spread > config.direct
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
-    seen = np.linalg.pinv(information, rcond=_SINGULAR, hermitian=True)
+    seen = np.linalg.pinv(information, rcond=TINY, hermitian=True)
     # Only directions that the match measures are compared: project the error onto them.
     onto = seen @ information
     visible = np.einsum("eij,ej->ei", onto, error)
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
-    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=_SINGULAR, hermitian=True), visible)
+    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=TINY, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
     share, rms = result.share, result.rms
     most = config.agrees**2 if candidates.constrained else np.inf

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import TINY, Bools, Floats, Ints
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -35,8 +35,6 @@ _SPECK = 0.015
 """m^2; islands of unknown cells that are smaller are noise of the map and no obstacle."""
 STRIP = 64
 """Rows whose distances are found together, so that they stay in a processor's cache."""
-ROUNDING = 1e-9
-"""Relative; a robot may touch what it passes."""
 AT_ONCE = 300_000
 """Squares, samples or nodes looked at together."""
 
@@ -117,7 +115,8 @@ class ClearanceMap:
         The owners are numbered 0 ... in order; every one has a point.
         """
         grid, kept = self.geometry, np.ones(int(owner.max(initial=-1)) + 1, dtype=np.bool_)
-        needed = needed * (1.0 - ROUNDING)
+        # A robot may touch what it passes.
+        needed = needed * (1.0 - TINY)
         open_ = np.flatnonzero(bound < needed)
         cell = (points[open_] - grid.origin) / grid.resolution
         col, row = np.floor(cell).astype(np.intp).T
@@ -232,7 +231,7 @@ def _across_rows(
 
 def _least(radius: float, resolution: float) -> int:
     """Return the least square of a distance, in half cells: half a cell at least, which parts a free cell from an obstacle."""
-    return max(int(np.ceil((2.0 * radius / resolution) ** 2 * (1.0 - ROUNDING))), 1)
+    return max(int(np.ceil((2.0 * radius / resolution) ** 2 * (1.0 - TINY))), 1)
 
 
 def _specks(dark: Bools, resolution: float) -> Bools:

@@ -13,8 +13,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints
-from .clearance import AT_ONCE, COMFORT, ROUNDING, ClearanceMap
+from ..arrays import TINY, WIDE, Bools, Floats, Ints
+from .clearance import AT_ONCE, COMFORT, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
 """Where clearance and cost of a line are looked up."""
@@ -157,7 +157,7 @@ def walk_back(before: Ints, first: int, last: int) -> Ints:
 
 def _cuts(line: Floats, step: float) -> tuple[Ints, Ints, Ints]:
     """Return, of all equal cuts (k,) of a line's pieces, the piece, the cut's number in it, and how many it is cut into."""
-    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - ROUNDING), 1).astype(np.intp)
+    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - TINY), 1).astype(np.intp)
     piece = np.repeat(np.arange(len(cuts)), cuts)
     return piece, np.arange(len(piece)) - (np.cumsum(cuts) - cuts)[piece], cuts[piece]
 
@@ -171,7 +171,7 @@ def _straightened(line: Floats) -> Floats:
     """Return a line (n, 2) without the corners at which it does not turn."""
     ways = np.diff(line, axis=0)
     before, after = ways[:-1], ways[1:]
-    turns = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > ROUNDING
+    turns = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > TINY
     return line[np.concatenate([[True], turns, [True]])]
 
 

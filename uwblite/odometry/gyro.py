@@ -155,7 +155,7 @@ class GyroTurns:
         self._stamps: list[float] = []
         self._headings: list[float] = []
         self._wheels: list[tuple[float, Floats]] = []
-        self._pose = np.zeros(3)
+        self._pose = np.zeros(se2.POSE)
         self._heading: float | None = None
         self._factor = self._bias = 0.0
         self._rested = False

@@ -127,7 +127,7 @@ def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
 
 def _slack(stamps: Floats, odometry: Floats, breaks: OdometryBreaks | None) -> Floats:
     """Return the standard deviation (k-1, 3) that breaks of an odometry with stamps (n,) add to the steps that they overlap."""
-    variance = np.zeros((len(stamps) - 1, 3))
+    variance = np.zeros((len(stamps) - 1, *se2.POSE))
     if breaks is None or not len(variance) or len(odometry) < 2:
         return variance
     broken = _broken_steps(odometry, breaks)

@@ -19,7 +19,7 @@ class Odometer:
     """A trajectory of the last seconds: poses are added at its end and removed at its beginning."""
 
     def __init__(self) -> None:
-        self._stamps, self._poses = np.zeros(_ROOM), np.zeros((_ROOM, 3))
+        self._stamps, self._poses = np.zeros(_ROOM), np.zeros((_ROOM, *se2.POSE))
         self._begin = self._end = 0
         self.jumps = 0
         """Number of impossible steps; they count as standing still."""

@@ -181,7 +181,7 @@ def _measured_from(graph: Graph, here: Bools) -> Floats:
 def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Floats]]:
     """Return (robust cost, T_map_chain) of the best places, apart from each other."""
     if len(ranges) < _LEAST_RANGES:
-        return [(0.0, np.zeros(3))]
+        return [(0.0, np.zeros(se2.POSE))]
     best: list[tuple[float, Floats]] = []
     for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _BEND)):
         if all(np.abs(se2.between(motion, other)).max() > _APART for _, other in best):

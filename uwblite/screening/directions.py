@@ -62,10 +62,10 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
     clear = pairs.measured & (np.minimum(*way) > PairPolicy.clear[0]) & (np.abs(pairs.lidar[:, 2]) < _LEAST_TURNED)
     if clear.sum() < PairPolicy.enough:
         return log, []
-    by_wheels, by_lidar = (m[clear, 0] + 1j * m[clear, 1] for m in (pairs.wheels, pairs.lidar))
+    by_wheels, by_lidar = (se2.as_complex(m[clear]) for m in (pairs.wheels, pairs.lidar))
     turns = by_wheels * by_lidar.conj() / np.abs(by_wheels * by_lidar)
     middle = float(np.angle(turns.mean()))
-    off = np.angle(turns * np.exp(-1j * middle))
+    off = np.angle(turns * se2.unit_complex(-middle))
     alike = np.abs(off) < _ALIKE
     angle = middle + float(np.median(off[alike])) if alike.any() else 0.0
     if abs(angle) < _LEAST_TURNED or np.mean(alike) < _CONCENTRATED:
