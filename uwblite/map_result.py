@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from . import se2
 from .arrays import Bools, Floats, Ints
 from .config import documented
 from .findings import DOUBT, WARNING, Finding, of_severity
@@ -149,9 +148,9 @@ class MapResult:
     stages: tuple[StageSummary, ...]
     findings: tuple[Finding, ...]
     """What to know about the result, in the order in which it was found."""
-    shape_poses: Floats = field(default_factory=lambda: np.zeros((0, *se2.POSE)))
+    shape_poses: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(p, 3) poses all over the map."""
-    shape_covariances: Floats = field(default_factory=lambda: np.zeros((0, *se2.POSE, *se2.POSE)))
+    shape_covariances: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))
     """(p, 3, 3) their covariances in the frame that fits all of them best: how far the map is bent there; m, m, rad."""
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import Blocks, WithBlocks, entries, factor, rows_of
+from uwblite.graph.eliminated import BlockEquations, BlockFactor, entries, factor, rows_of
 from uwblite.graph.graph import edge_weights
 from uwblite.graph.marginals import Marginals
 from uwblite.graph.normal_equations import filled
@@ -25,7 +25,7 @@ def planted(n=12):
     residual, prior = rng.standard_normal(m), np.tile(np.diag([1.0, 2.0, 3.0, 4.0]), (count, 1, 1))
     slope = rng.standard_normal((count, k))
     own = by_block.T @ by_block
-    blocks = Blocks(
+    blocks = BlockEquations(
         sparse.csr_matrix(by_graph.T @ by_graph),
         sparse.csr_matrix(by_block.T @ by_graph),
         prior + np.stack([own[b * k : (b + 1) * k, b * k : (b + 1) * k] for b in range(count)]),
@@ -71,7 +71,7 @@ def test_covariances_are_those_of_the_whole_system():
 def test_the_factor_is_in_an_order_with_contiguous_subtrees():
     """Else the selected inverse hands on the rows of unrelated columns, which takes far more memory and time."""
     _, normal, blocks, whole, _ = planted(60)
-    found = WithBlocks(normal, blocks, np.zeros(normal.unknowns.size))
+    found = BlockFactor(normal, blocks, np.zeros(normal.unknowns.size))
     lower, n = found.L.toarray(), len(whole)
     np.testing.assert_array_equal(found.perm_r, found.perm_c)
     order = np.argsort(found.perm_c)
@@ -94,7 +94,7 @@ def test_what_nothing_measures_stays():
     graph = replace(graph, anchors=anchors, fixed_anchors=np.append(graph.fixed_anchors, False))
     normal = filled(graph, last=())
     size = normal.unknowns.size
-    nothing = Blocks(
+    nothing = BlockEquations(
         sparse.csr_matrix((size, size)), sparse.csr_matrix((4, size)), np.eye(4)[None], np.zeros(size), np.zeros((1, 4))
     )
     x, _ = factor(normal, nothing).step(normal, nothing)

@@ -23,7 +23,7 @@ from .unknowns import Unknowns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks:
+class BlockEquations:
     """Normal equations of measurements of poses and blocks (b) of a few unknowns (k) each."""
 
     among: sparse.csr_matrix
@@ -57,20 +57,20 @@ TRACE = 1e-12
 """Damping, as a share of the diagonal: unmeasured directions keep their values."""
 
 
-def factor(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> "WithBlocks":
-    """Return the factor of the normal equations of a graph and of blocks, with a trace of damping; see WithBlocks."""
+def factor(normal: NormalEquations, blocks: BlockEquations, order: Ints | None = None) -> "BlockFactor":
+    """Return the factor of the normal equations of a graph and of blocks, with a trace of damping; see BlockFactor."""
     diagonal = normal.diagonal + blocks.among.diagonal()
-    return WithBlocks(normal, blocks, np.where(diagonal > 0.0, TRACE * diagonal, 1.0), order)
+    return BlockFactor(normal, blocks, np.where(diagonal > 0.0, TRACE * diagonal, 1.0), order)
 
 
-class WithBlocks:
+class BlockFactor:
     """Factor of [[H + G, B^T], [B, D]] that solves for the graph's unknowns: the inverse of H + G - B^T D^-1 B.
 
     Every subtree of the elimination is contiguous, which the selected inverse needs: otherwise ranges of columns contain
     unrelated poses, and each passes on the rows of all others.
     """
 
-    def __init__(self, normal: NormalEquations, blocks: Blocks, damping: Floats, order: Ints | None = None) -> None:
+    def __init__(self, normal: NormalEquations, blocks: BlockEquations, damping: Floats, order: Ints | None = None) -> None:
         """Factorise.
 
         Parameters
@@ -106,7 +106,7 @@ class WithBlocks:
         """Upper triangle."""
         return self._lu.U
 
-    def step(self, normal: NormalEquations, blocks: Blocks) -> tuple[Floats, Floats]:
+    def step(self, normal: NormalEquations, blocks: BlockEquations) -> tuple[Floats, Floats]:
         """Return the step of the graph's unknowns (n,) and of the blocks (b, k) by these slopes."""
         found = -self._solve(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
         return found[: self._size], found[self._size :].reshape(blocks.own_slope.shape)

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU
 from .. import se2
 from ..arrays import TINY, Floats, Ints, chunks
 from ..errors import SINGULAR, SolverError
-from .eliminated import TRACE, Blocks, WithBlocks, rows_of
+from .eliminated import TRACE, BlockEquations, BlockFactor, rows_of
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
@@ -101,7 +101,7 @@ class Marginals:
     curvature.
     """
 
-    def __init__(self, graph: Graph, normal: NormalEquations, among: ArrayLike = (), further: Blocks | None = None) -> None:
+    def __init__(self, graph: Graph, normal: NormalEquations, among: ArrayLike, further: BlockEquations | None) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = _factor(normal, further)
         self.unseen = np.append(normal.diagonal <= 0, False)
@@ -184,7 +184,7 @@ class Marginals:
         return np.concatenate([np.zeros((len(numbers), 0)), *parts], axis=1)
 
 
-def _factor(normal: NormalEquations, further: Blocks | None) -> SuperLU | WithBlocks:
+def _factor(normal: NormalEquations, further: BlockEquations | None) -> SuperLU | BlockFactor:
     """Factorise H, and further measurements with it, where it is regular, else with a trace of damping that leaves open
     directions open."""
     seen = normal.diagonal > 0
@@ -199,11 +199,11 @@ def _factor(normal: NormalEquations, further: Blocks | None) -> SuperLU | WithBl
     return _damped(normal, further, np.where(seen, TRACE * once, 1.0))
 
 
-def _damped(normal: NormalEquations, further: Blocks | None, damping: Floats) -> SuperLU | WithBlocks:
-    return cast(SuperLU, normal.factor(damping)) if further is None else WithBlocks(normal, further, damping)
+def _damped(normal: NormalEquations, further: BlockEquations | None, damping: Floats) -> SuperLU | BlockFactor:
+    return cast(SuperLU, normal.factor(damping)) if further is None else BlockFactor(normal, further, damping)
 
 
-def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], Blocks] | None = None) -> Marginals:
+def marginals(graph: Graph, among: ArrayLike = (), further: Callable[[Unknowns], BlockEquations] | None = None) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
     Parameters

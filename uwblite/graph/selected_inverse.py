@@ -19,7 +19,7 @@ from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from .eliminated import WithBlocks
+from .eliminated import BlockFactor
 
 _WIDEST, _OVERHEAD = 64, 1e4
 """Columns of a range at most, and the fixed cost of one, in entries: calls of library functions take time."""
@@ -42,7 +42,7 @@ class _Front(NamedTuple):
         return panel
 
 
-def selected_inverse(factor: SuperLU | WithBlocks, rows: Ints, columns: Ints) -> Floats:
+def selected_inverse(factor: SuperLU | BlockFactor, rows: Ints, columns: Ints) -> Floats:
     """Return entries (k,) of the inverse of a symmetric matrix, at rows and columns (k,) where the matrix itself is not empty.
 
     0 where it holds a zero that its factor need not fill.

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, entries, factor
+from ..graph.eliminated import BlockEquations, entries, factor
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
@@ -143,7 +143,7 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
 
-def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
+def for_covariances(found: MeasuredSurfaces, graph: Graph, task: Task) -> tuple[Graph, Callable[[Unknowns], BlockEquations]]:
     """Return a graph, and the normal equations of the rays by the numbers of its unknowns, for covariances.
 
     Rays have the weight of the adjustment. Pairs of clouds contain the same points, and others: they get half their weight.
@@ -228,7 +228,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
     return graph, found
 
 
-def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> Blocks:
+def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns) -> BlockEquations:
     """Return the normal equations of rays and of the priors of surfaces."""
     # An index -1 gives the number -1: fixed.
     of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
@@ -245,4 +245,4 @@ def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unkn
     across.eliminate_zeros()
     own, own_slope = sums.surfaces + np.diag(prior**-2.0), sums.surface_slope.copy()
     own_slope[:, 2] += surfaces.offset * prior[2] ** -2.0
-    return Blocks(among, across, own, slope, own_slope)
+    return BlockEquations(among, across, own, slope, own_slope)
