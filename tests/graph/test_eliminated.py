@@ -6,7 +6,7 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import BlockEquations, BlockFactor, entries, factor, rows_of
+from uwblite.graph.eliminated import BlockEquations, BlockFactor, factor, jacobian_rows, sum_of_blocks
 from uwblite.graph.graph import edge_weights
 from uwblite.graph.marginals import Marginals
 from uwblite.graph.normal_equations import filled
@@ -109,7 +109,7 @@ def test_blocks_add_up_and_what_is_fixed_is_left_out():
     for row, column, value in zip(rows, columns, values, strict=True):
         # The last row and column take what is fixed.
         expected[row[:, None], column] += value
-    np.testing.assert_allclose(entries(rows, columns, values, (3, 3)).toarray(), expected[:3, :3], rtol=1e-12)
+    np.testing.assert_allclose(sum_of_blocks(rows, columns, values, (3, 3)).toarray(), expected[:3, :3], rtol=1e-12)
 
 
 def test_rows_of_edges_make_the_normal_equations():
@@ -118,7 +118,7 @@ def test_rows_of_edges_make_the_normal_equations():
     for edges in graph.edges:
         linearized = edges.linearize(graph)
         weight = np.repeat(edge_weights(edges, graph), linearized.residuals.shape[1])
-        rows = rows_of(linearized, normal.unknowns).toarray()
+        rows = jacobian_rows(linearized, normal.unknowns).toarray()
         matrix += rows.T @ (weight[:, None] * rows)
         slope += rows.T @ (weight * linearized.residuals.ravel())
     np.testing.assert_allclose(matrix, normal.matrix.toarray(), rtol=1e-9, atol=1e-9 * np.abs(matrix).max())

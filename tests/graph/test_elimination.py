@@ -9,14 +9,14 @@ from uwblite.graph.elimination import (
     _pairs_of,
     adjacency,
     column_sizes,
-    contiguous,
+    count_multiplications,
     elimination_tree,
-    is_full,
+    fills_in_any_order,
     minimum_degree,
+    multiplications_of,
     narrow_order,
     order_of_columns,
-    work,
-    work_of,
+    postorder,
 )
 from uwblite.graph.factorization import superlu
 
@@ -44,7 +44,7 @@ def test_tree_and_sizes_are_those_of_the_filled_pattern(seed):
     order = rng.permutation(n) if seed % 2 else minimum_degree(adjacency(pairs, n))
     parent, sizes = by_brute_force(pairs, order, width)
     np.testing.assert_array_equal(elimination_tree(pairs, order), parent)
-    order, tree = contiguous(pairs, order)
+    order, tree = postorder(pairs, order)
     parent, sizes = by_brute_force(pairs, order, width)
     np.testing.assert_array_equal(tree, parent)
     np.testing.assert_array_equal(column_sizes(pairs, order, width, parent), sizes)
@@ -52,7 +52,7 @@ def test_tree_and_sizes_are_those_of_the_filled_pattern(seed):
     continued = [top == size - width[k] for k, top, size in zip(order, above, sizes, strict=True)]
     alone = EliminationPolicy.alone
     each = [width[k] * size**2 * (1 if more else alone) for k, size, more in zip(order, sizes, continued, strict=True)]
-    assert work(pairs, order, width, parent) == sum(each)
+    assert count_multiplications(pairs, order, width, parent) == sum(each)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -70,9 +70,9 @@ def test_a_ring_of_hundreds_ties_its_ends():
     pairs = np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1)
     lower = superlu(adjacency(pairs, n), "NATURAL").L
     assert lower[n - 1, n // 2] == 0.0
-    sizes = column_sizes(pairs, np.arange(n), np.ones(n, dtype=int), contiguous(pairs, np.arange(n))[1])
+    sizes = column_sizes(pairs, np.arange(n), np.ones(n, dtype=int), postorder(pairs, np.arange(n))[1])
     np.testing.assert_array_equal(sizes[:-2], np.full(n - 2, 3))
-    order = contiguous(pairs, minimum_degree(adjacency(pairs, n)))[0]
+    order = postorder(pairs, minimum_degree(adjacency(pairs, n)))[0]
     assert sorted(order) == list(range(n))
 
 
@@ -93,10 +93,10 @@ def test_a_large_matrix_of_anything_tied_to_anything_is_full():
     ways = ((grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1]))
     streets = np.vstack([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ways])
     links = np.random.default_rng(0).integers(0, n, (n, 2))
-    assert not is_full(narrow_order(adjacency(streets, n))[1])
-    assert is_full(narrow_order(adjacency(np.vstack([streets, links]), n))[1])
-    assert not is_full(narrow_order(adjacency(links[(links < 2000).all(axis=1)], 2000))[1])
-    assert work_of(sparse.csc_matrix(adjacency(np.vstack([streets, links]), n))) == np.inf
+    assert not fills_in_any_order(narrow_order(adjacency(streets, n))[1])
+    assert fills_in_any_order(narrow_order(adjacency(np.vstack([streets, links]), n))[1])
+    assert not fills_in_any_order(narrow_order(adjacency(links[(links < 2000).all(axis=1)], 2000))[1])
+    assert multiplications_of(sparse.csc_matrix(adjacency(np.vstack([streets, links]), n))) == np.inf
 
 
 def test_a_matrix_is_counted_by_its_pattern():
@@ -105,7 +105,7 @@ def test_a_matrix_is_counted_by_its_pattern():
     arrow[-1] = arrow[:, -1] = 1.0
     matrix = sparse.csc_matrix(arrow)
     assert sorted(map(tuple, _pairs_of(matrix).tolist())) == [(0, 4), (1, 4), (2, 4), (3, 4)]
-    assert work_of(matrix) == EliminationPolicy.per_complex * (4 * 2**2 + 1)
+    assert multiplications_of(matrix) == EliminationPolicy.per_complex * (4 * 2**2 + 1)
 
 
 @pytest.mark.parametrize("seed", range(5))

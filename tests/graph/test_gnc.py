@@ -7,7 +7,14 @@ from helpers.planted_graphs import at_random, every_kind, loop, random_poses, re
 
 from uwblite import se2
 from uwblite.errors import SolverError
-from uwblite.graph.gnc import closing, optimize_gnc, outlier_thresholds, tightened, truncated_weight, with_kernel
+from uwblite.graph.gnc import (
+    closing_edges,
+    optimize_gnc,
+    optimize_tightening,
+    outlier_thresholds,
+    truncated_weight,
+    with_kernel,
+)
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import SQUARED, Kernel
@@ -116,7 +123,7 @@ def test_results_are_the_same_every_time():
 
 
 @pytest.mark.parametrize("optimise", [
-    lambda graph: optimize_gnc(graph, THRESHOLDS), lambda graph: tightened(graph, [CLOSURES], (4.0,), SolverConfig()),
+    lambda graph: optimize_gnc(graph, THRESHOLDS), lambda graph: optimize_tightening(graph, [CLOSURES], (4.0,), SolverConfig()),
 ])  # fmt: skip
 def test_problems_that_are_none_are_refused_before_any_step(optimise):
     graph, _, _ = loop(0)
@@ -129,10 +136,10 @@ def test_problems_that_are_none_are_refused_before_any_step(optimise):
 def test_kernels_that_tighten_are_not_drawn_by_false_closures():
     """Those of the chosen kinds alone, the last scale in the end."""
     graph, _, _, clean, truth = spoilt(0)
-    found = tightened(graph, [CLOSURES, RANGES], (30.0, 10.0, 4.0), SolverConfig())
+    found = optimize_tightening(graph, [CLOSURES, RANGES], (30.0, 10.0, 4.0), SolverConfig())
     assert [e.kernel for e in found.edges] == [graph.edges[0].kernel, *[Kernel("geman-mcclure", 4.0)] * 2]
     assert ate(found.poses, truth) <= 1.2 * ate(optimize(clean)[0].poses, truth)
-    at_once = tightened(graph, [CLOSURES, RANGES], (4.0,), SolverConfig())
+    at_once = optimize_tightening(graph, [CLOSURES, RANGES], (4.0,), SolverConfig())
     assert found.chi2() < at_once.chi2()
 
 
@@ -171,7 +178,7 @@ def graph():
 
 
 def test_all_but_the_first_between_successive_poses_close_loops(graph):
-    one, again, other = closing(graph)
+    one, again, other = closing_edges(graph)
     np.testing.assert_array_equal(one, [False, False, True, True, True, True])
     assert again.all()
     assert not other.any()

@@ -15,13 +15,13 @@ from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import (
     ALL_WORK_DONE,
     SolverConfig,
-    _step,
+    _solve_step,
     cheaper_move,
     extrapolated,
     optimize,
     relaxed,
 )
-from uwblite.graph.unknowns import moved, moved_along
+from uwblite.graph.unknowns import move_by_arcs, move_by_links
 
 CAREFUL = SolverConfig(relative_decrease=1e-14)
 
@@ -328,7 +328,7 @@ def test_poses_move_along_arcs_and_headings_stay_wrapped():
     graph, _, _ = loop(13, n=8, anchors=1)
     normal = filled(graph)
     step = np.random.default_rng(0).normal(scale=2.0, size=normal.unknowns.size)
-    there = moved(graph, normal.unknowns, step)
+    there = move_by_arcs(graph, normal.unknowns, step)
     by = normal.unknowns.spread("poses", step)
     in_own_frame = np.column_stack([se2.rotate(-graph.poses[:, 2], by[:, :2]), by[:, 2]])
     expected = se2.compose(graph.poses, se2.exp(in_own_frame))
@@ -345,7 +345,7 @@ def test_link_by_link_is_the_same_step_to_first_order(is_fixed):
 
     def apart(scale):
         one, other = (
-            move(graph, normal.unknowns, scale * step, *more) for move, more in ((moved, ()), (moved_along, (linked,)))
+            move(graph, normal.unknowns, scale * step, *more) for move, more in ((move_by_arcs, ()), (move_by_links, (linked,)))
         )
         np.testing.assert_array_equal(one.anchors, other.anchors)
         np.testing.assert_array_equal(one.calibration.values, other.calibration.values)
@@ -364,7 +364,7 @@ def test_link_by_link_a_turned_chain_keeps_its_shape():
     step = np.zeros(normal.unknowns.size)
     number = normal.unknowns.number["poses"]
     step[number[number >= 0]] = whole[number >= 0]
-    turned = moved_along(graph, normal.unknowns, step, np.ones(5, dtype=bool)).poses
+    turned = move_by_links(graph, normal.unknowns, step, np.ones(5, dtype=bool)).poses
     shapes = (se2.between(poses[1:-1], poses[2:]) for poses in (turned, graph.poses))
     np.testing.assert_allclose(*shapes, atol=1e-12)
 
@@ -568,7 +568,7 @@ def test_a_search_in_which_no_step_helps_has_not_converged(config):
     assert min(summary.chi2_history) > 101.0
 
 
-@pytest.mark.parametrize("way", [moved, moved_along])
+@pytest.mark.parametrize("way", [move_by_arcs, move_by_links])
 def test_a_step_takes_whichever_way_costs_less(way):
     """Priors lie where one of the two ways of carrying out the step ends: that one costs nothing."""
     rng = np.random.default_rng(4)
@@ -577,14 +577,14 @@ def test_a_step_takes_whichever_way_costs_less(way):
     at_start = graph.with_edges(PriorEdges("poses", np.arange(4), graph.poses, everywhere))
     unknowns = NormalEquations(at_start, linearize(at_start)).unknowns
     step, linked = rng.normal(scale=0.5, size=unknowns.size), np.ones(3, dtype=bool)
-    ends = {moved: moved(graph, unknowns, step), moved_along: moved_along(graph, unknowns, step, linked)}
+    ends = {move_by_arcs: move_by_arcs(graph, unknowns, step), move_by_links: move_by_links(graph, unknowns, step, linked)}
     aimed = graph.with_edges(PriorEdges("poses", np.arange(4), ends[way].poses, everywhere))
-    assert not np.allclose(ends[moved].poses, ends[moved_along].poses)
+    assert not np.allclose(ends[move_by_arcs].poses, ends[move_by_links].poses)
     trial, linearized, chi2 = cheaper_move(aimed, unknowns, step, linked, enough=0.0)
     assert np.allclose(trial.poses, ends[way].poses)
     assert chi2 == linearized_cost(trial, linearized) == pytest.approx(0.0)
     # What the first way reaches is enough: the other is not looked at.
-    assert np.allclose(cheaper_move(aimed, unknowns, step, linked, np.inf)[0].poses, ends[moved].poses)
+    assert np.allclose(cheaper_move(aimed, unknowns, step, linked, np.inf)[0].poses, ends[move_by_arcs].poses)
 
 
 @pytest.mark.parametrize(
@@ -609,8 +609,8 @@ def test_a_damped_step_of_a_linear_problem_brings_what_it_promises(damping):
     prior = PriorEdges("anchors", np.array([0, 1, 1]), rng.normal(size=(3, 2)), rng.normal(size=(3, 2, 2)))
     graph = Graph(np.zeros((1, 3)), rng.normal(size=(2, 2)), (prior,))
     normal = filled(graph)
-    _, step, promised = _step(normal, damping * normal.diagonal, None)
-    assert promised == pytest.approx(graph.chi2() - moved(graph, normal.unknowns, step).chi2(), rel=1e-9)
+    _, step, promised = _solve_step(normal, damping * normal.diagonal, None)
+    assert promised == pytest.approx(graph.chi2() - move_by_arcs(graph, normal.unknowns, step).chi2(), rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", [0, 2, 3])

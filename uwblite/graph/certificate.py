@@ -34,7 +34,7 @@ from scipy import sparse
 from .. import se2
 from ..arrays import Bools, Complexes, Floats, Ints
 from ..errors import SolverError
-from .elimination import work_of
+from .elimination import multiplications_of
 from .factorization import superlu
 from .graph import Edges, Graph, PriorEdges
 from .point_edges import AnchorDistanceEdges, LandmarkEdges, PointDistanceEdges, distances
@@ -228,7 +228,7 @@ def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
     try:
         minimum, summary = optimize(graph, CertificatePolicy.polished, None, allowed)
         S, D = certificate_matrix(minimum)
-        if np.isfinite(allowed) and summary.work + (2 + CertificatePolicy.halvings) * work_of(S) > allowed:
+        if np.isfinite(allowed) and summary.work + (2 + CertificatePolicy.halvings) * multiplications_of(S) > allowed:
             return Certificate(False, 0.0, "its edges tie so many poses to so many others that the matrix would fill up")
         bound = max(summary.chi2 - _gap(S, D, 0.5 * negligible, summary.chi2), 0.0)
     except SolverError as problem:

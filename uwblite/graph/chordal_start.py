@@ -14,7 +14,7 @@ from scipy import sparse
 from .. import se2
 from ..arrays import Bools, Complexes, Floats, Ints
 from ..errors import SolverError
-from .elimination import fills_up, work_of
+from .elimination import multiplications_of, slower_than_iteration
 from .factorization import superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
@@ -60,7 +60,7 @@ def _solved(
     inner = A[:, free].conj().T
     solved = values.copy()
     normal = (inner @ inner.conj().T).tocsc()
-    if fills_up(work_of(normal), normal.shape[0]):
+    if slower_than_iteration(multiplications_of(normal), normal.shape[0]):
         raise SolverError("the matrix would fill up")
     solved[free] = superlu(normal, "MMD_AT_PLUS_A").solve(inner @ right)
     return solved

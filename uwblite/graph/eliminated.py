@@ -38,19 +38,19 @@ class BlockEquations:
     """(b, k) g_s."""
 
 
-def entries(rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int]) -> sparse.csr_matrix:
+def sum_of_blocks(rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int]) -> sparse.csr_matrix:
     """Return the sum of blocks (m, a, b) in rows (m, a) and columns (m, b) of a matrix; a number below 0 is fixed."""
     row, column = np.broadcast_to(rows[:, :, None], values.shape), np.broadcast_to(columns[:, None], values.shape)
     free = (row >= 0) & (column >= 0)
     return sparse.csr_matrix((values[free], (row[free], column[free])), shape=shape)
 
 
-def rows_of(linearized: Linearization, unknowns: Unknowns) -> sparse.csr_matrix:
+def jacobian_rows(linearized: Linearization, unknowns: Unknowns) -> sparse.csr_matrix:
     """Return the Jacobian (e d, n) of measurements (e) by the unknowns of a graph."""
     columns = np.concatenate([unknowns.number[name][index] for name, index, _ in linearized.blocks], axis=1)
     values = np.concatenate([jacobian for *_, jacobian in linearized.blocks], axis=2)
     rows = np.arange(linearized.residuals.size).reshape(linearized.residuals.shape)
-    return entries(rows, columns, values, (rows.size, unknowns.size))
+    return sum_of_blocks(rows, columns, values, (rows.size, unknowns.size))
 
 
 TRACE = 1e-12

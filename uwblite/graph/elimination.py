@@ -93,7 +93,7 @@ def narrow_order(pattern: sparse.csc_matrix) -> tuple[Ints, Ints]:
     return order, (place - first)[order]
 
 
-def is_full(reach: Ints) -> bool:
+def fills_in_any_order(reach: Ints) -> bool:
     """Return whether a large matrix, whose rows reach so far (n,) in a narrow order, fills up in any order.
 
     Such a matrix connects arbitrary unknowns. Counting by minimum degree takes many seconds for it, and less time than the
@@ -102,7 +102,7 @@ def is_full(reach: Ints) -> bool:
     return len(reach) > EliminationPolicy.small and float(np.mean(reach)) > EliminationPolicy.wide * len(reach)
 
 
-def fills_up(multiplications: float, poses: int) -> bool:
+def slower_than_iteration(multiplications: float, poses: int) -> bool:
     """Return whether a factorisation takes longer than iteration."""
     return multiplications > max(EliminationPolicy.little_work, EliminationPolicy.per_pose * poses)
 
@@ -141,7 +141,7 @@ def elimination_tree(pairs: Ints, order: Ints) -> Ints:
     return np.array(parent, dtype=np.intp)
 
 
-def contiguous(pairs: Ints, order: Ints) -> tuple[Ints, Ints]:
+def postorder(pairs: Ints, order: Ints) -> tuple[Ints, Ints]:
     """Return an order (n,) that fills the same and has every subtree contiguous, ending at its root, and its elimination tree.
 
     A depth-first walk from the roots, read backwards, is such an order. It makes neighbours in the order neighbours in the
@@ -163,7 +163,7 @@ def _pairs_of(matrix: sparse.csc_matrix) -> Ints:
 def order_of_columns(matrix: sparse.csc_matrix) -> Ints:
     """Return the order (n,) of elimination of a symmetric matrix by minimum degree, with every subtree contiguous."""
     pairs = _pairs_of(matrix)
-    return contiguous(pairs, minimum_degree(adjacency(pairs, matrix.shape[0])))[0]
+    return postorder(pairs, minimum_degree(adjacency(pairs, matrix.shape[0])))[0]
 
 
 def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
@@ -174,14 +174,14 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
 
     Parameters
     ----------
-    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
+    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see postorder.
     """
     n, scalars = len(order), width[order].astype(np.intp)
     lower = _lower_triangle(pairs, order)
     below, row = lower.indices.astype(np.intp), np.repeat(np.arange(n), np.diff(lower.indptr))
     change = np.bincount(below, scalars[row], n + 1).astype(np.float64)
     again = np.flatnonzero(row[1:] == row[:-1]) + 1
-    change -= np.bincount(_meeting(parent, below[again - 1], below[again]), scalars[row[again]], n + 1)
+    change -= np.bincount(_common_ancestors(parent, below[again - 1], below[again]), scalars[row[again]], n + 1)
     tied = np.zeros(n, dtype=bool)
     tied[row] = True
     change[:-1] += np.where(tied, 0, scalars)
@@ -193,7 +193,7 @@ def column_sizes(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> Ints:
     return np.rint(total[1:] - total[first[:-1]]).astype(np.intp)
 
 
-def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
+def _common_ancestors(parent: Ints, one: Ints, other: Ints) -> Ints:
     """Return where the paths up from nodes `one` and from later nodes `other` meet, in a tree in postorder.
 
     The nodes from one up to the other lie below the node where the paths meet, and one of them is its child: so it is the
@@ -208,29 +208,29 @@ def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
     return np.asarray(np.maximum(table[step, one], table[step, other - (1 << step)]))
 
 
-def work(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> float:
+def count_multiplications(pairs: Ints, order: Ints, width: Ints, parent: Ints) -> float:
     """Return the multiplications of a factorisation with the nodes in this order, in units of one of a dense matrix.
 
     Columns with the pattern of the next one are multiplied together; others are slower because of memory access.
 
     Parameters
     ----------
-    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see contiguous.
+    width : (n,) scalars of each node. order, parent : (n,) with every subtree contiguous, see postorder.
     """
     sizes, scalars = column_sizes(pairs, order, width, parent), width[order]
     continued = np.append(sizes, 0)[parent] == sizes - scalars
     return float(scalars @ (np.square(sizes, dtype=np.float64) * np.where(continued, 1.0, EliminationPolicy.alone)))
 
 
-def work_of(matrix: sparse.csc_matrix) -> float:
+def multiplications_of(matrix: sparse.csc_matrix) -> float:
     """Return the multiplications of a factorisation of a symmetric, complex matrix by minimum degree; infinite where it fills
     up."""
     pairs, width = _pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.intp)
     pattern = adjacency(pairs, len(width))
-    if is_full(narrow_order(pattern)[1]):
+    if fills_in_any_order(narrow_order(pattern)[1]):
         return np.inf
-    order, parent = contiguous(pairs, minimum_degree(pattern))
-    return EliminationPolicy.per_complex * work(pairs, order, width, parent)
+    order, parent = postorder(pairs, minimum_degree(pattern))
+    return EliminationPolicy.per_complex * count_multiplications(pairs, order, width, parent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,26 +265,26 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, last: Ints | None = No
     if last is not None:
         # What remains when all others are eliminated is full.
         among = np.concatenate([among, last[np.stack(np.triu_indices(len(last), 1), axis=1)]])
-        walk = contiguous(among, minimum_degree(adjacency(among, poses)))[0]
+        walk = postorder(among, minimum_degree(adjacency(among, poses)))[0]
         return Ordering(walk[np.argsort(np.isin(walk, last), kind="stable")])
     pattern = adjacency(among, poses)
     bordered = int(width[poses:].sum()) <= policy.widest_border
     order, reach = narrow_order(pattern)
     if bordered and reach.max() <= policy.widest_band:
         return Ordering(order, bordered=True, banded=True)
-    if is_full(reach):
+    if fills_in_any_order(reach):
         return Ordering(each, iterative=True)
     order = minimum_degree(pattern)
     if bordered:
         most = WIDTHS["poses"] * float(np.sum((WIDTHS["poses"] * (reach + 1.0)) ** 2))
         if most <= policy.little_work:
             return Ordering(order, bordered=True, work=most)
-    order, parent = contiguous(among, order)
+    order, parent = postorder(among, order)
     if bordered:
-        multiplications = work(among, order, width, parent)
+        multiplications = count_multiplications(among, order, width, parent)
     else:
-        every, parent = contiguous(pairs, np.concatenate([order, np.arange(poses, len(width))]))
-        multiplications = work(pairs, every, width, parent)
-    if fills_up(multiplications, poses):
+        every, parent = postorder(pairs, np.concatenate([order, np.arange(poses, len(width))]))
+        multiplications = count_multiplications(pairs, every, width, parent)
+    if slower_than_iteration(multiplications, poses):
         return Ordering(each, iterative=True)
     return Ordering(order, bordered, work=multiplications)

@@ -48,7 +48,7 @@ def _threshold(dimensions: int) -> float:
     return float(np.sqrt(chdtri(dimensions, OutlierPolicy.probability)))
 
 
-def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
+def optimize_tightening(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
     """Optimise with a Geman-McClure kernel on chosen kinds of edges that is tightened, scale by scale, standard deviations.
 
     A scale that no residual exceeds would reject nothing: it is left out, but for the last.
@@ -123,7 +123,7 @@ def optimize_gnc(
 
 def outlier_thresholds(graph: Graph) -> dict[int, float]:
     """Return by position the threshold of each kind of edges that may hold outliers: priors and successive poses do not."""
-    kinds = enumerate(zip(graph.edges, closing(graph), strict=True))
+    kinds = enumerate(zip(graph.edges, closing_edges(graph), strict=True))
     suspects = [(k, e) for k, (e, loop) in kinds if len(e) and (loop is None or loop.any()) and not isinstance(e, PriorEdges)]
     return {k: _threshold(e.residuals(graph).shape[1]) for k, e in suspects}
 
@@ -145,7 +145,7 @@ def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tu
     return graph, linearize(graph)
 
 
-def closing(graph: Graph) -> list[Bools | None]:
+def closing_edges(graph: Graph) -> list[Bools | None]:
     """Return for each kind of edges which of them (e,) close loops; None for kinds that are no relative poses."""
     seen = np.zeros(len(graph.poses), dtype=bool)
     found: list[Bools | None] = []
@@ -165,7 +165,7 @@ def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
     """Return the graph with a robust kernel on every edge except relative poses that close no loop."""
 
     def parts() -> Iterator[Edges]:
-        for e, loop in zip(graph.edges, closing(graph), strict=True):
+        for e, loop in zip(graph.edges, closing_edges(graph), strict=True):
             if loop is None:
                 yield replace(e, kernel=kernel)
                 continue
@@ -194,7 +194,7 @@ class Misfit:
 
 def misfit(graph: Graph) -> Misfit:
     """Return how far the loop closures of a graph are off."""
-    loops = [e.rows(loop) for e, loop in zip(graph.edges, closing(graph), strict=True) if loop is not None and loop.any()]
+    loops = [e.rows(loop) for e, loop in zip(graph.edges, closing_edges(graph), strict=True) if loop is not None and loop.any()]
     if not loops:
         return Misfit(0, 0, (-1, -1))
     i, j = (np.concatenate([getattr(e, end) for e in loops]) for end in ("i", "j"))

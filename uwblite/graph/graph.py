@@ -187,15 +187,15 @@ class Graph:
         """Priors of the calibration among the edges."""
         return tuple(e for e in self.edges if isinstance(e, PriorEdges) and e.block == "calibration")
 
-    def has_free(self, index: Ints) -> Bools:
+    def free_columns(self, index: Ints) -> Bools:
         """Return which columns of indices (e, k) of calibration values, -1 = none, hold a free one."""
         if self.fixed_calibration.all():
             return np.zeros(index.shape[1], dtype=bool)
         return np.any(np.append(~self.fixed_calibration, False)[index], axis=0)
 
-    def by_calibration(self, index: Ints, columns: Sequence[Floats]) -> list[Block]:
+    def calibration_blocks(self, index: Ints, columns: Sequence[Floats]) -> list[Block]:
         """Return the blocks by the calibration values of indices (e, k), -1 = none, that are free, of derivatives (d, e)."""
-        used = compress(zip(index.T, columns, strict=False), self.has_free(index))
+        used = compress(zip(index.T, columns, strict=False), self.free_columns(index))
         return [("calibration", np.maximum(i, 0), np.where(i >= 0, column, 0.0).T[..., None]) for i, column in used]
 
     def with_edges(self, *edges: Edges) -> "Graph":

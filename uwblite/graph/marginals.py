@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU
 from .. import se2
 from ..arrays import TINY, Floats, Ints, chunks
 from ..errors import SINGULAR, SolverError
-from .eliminated import TRACE, BlockEquations, BlockFactor, rows_of
+from .eliminated import TRACE, BlockEquations, BlockFactor, jacobian_rows
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
@@ -143,7 +143,7 @@ class Marginals:
 
     def slopes(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csc_matrix:
         """Return J^T W S (unknowns, k) of errors of edges; see estimated."""
-        jacobian = rows_of(edges.linearize(self._graph), self.unknowns)
+        jacobian = jacobian_rows(edges.linearize(self._graph), self.unknowns)
         return sparse.csc_matrix(jacobian.T @ self._weighted(edges, shifts))
 
     def _weighted(self, edges: Edges, shifts: sparse.csr_matrix) -> sparse.csr_matrix:

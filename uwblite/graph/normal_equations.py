@@ -42,7 +42,7 @@ class NormalEquations:
         """
         self.spent = graph.work
         """Counts what is done with these equations."""
-        self._analysed = free_unknowns(graph), [_touched(lin) for lin in linearized]
+        self._analysed = free_unknowns(graph), [_pattern(lin) for lin in linearized]
         free = self._analysed[0]
         counts = [int(mask.sum()) for mask in free.values()]
         self._values = sum(counts[:2])
@@ -86,14 +86,14 @@ class NormalEquations:
         return (
             len(linearized) == len(kinds)
             and all(np.array_equal(free[name], mask) for name, mask in free_unknowns(graph).items())
-            and all(_same(blocks, _touched(lin)) for blocks, lin in zip(kinds, linearized, strict=True))
+            and all(_same_pattern(blocks, _pattern(lin)) for blocks, lin in zip(kinds, linearized, strict=True))
         )
 
     def _pairs(self, touched: list[list[_Touched]], nodes: int) -> tuple[Ints, list[Ints]]:
         """Return the pairs (b, 2) of nodes that share an edge, every node with itself first; and each edge's pair."""
         m, valued = self._values, np.zeros((nodes - self._values + 1, nodes + 1), dtype=bool)
         keys = [np.array([m * m], dtype=WIDE)]
-        for low, high, by_value in _meetings(touched):
+        for low, high, by_value in _touched_pairs(touched):
             if by_value:
                 valued[np.where(low >= 0, high - m, -1), low] = True
             else:
@@ -110,7 +110,7 @@ class NormalEquations:
         following = iter(np.split(which, np.cumsum([len(k) for k in keys])[:-1])[1:])
         return pairs, [
             place[np.where(low >= 0, high - m, -1), low].astype(np.intp) if by_value else next(following)
-            for low, high, by_value in _meetings(touched)
+            for low, high, by_value in _touched_pairs(touched)
         ]
 
     def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> Blocks:
@@ -179,11 +179,11 @@ class NormalEquations:
             jacobian = np.ascontiguousarray(np.concatenate(jacobians, axis=1))
             weighted = jacobian if weight is None else jacobian * weight
             _, k, e = jacobian.shape
-            _contract(weighted, lin.residuals.T[:, None], slopes[row : row + k * e].reshape(k, e))
+            _sum_of_products(weighted, lin.residuals.T[:, None], slopes[row : row + k * e].reshape(k, e))
             row += k * e
             for column in range(1, k + 1) if again else ():
                 block = products[place : place + column * e].reshape(column, e)
-                _contract(weighted[:, column - 1 : column], jacobian[:, :column], block)
+                _sum_of_products(weighted[:, column - 1 : column], jacobian[:, :column], block)
                 place += column * e
         self.gradient = np.bincount(self._rows, slopes, self.unknowns.size + 1)[:-1].astype(np.float64, copy=False)
         if again:
@@ -214,11 +214,11 @@ class NormalEquations:
         return counted(self._layout.factor(values), self.spent)
 
 
-def _touched(lin: Linearization) -> list[_Block]:
+def _pattern(lin: Linearization) -> list[_Block]:
     return [(name, index, jac.shape[1:]) for name, index, jac in lin.blocks]
 
 
-def _same(one: list[_Block], other: list[_Block]) -> bool:
+def _same_pattern(one: list[_Block], other: list[_Block]) -> bool:
     return len(one) == len(other) and all(
         a == b and shape == form and (index is place or np.array_equal(index, place))
         for (a, index, shape), (b, place, form) in zip(one, other, strict=True)
@@ -238,7 +238,7 @@ def filled(graph: Graph, last: ArrayLike | None = None, like: NormalEquations | 
     return normal
 
 
-def _meetings(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]]:
+def _touched_pairs(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]]:
     """Yield the lower and the higher node (e,) of every two that each edge touches, -1 = fixed; and whether one is a value."""
     for nodes in touched:
         for p, (a, a_value) in enumerate(nodes):
@@ -246,7 +246,7 @@ def _meetings(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]
                 yield np.minimum(a, b), np.maximum(a, b), a_value or b_value
 
 
-def _contract(a: Floats, b: Floats, out: Floats) -> None:
+def _sum_of_products(a: Floats, b: Floats, out: Floats) -> None:
     """Put the sum over the first axis of a b into out."""
     np.multiply(a[0], b[0], out=out)
     for left, right in zip(a[1:], b[1:], strict=True):

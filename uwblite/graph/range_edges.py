@@ -111,9 +111,9 @@ class RangeEdges(Edges):
         by_pose = np.stack([direction[0], direction[1], by_theta])[None].transpose(2, 0, 1)
         blocks: list[Block] = [("poses", self.pose, by_pose), ("anchors", self.anchor, -direction[None].transpose(2, 0, 1))]
         columns = [distance / self.sigma, 1.0 / self.sigma, scale / (2.0 * reach[1])]
-        if graph.has_free(self.calibration[:, 3:]).any():
+        if graph.free_columns(self.calibration[:, 3:]).any():
             columns += self._by_tag_and_delay(graph, direction)
-        blocks += graph.by_calibration(self.calibration, [column[None] for column in columns])
+        blocks += graph.calibration_blocks(self.calibration, [column[None] for column in columns])
         residuals = (((1.0 + cal[0]) * distance + cal[1] - self.corrected) / self.sigma)[:, None]
         return Linearization(residuals, tuple(blocks))
 

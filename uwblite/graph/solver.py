@@ -40,7 +40,7 @@ from .graph import Edges, Graph, Linearization, kernel_weights, linearize, linea
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .schwarz_cg import iterated
-from .unknowns import Unknowns, linked_poses, moved, moved_along, turns_much
+from .unknowns import Unknowns, linked_poses, move_by_arcs, move_by_links, turns_much
 from .work import ENTRIES
 
 Progress = Callable[[int, int], None]
@@ -104,7 +104,7 @@ class SolverSummary:
         return self.chi2 / dof if (dof := self.dof) > 0 else float("nan")
 
 
-def _or_none(edges: Edges, residuals: Floats) -> Floats | None:
+def _weights_if_any(edges: Edges, residuals: Floats) -> Floats | None:
     return None if edges.weights is None and edges.kernel.name == "none" else kernel_weights(edges, residuals)
 
 
@@ -200,7 +200,7 @@ class _Descent:
         again = self.factor is None
         if self.moved or (again and not self.current):
             at = self.linearized or linearize(self.graph)
-            weights = [_or_none(e, lin.residuals) for e, lin in zip(self.graph.edges, at, strict=True)]
+            weights = [_weights_if_any(e, lin.residuals) for e, lin in zip(self.graph.edges, at, strict=True)]
             self.normal.fill(at, weights, again)
             # The normal equations contain all of it now; the Jacobians of a recording of hours are large.
             self.linearized, self.current = [], again
@@ -216,13 +216,13 @@ class _Descent:
     def step(self) -> str:
         """Try a step, and take it where the cost falls; return why the search ends with it, "" where it goes on."""
         reused, before = self.factor is not None, iterated(self.factor)
-        self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
+        self.factor, step, promised = _solve_step(self.normal, self.damping * self.scale, self.factor)
         steps = iterated(self.factor) - before if reused else iterated(self.factor)
         self.graph.work[ENTRIES] += int(steps)
         self.work += steps if reused else steps + self.normal.work
         negligible = self.config.relative_decrease * self.chi2 + DescentPolicy.negligible
         if reused and not self.robust and 0 < promised <= negligible:
-            self.graph, self.chi2 = moved(self.graph, self.normal.unknowns, step), self.chi2 - promised
+            self.graph, self.chi2 = move_by_arcs(self.graph, self.normal.unknowns, step), self.chi2 - promised
             self.history.append(self.chi2)
             return NO_DECREASE
         enough = self.chi2 - DescentPolicy.as_predicted * promised
@@ -270,7 +270,7 @@ USED_UP = "iterations used up"
 ALL_WORK_DONE = "the work allowed is done"
 
 
-def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
+def _solve_step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
     """Return the factor used (an earlier one where given), the step and its predicted decrease; not positive: no factor."""
     try:
         if factor is not None:
@@ -291,14 +291,14 @@ def cheaper_move(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools, 
 
     Where the step turns poses by much, and the first way of moving them costs more than enough, by whichever way costs less.
     """
-    straight = _linearized(moved(graph, unknowns, step))
+    straight = _trial_at(move_by_arcs(graph, unknowns, step))
     if straight[2] <= enough or not linked.any() or not turns_much(unknowns, step):
         return straight
-    along = _linearized(moved_along(graph, unknowns, step, linked))
+    along = _trial_at(move_by_links(graph, unknowns, step, linked))
     return along if along[2] < straight[2] else straight
 
 
-def _linearized(graph: Graph) -> _Trial:
+def _trial_at(graph: Graph) -> _Trial:
     linearized = linearize(graph)
     return graph, linearized, linearized_cost(graph, linearized)
 

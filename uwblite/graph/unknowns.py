@@ -24,7 +24,7 @@ class Unknowns:
         return np.append(vector, 0.0)[self.number[name]]
 
 
-def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
+def move_by_arcs(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
     """Return the graph moved by a step: poses along the arc of a constant twist, the rest straight.
 
     Long bent chains need about two iterations fewer than with plain addition, which it is to first order.
@@ -34,18 +34,18 @@ def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
     poses = np.empty_like(graph.poses)
     poses[:, :2] = graph.poses[:, :2] + arc[:, :2]
     poses[:, 2] = se2.wrap_angle(graph.poses[:, 2] + shift[:, 2])
-    return _moved_to(graph, unknowns, step, poses)
+    return _with_poses(graph, unknowns, step, poses)
 
 
-def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
+def move_by_links(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
     """Return the graph moved by a step, poses link by link: each relative pose changes by the step to first order,
-    and the chain is put together again from these. It keeps relative poses for any turn; `moved` keeps loops closed.
+    and the chain is put together again from these. It keeps relative poses for any turn; `move_by_arcs` keeps loops closed.
 
     Parameters
     ----------
     linked : (n - 1,) pose k + 1 is defined relative to pose k.
     """
-    shift, start = unknowns.spread("poses", step), moved(graph, unknowns, step).poses
+    shift, start = unknowns.spread("poses", step), move_by_arcs(graph, unknowns, step).poses
     link, change = se2.between(graph.poses[:-1], graph.poses[1:]), np.diff(shift, axis=0)
     turned = np.stack([link[:, 1], -link[:, 0]], axis=1) * shift[:-1, 2:]
     link[:, :2] += se2.rotate(-graph.poses[:-1, 2], change[:, :2]) + turned
@@ -54,16 +54,16 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -
     free[1:] = linked & np.all(unknowns.number["poses"][1:] >= 0, axis=1)
     first = np.maximum.accumulate(np.where(free, 0, np.arange(len(free))))
     poses = start.copy()
-    poses[:, 2] = start[first, 2] + _since(np.append(0.0, link[:, 2]), first)
+    poses[:, 2] = start[first, 2] + _sums_from(np.append(0.0, link[:, 2]), first)
     way = np.zeros_like(start[:, :2])
     way[1:] = se2.rotate(poses[:-1, 2], link[:, :2])
-    poses[:, :2] = start[first, :2] + _since(way, first)
+    poses[:, :2] = start[first, :2] + _sums_from(way, first)
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    return _moved_to(graph, unknowns, step, np.where(free[:, None], poses, start))
+    return _with_poses(graph, unknowns, step, np.where(free[:, None], poses, start))
 
 
 def turns_much(unknowns: Unknowns, step: Floats) -> bool:
-    """Return whether a step turns a pose so much that `moved` and `moved_along` differ."""
+    """Return whether a step turns a pose so much that `move_by_arcs` and `move_by_links` differ."""
     return bool(np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) >= _LARGE_TURN)
 
 
@@ -87,13 +87,13 @@ def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
     return linked
 
 
-def _since(values: Floats, first: Ints) -> Floats:
+def _sums_from(values: Floats, first: Ints) -> Floats:
     """Return sums of the values after row first[k] up to row k."""
     total = np.cumsum(values, axis=0)
     return total - total[first]
 
 
-def _moved_to(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> Graph:
+def _with_poses(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> Graph:
     calibration = graph.calibration.values + unknowns.spread("calibration", step)[:, 0]
     return graph.updated(poses, graph.anchors + unknowns.spread("anchors", step), calibration)
 

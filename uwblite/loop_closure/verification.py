@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import TINY, Floats
-from ..graph.gnc import tightened
+from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
@@ -131,7 +131,7 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     # The first scale contains every closure: one that ends a long drift would else be rejected before it has any weight.
     steps = int(np.ceil(np.log(max(worst / config.agrees, 1.0)) / np.log(_TIGHTER)))
     scales = [config.agrees * _TIGHTER**k for k in range(steps, -1, -1)]
-    solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
+    solved = optimize_tightening(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)

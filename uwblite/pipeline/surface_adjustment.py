@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
-from ..graph.eliminated import BlockEquations, entries, factor
+from ..graph.eliminated import BlockEquations, factor, sum_of_blocks
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
-from ..graph.unknowns import Unknowns, moved
+from ..graph.unknowns import Unknowns, move_by_arcs
 from ..graph.work import RAYS
 from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.columns import (
@@ -219,7 +219,7 @@ def _adjusted(graph: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Meas
         known = factor(normal, rays, order)
         (change, by_surface), order = known.step(normal, rays), known.order
         del known
-        graph = moved(graph, normal.unknowns, change)
+        graph = move_by_arcs(graph, normal.unknowns, change)
         found = replace(found, surfaces=found.surfaces.moved(by_surface))
         before, step = step, rms_length((graph.poses - poses)[:, :2])
         # Steps get smaller by the same factor each.
@@ -234,13 +234,13 @@ def _blocks(sums: RaySums, surfaces: Surfaces, graph: Graph, lidar: _Lidar, unkn
     of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
     number = np.column_stack([unknowns.number["poses"], np.tile(of_lidar, (len(graph.poses), 1))])
     by = np.concatenate([np.tile(np.eye(len(graph.poses.T)), (len(graph.poses), 1, 1)), lidar.by_lidar(graph.poses)], axis=1)
-    among = entries(number, number, by @ sums.poses @ by.transpose(0, 2, 1), (unknowns.size, unknowns.size))
+    among = sum_of_blocks(number, number, by @ sums.poses @ by.transpose(0, 2, 1), (unknowns.size, unknowns.size))
     slope = np.zeros(unknowns.size)
     np.add.at(slope, number[number >= 0], np.einsum("kab,kb->ka", by, sums.pose_slope)[number >= 0])
     prior = np.array(SurfacePolicy.prior)
     rows = len(prior) * sums.surface[:, None] + np.arange(len(prior))
     across = sums.across @ by[sums.keyframe].transpose(0, 2, 1)
-    across = entries(rows, number[sums.keyframe], across, (len(prior) * len(surfaces.facing), unknowns.size))
+    across = sum_of_blocks(rows, number[sums.keyframe], across, (len(prior) * len(surfaces.facing), unknowns.size))
     # Walls have no radius.
     across.eliminate_zeros()
     own, own_slope = sums.surfaces + np.diag(prior**-2.0), sums.surface_slope.copy()

@@ -17,7 +17,7 @@ import numpy as np
 from .. import se2
 from ..arrays import OUTLIER, TINY, Bools, Floats, Ints, runs_of, spread
 from ..config import setting
-from ..graph.gnc import tightened
+from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph, edge_cost
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
@@ -389,7 +389,7 @@ class Attempt:
     def _tightened(self, graph: Graph, scales: tuple[float, ...]) -> Graph:
         """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
         ranges = [k for k, e in enumerate(graph.edges) if isinstance(e, RangeEdges)]
-        return tightened(graph, ranges, scales, self.config.solver)
+        return optimize_tightening(graph, ranges, scales, self.config.solver)
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
