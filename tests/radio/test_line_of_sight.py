@@ -31,7 +31,7 @@ def crosses(tags, anchors, start, end):
 
 @pytest.mark.parametrize("at_once", [1 << 18, 50])
 def test_ways_through_a_wall_are_those_that_cut_it(monkeypatch, at_once):
-    monkeypatch.setattr(line_of_sight, "_SAMPLES_AT_ONCE", at_once)
+    monkeypatch.setattr(line_of_sight, "CHUNK", at_once)
     rng = np.random.default_rng(1)
     wall = np.array([-4.0, 0.3]), np.array([5.0, 1.1])
     tags = np.column_stack([rng.uniform(-8.0, 8.0, 400), rng.uniform(-8.0, -2.0, 400)])

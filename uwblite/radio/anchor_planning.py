@@ -15,22 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import TINY, Bools, Floats, Ints
 from ..errors import ConfigError
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from .line_of_sight import blocked
+from .line_of_sight import CELL, blocked
 
 SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
 """m; of a range in line of sight, and of one through walls, whose delay is not known."""
 _PRIOR = 3.0
 """m; standard deviation of the position without ranges: it bounds the error where no anchor is in reach."""
-_CELL = 0.2
-"""m; least size of the cells in which the map is evaluated."""
 _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
 """Cells at which the error is evaluated, and places offered to anchors: the time goes with their product."""
-_APART, _FROM_WALLS, _LEAST = 1.0, 0.5, 1e-3
-"""m between anchors; from walls: nearer to metal and corners, reflections disturb the antenna (docs/driving.md); least distance
-of a point."""
+_APART, _FROM_WALLS = 1.0, 0.5
+"""m between anchors; from walls: nearer to metal and corners, reflections disturb the antenna (docs/driving.md)."""
 _SWEEPS = 10
 """Most rounds of exchanges; two or three are usually enough."""
 
@@ -87,7 +84,7 @@ def position_errors(information: Floats) -> Floats:
 def _information(points: Floats, anchors: Floats, walls: Floats, reach: float) -> Floats:
     """Return the information of a range to each anchor at each point (a, m, 3): xx, xy, yy, 1/m^2; walls are points (w, 2)."""
     away = points[None] - anchors[:, None]
-    distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), _LEAST)
+    distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), TINY)
     behind = [blocked(points, np.broadcast_to(anchor, points.shape), walls, least=1) for anchor in anchors]
     sigma = np.where(np.reshape(behind, distance.shape), SIGMA_BEHIND_WALLS, SIGMA_LINE_OF_SIGHT)
     weight = sigma**-2.0 * (distance <= reach)
@@ -129,7 +126,7 @@ def _near(places: Floats, others: Floats) -> Bools:
 
 def _coarse(grid: OccupancyGrid) -> tuple[Bools, Bools, Floats, float]:
     """Return which coarse cells are blocked and which are free (rows, cols), the lower left corner and the edge, m."""
-    together = max(round(_CELL / grid.geometry.resolution), 1)
+    together = max(round(CELL / grid.geometry.resolution), 1)
     states = grid.states()
     rows, cols = (-(-n // together) * together for n in states.shape)
     padded = np.full((rows, cols), -1, dtype=states.dtype)

@@ -6,10 +6,10 @@ no residual distinguishes the delay from another place of the anchor; the map do
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import CHUNK, Bools, Floats, Ints, chunks
 
-_CELL = 0.2
-"""Side of a cell of the map, m; a wall is about as thick."""
+CELL = 0.2
+"""Least side of a cell of the map, m; a wall is about as thick."""
 _LEAST_POINTS = 3
 """Least number of points of clouds in a cell with a surface: people who pass cause fewer."""
 _NEAR_TAG, _NEAR_ANCHOR = 0.4, 1.0
@@ -17,8 +17,6 @@ _NEAR_TAG, _NEAR_ANCHOR = 0.4, 1.0
 not known better than this yet."""
 _MOST_CELLS = 100_000_000
 """A larger map (2 x 2 km) gets coarser cells; a bound on the memory."""
-_SAMPLES_AT_ONCE = 1 << 18
-"""Places looked up at once."""
 
 
 def blocked(tags: Floats, anchors: Floats, surfaces: Floats, least: int = _LEAST_POINTS) -> Bools:
@@ -41,7 +39,7 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats, least: int = _LEAST
     last = np.minimum(length - _NEAR_ANCHOR, first + diagonal)
     first = np.maximum(first, _NEAR_TAG)
     count = np.ceil(np.maximum(last - first, 0.0) / (0.5 * cell)).astype(np.intp)
-    for part in np.array_split(np.arange(len(tags)), 1 + int(count.sum()) // _SAMPLES_AT_ONCE):
+    for part in np.array_split(np.arange(len(tags)), 1 + int(count.sum()) // CHUNK):
         row = np.repeat(part, count[part])
         step = np.arange(len(row)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
         along = (first.take(row) + 0.5 * cell * step) / length.take(row)
@@ -53,11 +51,11 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats, least: int = _LEAST
 def _occupied(surfaces: Floats, least: int) -> tuple[Floats, float, Bools]:
     """Return the lower corner (2,) of the map, the side of its cells and which of them (x, y) hold a surface."""
     low, size = surfaces.min(axis=0), np.ptp(surfaces, axis=0)
-    cell = max(_CELL, float(np.sqrt(np.prod(size) / _MOST_CELLS)))
+    cell = max(CELL, float(np.sqrt(np.prod(size) / _MOST_CELLS)))
     # Points on a raster of as wide cells lie in their middles.
     low, shape = low - 0.5 * cell, tuple((size / cell + 0.5).astype(np.intp) + 1)
     number = np.empty(len(surfaces), dtype=np.intp)
-    for block in (slice(at, at + _SAMPLES_AT_ONCE) for at in range(0, len(surfaces), _SAMPLES_AT_ONCE)):
+    for block in chunks(len(surfaces)):
         number[block] = np.ravel_multi_index(tuple(_cells(surfaces[block].T, low, cell)), shape)
     hits = np.bincount(number, minlength=shape[0] * shape[1])
     return low, cell, (hits >= least).reshape(shape)

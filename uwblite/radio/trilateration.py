@@ -19,6 +19,7 @@ from .. import se2
 from ..arrays import MAD_TO_SIGMA, OUTLIER, TINY, Floats, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
+from .range_noise import RangeNoiseConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +38,8 @@ class TrilaterationConfig:
     """Plausible size of one anchor's constant error, m."""
     ambiguity: float = setting(0.2, advanced=True)
     """An anchor is ambiguous where a second hypothesis costs less than this more: of 100 ranges, a likelihood ratio of e^10."""
-    looked_at: ClassVar[int] = 200
     starts: ClassVar[int] = 10
-    """Cells of the raster, the best first, among which so many are chosen from which descent starts."""
+    """Cells of the raster, the best first, from which descent starts."""
     apart: ClassVar[float] = 1.5
     """Cells between two starts, and the width of the first kernel."""
     shrinking: ClassVar[float] = 0.7
@@ -146,7 +146,7 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     error /= config.shrinking * step
     cost = np.minimum(np.square(error, out=error), 1.0, out=error).mean(axis=1)
     cost += _OF_BIAS * (bias / (config.bias_sigma + step)) ** 2
-    likely = np.argsort(cost, kind="stable")[: config.looked_at]
+    likely = np.argsort(cost, kind="stable")
     best, free = list[int](), np.ones(len(likely), dtype=bool)
     while len(best) < config.starts and free.any():
         best.append(int(likely[np.argmax(free)]))
@@ -226,8 +226,8 @@ class PathPlacement(NamedTuple):
     """(3, 3) of the motion, of errors and prior."""
 
 
-_HEADINGS, _LOSS = 12, 2.5
-"""Starts of the heading, and standard deviations from which on an error counts less."""
+_HEADINGS = 12
+"""Starts of the heading."""
 
 
 def path_placements(
@@ -250,7 +250,7 @@ def path_placements(
         away = points - se2.rotate(np.full(len(tags), heading), tags)
         rows = roots[:, None] * np.column_stack([-2.0 * away, np.ones(len(away))])
         place = np.linalg.lstsq(rows, roots * (ranges**2 - np.sum(away**2, axis=1)), rcond=None)[0][:2]
-        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=_LOSS)
+        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=RangeNoiseConfig().kernel.scale)
         motion = np.append(done.x[:2], se2.wrap_angle(done.x[2]))
         found.append(PathPlacement(float(done.cost), motion, done.jac.T @ done.jac))
     return sorted(found, key=lambda each: each.cost)
