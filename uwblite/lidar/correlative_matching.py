@@ -5,8 +5,8 @@ number; the source becomes an image of its normals. For one heading the scores o
 
     score(T) = mean over source points of exp(-d^2 / 2 spread^2) cos(angle between normals),
 
-computed by FFT, or for few shifts one by one, as in Olson, Real-time correlative scan matching, ICRA 2009. A wall seen from
-its other side lowers the score. Every pose of the grid is scored; none is pruned.
+computed by FFT of its two components, or for few shifts one by one, as in Olson, Real-time correlative scan matching, ICRA
+2009. A wall seen from its other side lowers the score. Every pose of the grid is scored; none is pruned.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ Window = tuple[float, float, float]
 _CELLS_PER_REACH = 4
 _NEIGHBOURS = np.array([offset for offset in np.ndindex(3, 3, 3) if offset != (1, 1, 1)])
 """(26, 3) of a cell in the middle of three by three by three."""
-_TRANSFORM = 10
+_TRANSFORM = 6
 """Scores of single points that take as long as the transforms of one cell of an image."""
 
 
@@ -91,37 +91,47 @@ def score_grid(
         return scores, headings, shift_x, shift_y
     raster, reach = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution), np.array([tall, wide])
     field = surface_field(raster, config.spread).T
-    # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
-    shape = tuple(fft.next_fast_len(int(size)) for size in field.shape + 2 * reach)
+    parts = [np.ascontiguousarray(part) for part in (field.real, field.imag)]
+    turned = _turned(source, T_target_source[:2] - raster.origin[0], headings, config.resolution, -reach, field.shape + reach)
+    ends = np.array([end(cell, axis=1) for cell, _ in turned if cell.size for end in (np.min, np.max)], dtype=np.intp)
+    if not len(ends):
+        return scores, headings, shift_x, shift_y
+    # None may wrap around onto the field.
+    least = np.maximum(field.shape + np.maximum(reach - ends.min(axis=0), 0), ends.max(axis=0) + reach + 1)
+    shape = tuple(fft.next_fast_len(int(size), real=True) for size in least)
     one_by_one = len(source.points) * scores[0].size < _TRANSFORM * np.prod(shape)
-    normals = source.normals @ np.array([1.0, -1j])
     if one_by_one:
-        windows = sliding_window_view(np.pad(field, [(2 * side, 2 * side) for side in reach.tolist()]), scores[0].shape)
+        around = [(2 * side, 2 * side) for side in reach.tolist()]
+        windows = [sliding_window_view(np.pad(part, around), scores[0].shape) for part in parts]
     else:
-        spectrum = fft.fft2(field, shape)
-    for k, heading in enumerate(headings):
-        place = se2.transform([*T_target_source[:2], heading], source.points) - raster.origin[0]
-        cell = np.floor(place / config.resolution).astype(np.intp)[:, ::-1]
-        inside = np.all((cell >= -reach) & (cell < field.shape + reach), axis=1)
-        cell, turned = cell[inside], (normals[inside] * se2.unit_complex(-heading)).astype(np.complex64)
+        spectra = [fft.rfft2(part, shape) for part in parts]
+    for k, (cell, normals) in enumerate(turned):
         if one_by_one:
-            target.work[SCORES] += len(cell) * scores[k].size
-            scores[k] = np.tensordot(turned, windows[tuple((cell + reach).T)], axes=1).real
+            target.work[SCORES] += cell.shape[1] * scores[k].size
+            at = tuple(cell + reach[:, None])
+            for normal, shifted in zip(normals.T, windows, strict=True):
+                scores[k] += np.tensordot(normal, shifted[at], axes=1)
         else:
-            target.work[SCORES] += spectrum.size
-            product = np.conj(fft.fft2(_image(cell % shape, turned.conj(), shape))) * spectrum
-            scores[k] = fft.ifft(fft.ifft(product, axis=0)[shift_y], axis=1)[:, shift_x].real
+            target.work[SCORES] += int(np.prod(shape))
+            number = np.ravel_multi_index(tuple(cell), shape, mode="wrap")
+            images = (np.bincount(number, normal, np.prod(shape)).reshape(shape) for normal in normals.T)
+            x, y = (np.conj(fft.rfft2(image.astype(np.float32))) * of for image, of in zip(images, spectra, strict=True))
+            scores[k] = fft.irfft(fft.ifft(x + y, axis=0)[shift_y], shape[1], axis=1)[:, shift_x]
     scores /= len(source.points)
     return scores, headings, shift_x, shift_y
 
 
-def _image(cell: Ints, values: NDArray[np.complex64], shape: tuple[int, ...]) -> NDArray[np.complex64]:
-    """Return the sums of values (n,) in their cells (n, 2) of an image of a shape."""
-    number, image = np.ravel_multi_index(tuple(cell.T), shape), np.empty(shape, np.complex64)
-    image.real, image.imag = (
-        np.bincount(number, part, image.size).reshape(shape) for part in (values.real, values.imag)
-    )
-    return image
+def _turned(
+    source: Clouds, place: Floats, headings: Floats, cell: float, low: Ints, high: Ints
+) -> list[tuple[Ints, Singles]]:
+    """Return for each heading (h,) the cells (2, n), y and x, of the points that lie from low (2,) to below high (2,), and
+    their normals (n, 2), the source's frame being at a place (2,), m."""
+    found = []
+    for heading in headings:
+        x, y = np.floor(se2.transform([*place, heading], source.points).T / cell).astype(np.intp)
+        own = np.flatnonzero((y >= low[0]) & (y < high[0]) & (x >= low[1]) & (x < high[1]))
+        found.append((np.stack([y[own], x[own]]), se2.rotate(heading, source.normals[own]).astype(np.float32)))
+    return found
 
 
 def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
