@@ -131,8 +131,8 @@ class ObjectLikelihood:
         (nx, ny), (rx, ry) = found.normal, found.arm
         if covariance is not None:
             # What the prior leaves open shifts a surface without making it a thing that moves.
-            jacobian = np.stack([nx, ny, ny * rx - nx * ry])
-            variance += np.einsum("aen,eab,ben->en", jacobian, covariance, jacobian, optimize=True)
+            jacobian = np.stack([nx, ny, ny * rx - nx * ry], axis=1)
+            variance += np.einsum("ean,ean->en", jacobian, covariance @ jacobian)
         squared = np.square(found.distance) / variance
         cost = np.where(found.good, squared / (1.0 + squared / c.outlier), 0.0)
         through, in_view = in_free_space(self.free, i, rx + pose[:, :1], ry + pose[:, 1:2])

@@ -238,15 +238,17 @@ def with_neighbours(objects: ObjectLikelihood, pairs: CloudPairs, found: Placeme
 
 def search(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets, wherever the prior allows."""
-    placed = [descend(objects, pairs, start, prior) for start in _starts(objects, pairs, prior)]
-    best = np.argmax([each.evidence(prior) for each in placed], axis=0)
-    return concatenated(placed).rows(best * len(pairs) + np.arange(len(pairs)))
+    row, start = _starts(objects, pairs, prior)
+    placed = descend(objects, pairs.rows(row), start, prior.rows(row))
+    order = np.lexsort((-placed.evidence(prior.rows(row)), row))
+    return placed.rows(order[np.searchsorted(row, np.arange(len(pairs)))])
 
 
-def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> list[Floats]:
-    """Return poses (e, 3) from which matching may begin: exhaustive search of two standard deviations within view."""
+def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> tuple[Ints, Floats]:
+    """Return poses (s, 3) from which matching may begin, and whose they are (s,), in the order of the pairs: those of an
+    exhaustive search of two standard deviations within view, and the prior's mean where these are few."""
     config, within = CorrelativeConfig(), 2.0 * np.sqrt(np.einsum("eii->ei", prior.covariance))
-    starts = np.tile(prior.mean, (config.candidates, 1, 1))
+    starts = []
     for row, (mean, reach) in enumerate(zip(prior.mean, within, strict=True)):
         target, source = (objects.clouds.chosen(which[row : row + 1]) for which in (pairs.i, pairs.j))
         view = sum(float(np.hypot(*cloud.points.T).max(initial=0.0)) for cloud in (target, source))
@@ -254,8 +256,9 @@ def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> li
         middle, (wide, tall) = np.append(0.5 * (low + high), mean[2]), 0.5 * (high - low)
         window = float(wide), float(tall), min(float(reach[2]), np.pi)
         found = correlative_matching.search(target, source, middle, window, config).poses
-        starts[: len(found), row] = found
-    return list(starts)
+        starts.append(np.concatenate([found, mean[None]])[: config.candidates])
+    counts = np.array([len(each) for each in starts], dtype=np.intp)
+    return np.repeat(np.arange(len(pairs)), counts), np.concatenate([np.zeros((0, *se2.POSE)), *starts])
 
 
 def _most_odds(placed: Placed, prior: Prior) -> Floats:
@@ -280,6 +283,8 @@ def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: 
         pose[left] += step
         if gate <= c.gate and temper < RegistrationConfig.cold:
             left = left[np.abs(step).max(axis=1) >= c.converged]
+        if not len(left):
+            break
         gate, temper = max(gate * c.shrink, c.gate), temper * RegistrationConfig.cooling
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
     factors, likelihood, most = objects.match(pairs, pose, c.gate)
