@@ -44,21 +44,35 @@ def test_clouds_are_made_and_the_laser_is_free_from_then_on(keys, fixed):
     assert made.graph.fixed_calibration.tolist() == fixed
 
 
-def test_scans_between_keyframes_show_where_the_robot_was_when_stamps_of_the_odometry_jitter():
-    """The odometry's stamps are off by 50 ms; the poses at keyframes are right."""
+def scans_placed_between(jitter, rate, *, speed=0.8):
+    """Return stamps and true poses of a drive, its recording before and after scans between keyframes were placed, and the
+    graph; the odometry's stamps are off by a jitter, s, the poses at keyframes are right."""
     rng = np.random.default_rng(2)
-    stamps, truth = wander(rng, 20.0, speed=0.8, half_width=4.0)
-    off = np.clip(stamps + 0.05 * rng.standard_normal(len(stamps)), stamps[0], stamps[-1])
+    stamps, truth = wander(rng, 20.0, speed=speed, half_width=4.0)
+    off = np.clip(stamps + jitter * rng.standard_normal(len(stamps)), stamps[0], stamps[-1])
     wheels = odometry(stamps, se2.interpolate_trajectory(stamps, truth, off))
-    log = recording(wheels, None, scans(stamps, truth, HALL, rate=5.0, range_max=8.0))
+    log = recording(wheels, None, scans(stamps, truth, HALL, rate=rate, range_max=8.0))
     config = MappingConfig(keyframes=KeyframeConfig(scans=1))
     task = task_of(gather([log], config.keyframes), config)
     (one,) = task.recordings.each
     reckoned = radio_stages.dead_reckoning(one, config)
     graph = replace(reckoned.graph, poses=se2.interpolate_trajectory(stamps, truth, one.frames.stamps))
     estimate = replace(reckoned, graph=graph, scans=keyframe_data.make(task.recordings, config, 0.0, Work()), joint=NO_PAIRS)
-    placed = lidar_stages.place_scans_between(estimate, task)
-    (after,) = placed.recordings.each
+    (after,) = lidar_stages.place_scans_between(estimate, task).recordings.each
+    return stamps, truth, one, after, graph
+
+
+@pytest.mark.parametrize(("jitter", "most"), [(0.0, 2), (0.05, np.inf)])
+def test_scans_beyond_two_of_a_step_are_placed_only_where_these_contradict_the_odometry(jitter, most):
+    _, _, one, after, _ = scans_placed_between(jitter, 20.0, speed=0.4)
+    within = np.diff(np.flatnonzero(np.isin(after.between.frames.stamps, one.frames.stamps))) - 1
+    assert 2 <= within.max() <= most
+    assert (within.max() > 2) == (most > 2)
+
+
+def test_scans_between_keyframes_show_where_the_robot_was_when_stamps_of_the_odometry_jitter():
+    stamps, truth, one, after, graph = scans_placed_between(0.05, 5.0)
+    log = one.log
     inside = log.scans.middles[(log.scans.middles > one.frames.stamps[0]) & (log.scans.middles < one.frames.stamps[-1])]
     right = se2.interpolate_trajectory(stamps, truth, inside)
     turned = [

@@ -36,6 +36,8 @@ _COME_AND_GONE = 2.0
 """Ratio to the share within one visit that people explain: those of either visit are not there on the other one."""
 _AT_ONCE = 1024
 """Single scans whose clouds are in memory at once."""
+_PLACED_FIRST = 2
+"""Scans between two keyframes that are placed first; where the odometry agrees with them as well as they measure, no others."""
 _ENOUGH_VISITS = 5
 """Least number of keyframes of either visit for which their free-space violation counts."""
 
@@ -135,7 +137,7 @@ def place_scans_between(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) -> Recording:
-    """Place the scans between a recording's keyframes, so many at once that their clouds take little memory."""
+    """Place scans between a recording's keyframes, those that are not placed first only where these show more than odometry."""
     assert recording.log.scans is not None
     own, stamps = recording.frames.stamps, recording.log.scans.middles + estimate.lidar.delay
     stamps = stamps[(stamps > own[0]) & (stamps < own[-1])]
@@ -147,14 +149,35 @@ def _with_scans_between(recording: Recording, estimate: Estimate, task: Task) ->
     stamps, step = stamps[further], step[further]
     # The nearer keyframe's cloud may hold the scan itself.
     side = recording.first + step + (before <= after)[further]
-    parts = [(stamps[some], step[some], side[some]) for some in chunks(len(step), _AT_ONCE)]
-    placed = [_seen_from(recording, estimate, task, part) for part in parts]
-    good, seen = (np.concatenate(of) for of in zip(*placed, strict=True))
-    return recording.with_poses_between(stamps[good], (side - recording.first)[good], seen[good])
+
+    def placed(rows: Ints) -> list[Floats]:
+        """Place some scans, so many at once that their clouds take little memory."""
+        parts = (rows[some] for some in chunks(len(rows), _AT_ONCE))
+        each = [_seen_from(recording, estimate, task, (stamps[some], step[some], side[some])) for some in parts]
+        return [np.concatenate(of) for of in zip(*each, strict=True)]
+
+    first = _evenly(step, _PLACED_FIRST)
+    rows, rest = np.flatnonzero(first), np.flatnonzero(~first)
+    good, seen, squared = placed(rows)
+    if len(rest) and good.any() and np.median(squared[good]) > TrackingConfig.median:
+        rows = np.concatenate([rows, rest])
+        good, seen = (np.concatenate(of) for of in zip((good, seen), placed(rest)[:2], strict=True))
+    return recording.with_poses_between(stamps[rows][good], (side - recording.first)[rows][good], seen[good])
 
 
-def _seen_from(recording: Recording, estimate: Estimate, task: Task, of: tuple[Floats, Ints, Ints]) -> tuple[Bools, Floats]:
-    """Return which scans (m,) match the cloud of a keyframe, and where the base was, seen from it (m, 3).
+def _evenly(step: Ints, most: int) -> Bools:
+    """Return which of ascending numbers of steps (m,) are chosen: of each number at most so many, evenly spread."""
+    first, end = (np.searchsorted(step, step, side) for side in ("left", "right"))
+    rank = np.arange(len(step)) - first
+    before, after = ((rank + k) * (most + 1) // (end - first + 1) for k in (0, 1))
+    return np.asarray(after > before)
+
+
+def _seen_from(
+    recording: Recording, estimate: Estimate, task: Task, of: tuple[Floats, Ints, Ints]
+) -> tuple[Bools, Floats, Floats]:
+    """Return which scans (m,) match the cloud of a keyframe, where the base was, seen from it (m, 3), and the squared
+    Mahalanobis distance (m,) of the odometry's pose from the match, by the variance of the match alone.
 
     Parameters
     ----------
@@ -179,7 +202,8 @@ def _seen_from(recording: Recording, estimate: Estimate, task: Task, of: tuple[F
     prior = np.linalg.inv(np.swapaxes(turn, 1, 2) @ covariance_of(estimate.odometry, graph)[of_step] @ turn)
     off = np.linalg.solve(np.swapaxes(root, 1, 2) @ root + prior, prior @ se2.between(z, guess)[..., None])[..., 0]
     seen = se2.compose(se2.compose(se2.compose(mounting, z), off), se2.inverse(mounting))
-    return (aligned.share >= PairPolicy.good_share) & (aligned.factors.asked >= PairPolicy.fewest), seen
+    squared = np.sum(np.einsum("eij,ej->ei", root, se2.between(z, guess)) ** 2, axis=1)
+    return (aligned.share >= PairPolicy.good_share) & (aligned.factors.asked >= PairPolicy.fewest), seen, squared
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
