@@ -52,6 +52,9 @@ class RangePolicy:
     """m from the line up to which a trajectory may have changed sides."""
     ends: ClassVar[int] = 3
     """Poses at either end of a trajectory within which no change of sides is tried."""
+    pace: ClassVar[float] = 0.01
+    """Share of the evidence that refutes by which a step has to make other places likelier: at a lower pace none of them
+    becomes likely in a hundred steps."""
     straight: ClassVar[float] = 1.0
     """m across a path, rms, beyond which no odometry lets it bend into its mirror image."""
     bends: ClassVar[float] = 0.05
@@ -200,9 +203,11 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     (mirrored, straight), second, best = _images(estimate, ranges), _second_places(estimate), estimate.graph
     present = _minimum(best, ranges, free, best.anchors, config)
+    pace = RangePolicy.pace * EvidencePolicy.very_strong / (EvidencePolicy.very_strong - log_density(present))
+    slow = replace(config, relative_decrease=max(config.relative_decrease, pace))
     log_odds, others = np.full(len(free), -np.inf), present.anchors.copy()
     for start in (mirrored, second):
-        image = _minimum(best, ranges, free, start, config)
+        image = _minimum(best, ranges, free, start, slow)
         odds = 0.5 * (_costs(present, ranges) - _costs(image, ranges))
         likelier = _elsewhere(image.anchors, present.anchors) & (odds > log_odds)
         log_odds, others = np.where(likelier, odds, log_odds), np.where(likelier[:, None], image.anchors, others)
