@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from ..errors import SINGULAR, SolverError
 
 
@@ -127,8 +127,7 @@ class TwoLevelFactor:
         columns.eliminate_zeros()
         self._matrix = columns.T
         coarse, by_column = np.empty((pieces.basis.shape[1],) * 2, order="F"), pieces.basis.tocsc()
-        for first in range(0, len(coarse), SchwarzPolicy.columns_at_once):
-            part = slice(first, first + SchwarzPolicy.columns_at_once)
+        for part in chunks(len(coarse), SchwarzPolicy.columns_at_once):
             coarse[:, part] = (self._onto @ (columns @ by_column[:, part])).toarray()
         self._coarse, failed = lapack.dpotrf(coarse, lower=1, overwrite_a=1)
         if failed:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from ..config import documented
 from ..errors import ConfigError
 
@@ -66,9 +66,8 @@ class GridGeometry:
         return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
 
     def strips(self) -> Iterator[slice]:
-        """Yield the rows in strips, for computations that take many bytes per cell."""
-        for start in range(0, self.rows, _STRIP):
-            yield slice(start, min(start + _STRIP, self.rows))
+        """Return the rows in strips, for computations that take many bytes per cell."""
+        return chunks(self.rows, _STRIP)
 
     def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":
         """Return the part of the grid whose first cell is (row, col)."""

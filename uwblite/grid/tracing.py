@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from ..errors import DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
@@ -212,9 +212,8 @@ class _Task:
         return self.sweeps.first[self.chosen, :2]
 
     def parts(self) -> Iterator[Ints]:
-        """Yield a bounded number of scans at a time."""
-        for start in range(0, len(self.chosen), _AT_ONCE):
-            yield self.chosen[start : start + _AT_ONCE]
+        """Return a bounded number of scans at a time."""
+        return (self.chosen[part] for part in chunks(len(self.chosen), _AT_ONCE))
 
     def reach(self, some: Ints, empty: bool) -> NDArray[np.float32]:
         """Return the length of the beams of some scans, m, with a reading or without; 0 = others."""

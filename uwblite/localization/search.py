@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from ..grid.occupancy_grid import FREE
 from .hypotheses import MATCHES, SAME, apart, refined
 from .range_model import PER_RANGE, Ranges, range_likelihood
@@ -118,8 +118,7 @@ _UNDECIDED = Places(np.zeros((0, *se2.POSE)), False)
 
 def units(count: int, each: int) -> Iterator[slice]:
     """Yield parts of so many items, of a unit of work at most, where an item takes so many operations."""
-    step = max(1, UNIT // max(each, 1))
-    return (slice(start, start + step) for start in range(0, count, step))
+    return chunks(count, max(1, UNIT // max(each, 1)))
 
 
 def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from typing import TypeVar
 
-from ..arrays import Ints, renumbered
+from ..arrays import Ints, chunks, renumbered
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -18,8 +18,7 @@ _AT_ONCE = 32
 
 def batches(target: Ints, source: Ints) -> Iterator[tuple[slice, Ints, Ints, Ints]]:
     """Yield the rows of some pairs at a time, the sub-maps of these, and their numbers among them of targets and sources."""
-    for first in range(0, len(target), _AT_ONCE):
-        rows = slice(first, first + _AT_ONCE)
+    for rows in chunks(len(target), _AT_ONCE):
         yield rows, *renumbered(target[rows], source[rows])
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import TINY, Bools, Floats, Ints
+from ..arrays import TINY, Bools, Floats, Ints, chunks
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -181,8 +181,7 @@ def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[
     cut = (2 * reach) ** 2
     half = np.empty(obstacles.shape, dtype=np.uint16 if 2 * cut <= np.iinfo(np.uint16).max else np.uint32)
     tight = []
-    for first in range(0, geometry.rows, STRIP):
-        rows = slice(first, min(first + STRIP, geometry.rows))
+    for rows in chunks(geometry.rows, STRIP):
         count = rows.stop - rows.start
         centres, edges = (squares.astype(half.dtype) for squares in _along_rows(_rows(obstacles, rows, reach), cut))
         stands = np.zeros((count + 1, geometry.cols + 1), dtype=np.bool_)
@@ -195,7 +194,7 @@ def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[
             across = (beside[0] == beside[3]) & (beside[1] == beside[2]) & (beside[0] != beside[1]) if right and up else none
             may &= none | across
             row, col = np.nonzero(may)
-            tight.append(geometry.centre_of(row + first, col) + 0.5 * geometry.resolution * np.array([right, up]))
+            tight.append(geometry.centre_of(row + rows.start, col) + 0.5 * geometry.resolution * np.array([right, up]))
     return half, np.concatenate(tight)
 
 
@@ -240,7 +239,7 @@ def _specks(dark: Bools, resolution: float) -> Bools:
         return dark
     labels, count = ndimage.label(dark)
     sizes = np.zeros(count + 1, dtype=np.intp)
-    for first in range(0, len(dark), STRIP):
-        sizes += np.bincount(labels[first : first + STRIP].ravel(), minlength=count + 1)
+    for rows in chunks(len(dark), STRIP):
+        sizes += np.bincount(labels[rows].ravel(), minlength=count + 1)
     sizes[0] = 0
     return np.asarray((sizes * resolution**2 < _SPECK)[labels] & dark)

@@ -25,7 +25,9 @@ _PLACES_PER_OCTAVE = 8
 _SIEVES = 4
 """How often a shortcut is halved, at whose parts' ends it is looked up first: most of the long ones lead through obstacles."""
 _GAIN = 1e-3
-"""Relative; a round that gains less is the last. A corner is worth as many m: of equal lines the one with fewest is taken."""
+"""Relative; a round that gains less is the last."""
+_CORNER = _GAIN
+"""m; a corner costs so much that of equal lines the one with fewest is taken."""
 _MOST_ROUNDS = 6
 
 
@@ -121,7 +123,7 @@ def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
     costs[across] = along.costs
     kept = piece[begin] == piece[end - 1]
     kept[across] = along.clear
-    graph = csr_matrix((costs[kept] + _GAIN, (begin[kept], end[kept])), shape=(len(places), len(places)))
+    graph = csr_matrix((costs[kept] + _CORNER, (begin[kept], end[kept])), shape=(len(places), len(places)))
     totals, before = dijkstra(graph, indices=0, return_predecessors=True)
     return places[walk_back(before, 0, len(places) - 1)], float(totals[-1])
 

@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, chunks
 from .clearance import AT_ONCE, STRIP, ClearanceMap
 from .smoothing import along_lines, walk_back
 
@@ -28,9 +28,10 @@ STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 _NEAR_TIGHT = 1.3
 """Cells from a tight place to the nodes that it is joined to: the centre of the next cell but half a cell."""
 BLOCK = 16
-"""Cells along the edge of a block; STRIP is a multiple of it. A straight way through open space over as many blocks needs no
-search: its ends lie half a block beside the cheapest path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is
-smoothed."""
+"""Cells along the edge of a block; STRIP is a multiple of it."""
+_LEG = BLOCK
+"""Regions of a chain over which a straight way through open space needs no search: its ends lie half a block beside the
+cheapest path, which makes it up to (0.5 / 8)^2 / 2 = 0.2 % dearer before it is smoothed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +88,7 @@ class StepSearch:
         if not np.isfinite(costs[end]):
             return None
         chain = walk_back(before, start, end)
-        stops = np.append(np.arange(0, max(len(chain) - 1, 1), BLOCK), len(chain) - 1)
+        stops = np.append(np.arange(0, max(len(chain) - 1, 1), _LEG), len(chain) - 1)
         nodes = np.array([first, *(self._roomiest(int(chain[k])) for k in stops[1:-1]), last])
         places = self.places(nodes)
         open_ = along_lines(self.clearance, places[:-1], places[1:]).open
@@ -106,9 +107,9 @@ class StepSearch:
             return
         reached = np.isfinite(dijkstra(self.regions.graph, indices=self._region(np.array([first]))[0]))
         count, grid = len(reached) - len(self.clearance.tight), self.clearance.geometry
-        for start in range(0, grid.rows, STRIP):
-            label = self.regions.label[start : start + STRIP].ravel()
-            yield np.flatnonzero(np.append(False, reached[:count])[label]) + start * grid.cols
+        for rows in chunks(grid.rows, STRIP):
+            label = self.regions.label[rows].ravel()
+            yield np.flatnonzero(np.append(False, reached[:count])[label]) + rows.start * grid.cols
         yield np.flatnonzero(reached[count:]) + grid.cells
 
     def nearest(self, first: int, place: Floats, allowed: Bools | None = None) -> int:
@@ -258,15 +259,14 @@ def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
     row, col = (n.ravel().astype(np.float64) for n in np.indices((STRIP, grid.cols)))
     sums: list[Floats] = []
     pairs: list[tuple[Ints, Ints]] = []
-    for start in range(0, grid.rows, STRIP):
-        rows = slice(start, min(start + STRIP, grid.rows))
+    for rows in chunks(grid.rows, STRIP):
         part, more = _parted(clearance.passable(rows))
         inner = part.ravel().astype(np.intp)
-        values = (None, col[: len(inner)], row[: len(inner)] + start, clearance.cell_cost(rows).ravel())
+        values = (None, col[: len(inner)], row[: len(inner)] + rows.start, clearance.cell_cost(rows).ravel())
         sums.append(np.stack([np.bincount(inner, v, more + 1)[1:] for v in values]))
         label[rows] = np.where(part > 0, part + count, 0)
         count += more
-        above = np.arange(max(start, BLOCK), rows.stop, BLOCK)
+        above = np.arange(max(rows.start, BLOCK), rows.stop, BLOCK)
         pairs += (
             _touching(label[above - 1], label[above]),
             _touching(label[rows].T[BLOCK - 1 : -1 : BLOCK], label[rows].T[BLOCK::BLOCK]),

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Ints
+from ..arrays import Bools, Ints, chunks
 from ..graph.graph import Edges, PriorEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..graph.range_edges import RangeEdges
@@ -96,8 +96,7 @@ def rays_of(
     owner, chosen = choose_scans(log.scans, frames, config.keyframes)
     if wanted is not None:
         owner, chosen = owner[wanted[owner]], chosen[wanted[owner]]
-    for first in range(0, len(frames), _AT_ONCE):
-        some = slice(first, min(first + _AT_ONCE, len(frames)))
+    for some in chunks(len(frames), _AT_ONCE):
         if wanted is None or wanted[some].any():
             own = (owner >= some.start) & (owner < some.stop)
             yield some, scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, OUTLIER, TINY, Floats, row_medians
+from ..arrays import MAD_TO_SIGMA, OUTLIER, TINY, Floats, chunks, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
 from .range_noise import RangeNoiseConfig
@@ -97,8 +97,7 @@ def trilaterate_each(
         if len(ranges) >= config.min_ranges:
             of_size.setdefault(min(len(ranges), config.samples), []).append(k)
     for own in of_size.values():
-        for first in range(0, len(own), _AT_ONCE):
-            some = own[first : first + _AT_ONCE]
+        for some in (own[part] for part in chunks(len(own), _AT_ONCE)):
             for k, hypotheses in zip(some, _of_one_size([stretches[k] for k in some], config, drift), strict=True):
                 found[k] = hypotheses
     return found
