@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from uwblite.server.rounds import AT_REST, FIRST_AFTER, LEAST_NEWS, SHARE, Round, expected_cost, next_thinning
+from uwblite.server.rounds import FIRST_AFTER, LEAST_PAUSE, PATIENCE, SHARE, Round, expected_cost, next_thinning
 
 
 def simulated(cost_of, seconds, step=1.0, rest=0.0):
@@ -45,23 +45,23 @@ def test_costs_far_from_the_law_are_learnt():
 def test_nothing_new_is_no_reason_and_too_little_neither():
     last = Round(ended=100.0, cost=1.0, recorded=90.0, every_nth_scan=8)
     assert next_thinning(last, 90.0, 500.0) is None
-    assert next_thinning(last, 90.0 + 0.9 * LEAST_NEWS, 500.0) is None
-    assert next_thinning(last, 96.0, 500.0) == 1
+    assert next_thinning(last, 90.0 + 0.9 * LEAST_PAUSE, 500.0) is None
+    assert next_thinning(last, 90.0 + LEAST_PAUSE, 500.0) == 1
     assert next_thinning(None, 0.9 * FIRST_AFTER, 1e9) is None
 
 
 def test_a_round_that_failed_is_tried_again_but_not_at_once():
     last = Round(ended=100.0, cost=0.1, recorded=90.0, every_nth_scan=8, failed=True)
-    assert next_thinning(last, 500.0, 120.0) is None
-    assert next_thinning(last, 500.0, 131.0) is not None
+    assert next_thinning(last, 500.0, 100.0 + 0.9 * LEAST_PAUSE) is None
+    assert next_thinning(last, 500.0, 100.0 + LEAST_PAUSE) is not None
 
 
 def test_a_recording_at_rest_is_mapped_from_all_scans_once():
     rounds = simulated(lambda t, n: 40.0 / n**0.5, 600.0, rest=500.0)
     assert rounds[-1][2] == 1
     assert rounds[-1][1] == 600.0
-    assert rounds[-1][0] >= 600.0 + AT_REST
-    assert sum(r[0] >= 600.0 + AT_REST for r in rounds) == 1
+    assert rounds[-1][0] >= 600.0 + PATIENCE
+    assert sum(r[0] >= 600.0 + PATIENCE for r in rounds) == 1
 
 
 def test_expected_cost_grows_with_the_recording_and_falls_with_thinning():

@@ -14,19 +14,14 @@ from dataclasses import dataclass
 SHARE = 0.1
 """Of the time that may go into rounds."""
 PATIENCE = 60.0
-"""s that a person waits for a new map; beyond, scans are left out rather than waited for."""
+"""s that a person waits for a new map: beyond, scans are left out rather than waited for; and a recording that has not grown
+for so long counts as finished, and is mapped from all scans."""
 LEAST_PAUSE = 10.0
-"""s between rounds."""
-LEAST_NEWS = 5.0
-"""s of recording that must be new."""
+"""s between rounds, and s of recording that must be new."""
 FIRST_AFTER = 20.0
 """s of recording before the first round: less shows no map."""
-AT_REST = 60.0
-"""s without growth after which the recording counts as finished, and is mapped from all scans."""
-_AFTER_FAILURE = 30.0
-"""s."""
-_THINNINGS = (1, 8, 16, 32)
-_SAME_KEYFRAMES, _EXPONENT = 8.0, 0.4
+_SAME_KEYFRAMES, _EXPONENT = 8, 0.4
+_THINNINGS = (1, _SAME_KEYFRAMES, 2 * _SAME_KEYFRAMES, 4 * _SAME_KEYFRAMES)
 _ALWAYS = 200.0
 """s of recording that cost as much as what any round takes."""
 
@@ -56,12 +51,12 @@ def next_thinning(last: Round | None, recorded: float, now: float, at_rest: floa
     if last is None:
         return 1 if recorded >= FIRST_AFTER else None
     since = now - last.ended
-    if since < (_AFTER_FAILURE if last.failed else LEAST_PAUSE):
+    if since < LEAST_PAUSE:
         return None
-    if at_rest >= AT_REST:
+    if at_rest >= PATIENCE:
         best = last.every_nth_scan == 1 and last.recorded >= recorded
         return None if best or last.failed else 1
-    if recorded - last.recorded < LEAST_NEWS and not last.failed:
+    if recorded - last.recorded < LEAST_PAUSE and not last.failed:
         return None
     costs = [(n, expected_cost(last, recorded, n)) for n in _THINNINGS]
     n, cost = next(((n, c) for n, c in costs if c <= SHARE * PATIENCE), costs[-1])
