@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-from ..report.printable import duration, encodable, printable
+from ..report.printable import duration, json_ready, printable
 from .options import name_options
 
 _LOGGER = logging.getLogger("uwblite")
@@ -224,15 +224,5 @@ def say_json(value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it: arrays as lists, numbers that are not finite as None."""
-    if isinstance(value, dict):
-        return {encodable(str(k)): plain(v) for k, v in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, str):
-        return encodable(name_options(value))
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    return value
+    """Return a value as JSON has it, with options in its texts in place of the settings that these name."""
+    return json_ready(value, text=name_options)

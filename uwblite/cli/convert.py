@@ -134,11 +134,9 @@ def _write_trajectory(args: argparse.Namespace, to: str, trajectory: tuple[Any, 
 
 def _say(args: argparse.Namespace, counts: dict[str, int], *, note: str = "", warnings: Sequence[str] = ()) -> int:
     """Say what was written, as text or as one JSON object."""
-    if args.json:
-        console.say_json({"out": args.target, "counts": counts, "note": note, "warnings": list(warnings), "exit_code": 0})
-    else:
-        made = ", ".join(f"{count} {name}" for name, count in counts.items())
-        console.say(f"{args.target}: {made}{f'; {note}' if note else ''}")
+    figures = {"out": args.target, "counts": counts, "note": note, "warnings": list(warnings), "exit_code": 0}
+    made = ", ".join(f"{count} {name}" for name, count in counts.items())
+    console.report(args.json, figures, [f"{args.target}: {made}{f'; {note}' if note else ''}"])
     return 0
 
 

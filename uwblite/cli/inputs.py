@@ -8,11 +8,13 @@ import numpy as np
 
 from ..config import merge, override, parse_toml
 from ..errors import ConfigError, UsageError
+from ..grid.occupancy_grid import OccupancyGrid
 from ..io.bag_topics import BagTopics
 from ..io.folders import refuse_foreign_picture
 from ..io.formats import read_recording, refuse_existing
 from ..io.log_parts import each_once
 from ..io.source import read_settings
+from ..io.stored_result import StoredAnchor, read_space
 from ..io.uwb_mapping import UwbMapping, parse_mappings
 from ..sensor_log import SensorLog, SensorMounting
 from . import console
@@ -21,12 +23,15 @@ if TYPE_CHECKING:
     from ..pipeline.mapping_config import MappingConfig
 
 
-def table_and_picture(args: argparse.Namespace, head: str) -> tuple[str, str]:
-    """Return the names of a plan's table, which begins so, and picture, which may be written."""
+def begin_plan(args: argparse.Namespace, head: str) -> tuple[str, str, OccupancyGrid, tuple[StoredAnchor, ...]]:
+    """Return the names of a plan's table, which begins so, and of its picture, which may be written, and the map it is for."""
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, head)
-    return table, picture
+    warnings = list[str]()
+    grid, anchors = read_space(args.map, warnings)
+    console.note_of(args.map, warnings)
+    return table, picture, grid, anchors
 
 
 def name_recordings_once(args: argparse.Namespace) -> None:

@@ -47,10 +47,7 @@ def run(args: argparse.Namespace) -> int:
     picture = draw_map(drawn, caption=os.path.basename(args.log)) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, localization, picture, json_lines(about | summary))
-    if args.json:
-        console.say_json(summary)
-    else:
-        _say(localization, list(files.values()))
+    console.report(args.json, summary, _lines(localization, list(files.values())))
     return 3 if localization.doubts else 0
 
 
@@ -110,17 +107,15 @@ def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
     }
 
 
-def _say(localization: Localization, files: list[str]) -> None:
+def _lines(localization: Localization, files: list[str]) -> list[str]:
     start = localization.trajectory[0]
     sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in localization.covariances)[len(localization.covariances) // 2]
-    console.say(f"{len(localization.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
-    console.say(f"{100 * localization.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m")
-    if localization.overlap == localization.overlap:
-        console.say(f"{100 * localization.overlap:.0f} % of the lidar's points in known space lie on walls of the map")
-    else:
-        console.say("no walls to compare: the position rests on the anchors")
-    for text in localization.warnings:
-        console.say(f"warning: {text}")
-    for text in localization.doubts:
-        console.say(f"DOUBT: {text}")
-    console.say("files: " + " ".join(files))
+    walls = f"{100 * localization.overlap:.0f} % of the lidar's points in known space lie on walls of the map"
+    return [
+        f"{len(localization.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m",
+        f"{100 * localization.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m",
+        walls if localization.overlap == localization.overlap else "no walls to compare: the position rests on the anchors",
+        *(f"warning: {text}" for text in localization.warnings),
+        *(f"DOUBT: {text}" for text in localization.doubts),
+        "files: " + " ".join(files),
+    ]

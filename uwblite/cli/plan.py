@@ -7,12 +7,11 @@ import numpy as np
 
 from ..io.files import write_text
 from ..io.png import write_png
-from ..io.stored_result import read_space
 from ..navigation.planner import NoPathError, PlannedPath, make_planner
 from ..report.drawn_map import DrawnAnchor, DrawnMap
 from ..report.picture import draw_map
 from . import console
-from .inputs import table_and_picture
+from .inputs import begin_plan
 
 _HEAD = "x,y,theta,distance,clearance"
 """Of the table."""
@@ -21,10 +20,7 @@ _ROW = "%.4f,%.4f,%.4f,%.4f,%.3f"
 
 
 def run(args: argparse.Namespace) -> int:
-    table, picture = table_and_picture(args, _HEAD)
-    warnings = list[str]()
-    grid, anchors = read_space(args.map, warnings)
-    console.note_of(args.map, warnings)
+    table, picture, grid, anchors = begin_plan(args, _HEAD)
     try:
         places = [np.array(p) for p in (args.start, *args.via, args.goal)]
         path = make_planner(grid, args.radius, unknown=args.unknown).plan(places[0], places[1:], step=args.step)
@@ -36,15 +32,12 @@ def run(args: argparse.Namespace) -> int:
     corners = np.union1d(np.flatnonzero(np.diff(path.poses[:, 2], prepend=np.nan)), len(path.poses) - 1)
     drawn = DrawnMap(grid, [path.poses[corners]], [DrawnAnchor(a.id, a.position) for a in anchors])
     write_png(picture, draw_map(drawn, caption=f"{path.length:.2f} m, radius {args.radius:g} m"))
-    if args.json:
-        console.say_json(_figures(args, path) | {"files": [table, picture], "exit_code": 0})
-        return 0
-    steps, least = len(path.poses) - 1, path.clearances.min()
-    console.say(f"{path.length:.2f} m in {steps} steps, never nearer than {least:.2f} m to a wall")
+    lines = [f"{path.length:.2f} m in {len(path.poses) - 1} steps, never nearer than {path.clearances.min():.2f} m to a wall"]
     if (leaving := _leaving(path, args.radius)) > 0.0:
         where = "in unknown space, or nearer to a wall than the radius"
-        console.say(f"warning: the start is {where}; the first {leaving:.2f} m leave it")
-    console.say(f"files: {table} {picture}")
+        lines.append(f"warning: the start is {where}; the first {leaving:.2f} m leave it")
+    figures = _figures(args, path) | {"files": [table, picture], "exit_code": 0}
+    console.report(args.json, figures, [*lines, f"files: {table} {picture}"])
     return 0
 
 

@@ -7,23 +7,19 @@ import numpy as np
 
 from ..io.files import write_text
 from ..io.png import write_png
-from ..io.stored_result import read_space
 from ..radio.anchor_planning import AnchorPlan, plan_anchors
 from ..report.drawn_map import DrawnAnchor
 from ..report.picture import draw_errors, side_by_side
 from ..report.printable import signed
 from . import console
-from .inputs import table_and_picture
+from .inputs import begin_plan
 
 _HEAD = "id,x,y,mean_error,error_95"
 """Of the table."""
 
 
 def run(args: argparse.Namespace) -> int:
-    table, picture = table_and_picture(args, _HEAD)
-    warnings = list[str]()
-    grid, anchors = read_space(args.map, warnings)
-    console.note_of(args.map, warnings)
+    table, picture, grid, anchors = begin_plan(args, _HEAD)
     placed = [DrawnAnchor(a.id, a.position) for a in anchors if np.isfinite(a.position).all() and not args.from_nothing]
     plan = plan_anchors(grid, np.array([a.position for a in placed]).reshape(-1, 2), args.count, reach=args.reach)
     figures = _figures(args, plan, len(placed))
@@ -33,13 +29,9 @@ def run(args: argparse.Namespace) -> int:
     today = plan.errors[0], placed, f"{about}, {len(placed)} anchors"
     then = plan.errors[-1], [*placed, *new], f"{about}, {len(new)} more"
     write_png(picture, side_by_side([draw_errors(grid, plan.points, *panel) for panel in (today, then)]))
-    if args.json:
-        console.say_json({**figures, "files": [table, picture]})
-        return 0
-    console.say(f"{len(placed)} anchors today: {_errors(figures['today'])}")
-    for new in figures["anchors"]:
-        console.say(f"{new['id']}: x {signed(new['x'])} m, y {signed(new['y'])} m: {_errors(new)}")
-    console.say(f"files: {table} {picture}")
+    lines = [f"{len(placed)} anchors today: {_errors(figures['today'])}"]
+    lines += [f"{a['id']}: x {signed(a['x'])} m, y {signed(a['y'])} m: {_errors(a)}" for a in figures["anchors"]]
+    console.report(args.json, figures | {"files": [table, picture]}, [*lines, f"files: {table} {picture}"])
     return 0
 
 

@@ -18,7 +18,7 @@ from ..drivers.recorder import Recorder
 from ..drivers.transport import absent_port, check_pyserial, check_url, stable_name
 from ..errors import ConfigError, DeviceError
 from .child import Child
-from .console import Progress, note, say, say_json
+from .console import Progress, note, report
 from .interruption import stopped_by
 from .verbs import MOST
 
@@ -66,13 +66,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _finish(recorder: Recorder, as_json: bool, interrupted: bool) -> int:
     doubts = recorder.doubts()
-    if as_json:
-        say_json(_summary(recorder, doubts))
-    else:
-        for line in recorder.summary():
-            say(line)
-        if not doubts:
-            say(f"next: uwblite check {recorder.log.first}")
+    following = [] if doubts else [f"next: uwblite check {recorder.log.first}"]
+    report(as_json, _summary(recorder, doubts), [*recorder.summary(), *following])
     for doubt in doubts:
         note(f"uwblite: warning: {doubt}")
     return 130 if interrupted else 3 if doubts else 0

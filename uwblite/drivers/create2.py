@@ -15,10 +15,10 @@ import struct
 from dataclasses import dataclass
 
 from ..clocks.clock_map import rhythm_map
-from .events import Action, Lost, OdometryPose, Pose, Send
+from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
 from .odometer import BaseDriver, WheelOdometer, way_of
-from .session import Script, Wait
+from .session import Script
 
 BAUD = 115200
 PERIOD = 0.015
@@ -100,8 +100,7 @@ class Create2Driver(BaseDriver):
             yield Send(START)
             yield from self.sleep(0.05)
             yield Send(STREAM)
-            while (yield Wait(self.now + SILENCE)) is not None:
-                pass
+            yield from self.listen(Encoders | Corrupt, SILENCE)
 
     def damaged(self) -> None:
         self._new_clock()

@@ -16,6 +16,7 @@ opens a port or reads a clock: the caller brings `now`, seconds of a monotonic c
 import math
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
+from types import UnionType
 from typing import Any, Protocol, TypeVar
 
 from .backlog import Backlog
@@ -126,6 +127,13 @@ class Driver:
         while (event := (yield Wait(until))) is not None:
             events.append(event)
         return events
+
+    def listen(self, kind: type | UnionType, patience: float) -> Script[None]:
+        """Wait until nothing of a kind came for so long, s."""
+        until = self.now + patience
+        while (event := (yield Wait(until))) is not None:
+            if isinstance(event, kind):
+                until = self.now + patience
 
     def ask(self, request: bytes, answers: Callable[[Any], bool], patience: float, tries: int = 1) -> Script[Any]:
         """Send a request, again if need be, and return the first event that answers it; None = none came."""

@@ -200,7 +200,7 @@ class SpinningDriver(Driver):
             if self.dtr is not None:
                 yield SetDtr(self.dtr)
             if (yield from self.start_up()):
-                yield from self._listen()
+                yield from self.listen(Samples, SILENCE)
             else:
                 yield Reopen("it does not answer")
                 yield Wait(self.now + SILENCE)
@@ -216,12 +216,6 @@ class SpinningDriver(Driver):
         """Make the lidar stream; False = it does not answer."""
         return True
         yield
-
-    def _listen(self) -> Script[None]:
-        until = self.now + SILENCE
-        while (event := (yield Wait(until))) is not None:
-            if isinstance(event, Samples):
-                until = self.now + SILENCE
 
     def stop(self) -> list[Action]:
         return [] if self.dtr is None else [SetDtr(not self.dtr)]

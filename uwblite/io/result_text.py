@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, Ints
 from ..map_result import MapResult
-from ..report.printable import csv_field, encodable
+from ..report.printable import csv_field, json_ready
 from ..sensor_log import LogNotes, SensorLog
 
 SCHEMA = 3
@@ -149,7 +149,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
             "stages": [[s.name, round(s.seconds, 4)] for s in result.stages],
             "peak_rss_bytes": record.peak_rss_bytes,
         }
-    ready: dict[str, Any] = _ready(content)
+    ready: dict[str, Any] = json_ready(content, _rounded)
     return ready
 
 
@@ -199,17 +199,6 @@ def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:
     return {**entry, "stamp_i": float(stamps[closure.i]), "stamp_j": float(stamps[closure.j])}
 
 
-def _ready(value: Any) -> Any:
-    """Return a value as JSON has it: nine significant digits, six decimals of large numbers, null where it is not finite."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {encodable(str(k)): _ready(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_ready(v) for v in value]
-    if isinstance(value, str):
-        return encodable(value)
-    if isinstance(value, float):
-        # Nine digits of a measurement; of a time since 1970 a microsecond.
-        return (round(value, 6) if abs(value) > 1e3 else float(f"{value:.9g}")) if math.isfinite(value) else None
-    return value
+def _rounded(value: float) -> float:
+    """Return nine digits of a measurement; of a time since 1970 a microsecond."""
+    return round(value, 6) if abs(value) > 1e3 else float(f"{value:.9g}")

@@ -2,8 +2,9 @@
 
 import math
 import re
+from collections.abc import Callable
 from html import escape as escape_markup
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ..map_result import AnchorEstimate, CalibrationEstimate
@@ -29,6 +30,26 @@ def escape(text: str) -> str:
 def encodable(text: str) -> str:
     """Return text that UTF-8 can hold: bytes of file names that are not UTF-8 written as escapes."""
     return text if text.isascii() else re.sub("[\ud800-\udfff]", lambda match: _code(match[0]), text)
+
+
+def json_ready(value: Any, number: Callable[[float], float] = float, text: Callable[[str], str] = str) -> Any:
+    """Return a value as JSON has it: arrays as lists, numbers that are not finite as None.
+
+    Parameters
+    ----------
+    number, text : what becomes of other numbers with decimals, and of texts before they are made to be UTF-8.
+    """
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {encodable(str(k)): json_ready(v, number, text) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_ready(v, number, text) for v in value]
+    if isinstance(value, str):
+        return encodable(text(value))
+    if isinstance(value, float):
+        return number(value) if math.isfinite(value) else None
+    return value
 
 
 def csv_field(text: str) -> str:
