@@ -18,7 +18,7 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.scan_matching import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import keyframe_data
-from uwblite.pipeline.broken_steps import broken_steps, range_evidence
+from uwblite.pipeline.broken_steps import _without_unused, broken_steps, range_evidence
 from uwblite.pipeline.broken_stretches import _likelihood, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.lidar_stages import refine_jointly
@@ -27,6 +27,8 @@ from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning, with_range_noise
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.bootstrap_attempt import BootstrapResult
+from uwblite.radio.place_evidence import Explanation
+from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import SensorLog, SensorMounting
 
 ANCHORS = np.array([[-7.5, -5.5], [7.5, -5.0], [6.5, 5.5], [-7.0, 5.0]])
@@ -167,3 +169,15 @@ def test_rays_are_less_probable_beside_their_walls():
     right, wrong = (rays.log_likelihood(pairs, pose) for pose in (at, se2.compose(at, np.array([0.5, 0.5, 0.0]))))
     assert np.all(right > wrong)
     assert rays.log_likelihood(pairs.rows(i[:0]), at[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize(("place", "renumbered", "left"), [
+    ([0, 0, 1, 2], [0, 0, 1, 2], "abc"), ([0, 0, 2, 2], [0, 0, 1, 1], "ac"), ([0, -1, 2, 2], [0, -1, 1, 1], "ac"),
+    ([1, 1], [0, 0], "b"),
+])  # fmt: skip
+def test_a_place_whose_ranges_are_all_of_others_is_none(place, renumbered, left):
+    """A move that a broken step explains leaves a gap in the numbers of the places after it."""
+    places = {name: AnchorHypothesis(np.full(2, float(k)), 0.0, 0.1, 0.0, 0.1) for k, name in enumerate("abc")}
+    each = _without_unused(Explanation(np.array(place), tuple(places.values()), 3.0))
+    assert each.place.tolist() == renumbered
+    assert each.found == tuple(places[name] for name in left)

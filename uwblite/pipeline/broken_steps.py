@@ -142,9 +142,16 @@ def without_moves_of_path(
     for group in _groups(radios, found):
         rival = BrokenStep(estimate, task, radios, kept, [c for c in _changes(radios, kept) if group[0].with_other(c)])
         if rival.moves and rival.gain() + rival.log_prior() > 0.0:
-            kept = rival.found
+            kept = [_without_unused(each) for each in rival.found]
             broken.append(rival)
     return kept, broken
+
+
+def _without_unused(each: Explanation) -> Explanation:
+    """Return an explanation without the places to which it has no range, as those of moves that were none."""
+    used, number = np.unique(each.place, return_inverse=True)
+    carried = int(used[0] < 0)
+    return replace(each, place=number.reshape(-1) - carried, found=tuple(each.found[k] for k in used[carried:].tolist()))
 
 
 def broken_steps(estimate: Estimate, task: Task, suspects: Ints) -> list[tuple[float, "BrokenStep"]]:
