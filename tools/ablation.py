@@ -136,7 +136,7 @@ INGREDIENTS: dict[str, LeftOut] = {
         f"repair: {name.partition('.')[2].replace('_', ' ')}": _repair(name)
         for name in (
             "repeats.without_repeated_scans", "repeats.without_lidar_marks", "repeats.without_own_body",
-            "repeats.without_marks", "repeats.without_repeated_ranges", "range_motion.without_shared_names",
+            "repeats.without_marks", "repeats.without_repeated_ranges",
             "directions.heading_with_the_path", "directions.laser_upright", "clocks.with_late_scans_placed",
             "screen.heading_from_gyro",
         )

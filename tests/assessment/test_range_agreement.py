@@ -9,7 +9,7 @@ from uwblite.assessment.range_agreement import (
     check_wheels_against_lidar,
     outlier_stretches,
 )
-from uwblite.findings import Fact, warning
+from uwblite.findings import Fact
 from uwblite.map_result import AnchorEstimate
 from uwblite.sensor_log import OdometryBreaks, Screening
 
@@ -34,12 +34,12 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
     assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
 
 
-def told(agrees, statuses=(), lidar=False, left_out=0, starts=(0.0,), where=None):
+def told(agrees, statuses=(), lidar=False, starts=(0.0,), where=None):
     """Return the findings about anchors of which each has a range a second, which agree with the map or not (a, n).
 
     Parameters
     ----------
-    statuses : of the anchors; ok. left_out : names that two anchors had. starts : of the recordings' clocks, s.
+    statuses : of the anchors; ok. starts : of the recordings' clocks, s.
     where : (n,) recording of each range; all of the first.
     """
     count, seconds = agrees.shape
@@ -56,7 +56,6 @@ def told(agrees, statuses=(), lidar=False, left_out=0, starts=(0.0,), where=None
     begins = np.ravel([(t, t + 1.0) for t in starts])
     of_each = np.repeat(np.arange(len(starts)), 2)
     task = task_of(recordings_of(np.zeros((len(begins), 3)), begins, of_each, lidar=lidar))
-    task.stages.findings.extend([warning("shared-name", "")] * left_out)
     return list(check_range_agreement(anchors, table, task))
 
 
@@ -92,8 +91,6 @@ def test_an_anchor_disagrees_in_one_recording_while_others_whose_clocks_show_the
     (wrong_from(1), {"statuses": ("ok", "ok", "ok", "distrusted")}, True),
     (wrong_from(0), {"statuses": ("ok", "ok", "distrusted", "unplaced")}, False),
     (wrong_from(0), {"statuses": ("ok", "unplaced", "distrusted", "unplaced")}, True),
-    (wrong_from(0, 2), {"left_out": 1}, False), (wrong_from(0, 1), {"left_out": 1}, True),
-    (wrong_from(0, 1), {"left_out": 1, "lidar": True}, False),
     (wrong_from(1, 5), {}, True), (wrong_from(0, 5), {}, False),
     (wrong_from(0, 5), {"statuses": ("ok", "ok", "ok", "distrusted", "distrusted")}, False),
 ])  # fmt: skip

@@ -16,7 +16,7 @@ LIDAR = (
 )  # fmt: skip
 RADIO = (
     "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
-    "anchor-mirror-ambiguous", "moved-anchor", "shared-name", "repeated-ranges", "marked-ranges", "sustained-outliers",
+    "anchor-mirror-ambiguous", "moved-anchor", "repeated-ranges", "marked-ranges", "sustained-outliers",
     "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales", "exchanged-names",
 )  # fmt: skip
 CLOCKS = (
@@ -40,7 +40,7 @@ OWN = {
     "lidar absent for 40 %": CUT, "half of the scans an hour late": CLOCKS, "clock of the radio back 30 s": ("clock-set-back",),
     "clock of the lidar back 30 s": ("clock-set-back",), "clock of the odometry back 30 s": ("set back",),
     "clock of all back 30 s": ("set back",), "two robots in one log": ("two robots",),
-    "two logs in one, overlapping by 25 s": ("two robots", "set back"), "two anchors with one name": ("shared-name",),
+    "two logs in one, overlapping by 25 s": ("two robots", "set back"), "two anchors with one name": ("anchor-distrusted",),
     "two buildings in one log": (*CUT, "free-space-violation"),
     "all ranges 2 m longer from half time": (*RADIO, "anchor-heights"),
     "the radio's clock runs 2 % fast": (*RADIO, "late-ranges"), "ranges 5 s late": CLOCKS, "ranges 18 s late": CLOCKS,

@@ -133,7 +133,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "one wheel counts nothing for 6 s of 50": (wheels.loose_encoder, WHEELS),
     "two logs in one, overlapping by 25 s": (logs.joined_with_overlap, ("all",)),
     "a third of the walls are mirrors": (lidar.mirrors, ("all",)),
-    "a tray of the robot before 45 degrees of the lidar": (lidar.own_body(np.deg2rad(45.0), 0.2), LIDAR),
+    "a tray of the robot before 100 degrees of the lidar": (lidar.own_body(np.deg2rad(100.0), 0.6), LIDAR),
     "the driver sends every scan twice": (lidar.sent_twice, LIDAR),
     "left and right half of the scans lost in turn": (lidar.alternating_halves, LIDAR),
     "beams in the other order from half time": (lidar.swapped_rotation, LIDAR),

@@ -57,7 +57,6 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "laser-turned-over": _of(_BY_SCANS, "wheels-against-lidar range-scatter anchors-moved-together"),
         "wheels-stand-still": _BY_RANGES | _BY_SCANS,
         "marked-ranges": _of(_PLACES, "uncertain odometry-alone untied-parts few-in-reach few-ranges"),
-        "shared-name": _of(_PLACES, "spikes"),
         "repeated-ranges": _of("few-ranges anchor-unplaced no-anchor odometry-alone uncertain"),
         "repeated-scans": _of("odometry-alone untied-parts silences"),
         "worse-than-parts": _of(_PLACES, "path-displaced free-space-violation"),

@@ -168,11 +168,6 @@ TEXTS: Mapping[str, Text] = {
         "anchor {anchor} repeats one range while the robot moves ({stretches:spans}); these were left out",
         anchor="{anchor}",
     ),
-    "shared-name": Text(
-        "two anchors seem to have the name {anchor}: its ranges jump between two distances "
-        "({jumps} of {total} times by more than the robot drove); they were left out, give each anchor its own name",
-        anchor="{anchor}",
-    ),
     "heading-against-path": Text(
         "the odometry's heading turns against its path: {inverted} was inverted"
         "{settled:|; nothing in the recording shows whether the map is mirrored, so compare it with the building}",

@@ -44,7 +44,7 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
     """Warn of each anchor whose ranges disagree with the map for long; doubt a map that most ranges contradict.
 
     A line of sight was blocked, or an anchor was moved. Without a lidar, ranges alone determine the path: half of the anchors
-    that disagree, or are distrusted or left out, are a doubt as well. An anchor that was moved counts once.
+    that disagree, or are distrusted, are a doubt as well. An anchor that was moved counts once.
     """
     placed = [a for a in anchors if a.status != "unplaced"]
     of_place = {a.id: name_and_number(a.id)[0] for a in placed}
@@ -60,11 +60,10 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
         )
         yield doubt("ranges-disagree", text, share=agreeing / count)
     moved = {name for name, number in map(name_and_number, of_place) if number > 1}
-    left_out = sum(finding.kind == "shared-name" for finding in task.stages.findings)
-    bad, heard = len(wrong | moved) + left_out, len(set(of_place.values())) + left_out
-    if (wrong or left_out or bad > 1) and 2 * bad >= heard and not task.recordings.have_scans:
+    bad, heard = len(wrong | moved), len(set(of_place.values()))
+    if (wrong or bad > 1) and 2 * bad >= heard and not task.recordings.have_scans:
         text = (
-            f"{bad} of {heard} anchors were moved, disagree for long, are distrusted or left out, and only ranges and odometry "
+            f"{bad} of {heard} anchors were moved, disagree for long, or are distrusted, and only ranges and odometry "
             "constrain the trajectory: a wrong one is likelier than so many bad anchors, and the others may be too few; check "
             "the odometry, map the parts before and after separately, or give the anchors' places"
         )

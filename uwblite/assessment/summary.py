@@ -139,7 +139,7 @@ def _anchor(
     if not doubtful and short > max(_FEW_SHORT, _SHARE_SHORT * len(measured)):
         doubtful = (
             f"{short} of its {len(measured)} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for "
-            "a time?"
+            "a time, or another anchor has its name?"
         )
     if doubtful:
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")

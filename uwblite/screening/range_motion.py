@@ -1,21 +1,17 @@
 """Tests by the triangle inequality: ranges to one place change by at most the distance driven, apart from noise and NLOS.
 
 Medians of a few readings of one anchor are compared over a time. Where several anchors change by more together, the wheels
-missed a motion. Where the ranges of one anchor jump to and fro between two distances, each of which changes by at most the
-distance driven, and their difference varies, two anchors have one name: multipath delays are constant, or different each time,
-and a motion that the wheels miss makes ranges jump, but not back.
+missed a motion.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import BEYOND_NOISE, ENOUGH, MOST, Bools, Floats, white_noise
-from ..findings import Fact
+from ..arrays import BEYOND_NOISE, ENOUGH, MOST, Floats, white_noise
 from ..sensor_log import SensorLog, plausible
-from .odometry_chain import usual_speed
-from .repeats import RepeatPolicy, quiet_noise, resolution_of
+from .repeats import RepeatPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,19 +34,11 @@ class MotionPolicy:
     """Cuts nearer than this in time are one, s."""
     way: ClassVar[float] = 2.0
     """Length of the stretches, m, in which the change of ranges is compared with the distance."""
-    leaps: ClassVar[int] = 12
-    leaping: ClassVar[float] = 0.1
-    """Least number of jumps, and their least share of the ranges' differences, for two places; one place has 3 % at most."""
-    near: ClassVar[float] = 0.6
-    """Distance, m, over which a jump is compared with the next one."""
-    varies: ClassVar[float] = 0.7
-    """By how much leaps differ (10 to 90 %, by their median): of two places by 1.2 at least, of constant detours by 0.34. The
-    ends of 97 % of the leaps of two places are where the next one's are, and of 74 % at most of exponential detours."""
 
 
-def _most_change(way: Floats | float, noise: float) -> Floats:
-    """Return by how much ranges to one place differ at most between two points of the way (n,), m."""
-    return np.asarray(MotionPolicy.stretch * way + MotionPolicy.margin + BEYOND_NOISE * noise)
+def _without_motion(noise: float) -> float:
+    """Return by how much ranges from one place to another differ at most, m, by the noise of one of them, m."""
+    return MotionPolicy.margin + BEYOND_NOISE * noise
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
@@ -73,7 +61,7 @@ def excess(log: SensorLog, start: float, end: float) -> float:
         before, after = stamps[stamps <= start][-middle:], stamps[stamps >= end][:middle]
         extra = np.zeros(len(level))
         extra[[0, -1]] = _way(log, np.append(before, start)), _way(log, np.append(after, end))
-        change = np.abs(level[:, None] - level) - extra[:, None] - extra - _most_change(0.0, _noise(ranges))
+        change = np.abs(level[:, None] - level) - extra[:, None] - extra - _without_motion(_noise(ranges))
         if np.isfinite(level).sum() >= 2:
             found.append(np.where(np.isfinite(change), change, -np.inf))
     if not found:
@@ -96,7 +84,7 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
         if len(ranges) < 4 * MotionPolicy.lasting:
             continue
         way, windows = log.odometry.travelled_at(stamps), (MotionPolicy.window, MotionPolicy.lasting)
-        over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in windows)) - _most_change(0.0, _noise(ranges))
+        over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in windows)) - _without_motion(_noise(ranges))
         close = np.isfinite(over) & (np.diff(stamps) <= MotionPolicy.silence * np.median(np.diff(stamps)))
         spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[close])
     return _together(spans, jumps)
@@ -170,40 +158,3 @@ def _noise(ranges: Floats) -> float:
 def _way(log: SensorLog, stamps: Floats) -> float:
     """Return the distance driven between the first and the last stamp, m."""
     return float(np.ptp(log.odometry.travelled_at(stamps))) if len(stamps) else 0.0
-
-
-def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
-    """Leave out the ranges of each name that two anchors have: the place of none of them is known."""
-    ranges = log.ranges
-    if ranges is None or len(log.odometry.stamps) < 2:
-        return log, []
-    usable = ranges.ranges > 0.0
-    each = ranges.by_pair(usable)
-    if not each:
-        return log, []
-    noise = quiet_noise([ranges.ranges[own] for _, own in each], resolution_of(ranges.ranges[usable]))
-    # The robot may drive as fast as usual wherever its wheels count less.
-    steps = np.maximum(np.diff(log.odometry.travelled), usual_speed(log.odometry) * np.diff(log.odometry.stamps))
-    driven = np.interp(ranges.stamps, log.odometry.stamps, np.append(0.0, np.cumsum(steps)))
-    wrong, facts = np.zeros(len(ranges.stamps), dtype=bool), []
-    for anchor, own in each:
-        leaps = np.abs(np.diff(ranges.ranges[own])) > _most_change(np.diff(driven[own]), noise)
-        if _two_distances(ranges.ranges[own], driven[own], leaps, noise) and not wrong[own].any():
-            name = ranges.anchor_ids[anchor]
-            facts.append(Fact.of("shared-name", anchor=name, jumps=int(leaps.sum()), total=len(leaps)))
-            wrong |= ranges.anchor == anchor
-    return (replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)) if facts else log), facts
-
-
-def _two_distances(values: Floats, driven: Floats, leaps: Bools, noise: float) -> bool:
-    """Return whether the shorter and the longer ends of an anchor's leaps are distances to a place each, no constant apart."""
-    at = np.flatnonzero(leaps)
-    if len(at) < max(MotionPolicy.leaps, MotionPolicy.leaping * len(leaps)):
-        return False
-    ends = np.sort(np.column_stack([values[at], values[at + 1]]), axis=1)
-    way = np.diff(0.5 * (driven[at] + driven[at + 1]))
-    steady = np.abs(np.diff(ends, axis=0)).max(axis=1) < _most_change(way, noise)
-    low, middle, high = np.quantile(ends[:, 1] - ends[:, 0], [1.0 - MOST, 0.5, MOST])
-    steady = steady[way < MotionPolicy.near]
-    enough = len(steady) >= MotionPolicy.leaps and steady.mean() > MOST
-    return bool(enough and high - low > MotionPolicy.varies * middle)

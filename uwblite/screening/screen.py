@@ -47,7 +47,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
     facts += [*set_right, *outside, *repeated, *spread, *times, *glitches, *broken, *turned]
     repairs = [repeats.without_repeated_scans, repeats.without_lidar_marks, repeats.without_own_body]
-    repairs += [repeats.without_marks, repeats.without_repeated_ranges, range_motion.without_shared_names]
+    repairs += [repeats.without_marks, repeats.without_repeated_ranges]
     repairs += [explained_by_ranges, directions.heading_with_the_path, clocks.with_late_scans_placed]
     for repair in repairs:
         log, more = repair(log)
