@@ -2,8 +2,7 @@
 
 A radio that warms up, wheels that wear or lose air: where ranges alone constrain the trajectory, bent paths and displaced
 anchors explain nearly all of such an effect, and no residual is conspicuous. The small remainder is compared with the pattern
-that each of these faults would leave: a score test (graph/marginals.py) gives the best-fitting size. A wheel that slips for
-seconds is hidden in the same way: the error of each step is small, and the calibration of the turns absorbs the rest.
+that each of these faults would leave: a score test (graph/marginals.py) gives the best-fitting size.
 """
 
 from collections.abc import Iterator
@@ -13,14 +12,13 @@ import numpy as np
 
 from ..arrays import Floats
 from ..findings import Finding, doubt
-from ..graph.graph import Graph, edge_weights
+from ..graph.graph import Graph
 from ..graph.marginals import added_unknown
 from ..graph.pose_edges import OdometryEdges
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.range_alternatives import RangePolicy, sides
 from ..pipeline.recordings import Recording, Recordings
 from ..problem.alternatives import apart
-from .residual_tests import between_keyframes, seconds
 
 _UNCERTAIN, _UNCERTAIN_SHARE = 0.4, 0.05
 """Expected error of places, m and as a share of the area's diameter. Of maps at this limit one in five is off by more than
@@ -30,11 +28,6 @@ _SIGMAS = 2.5
 _LONGER, _SCALE = 0.4, 0.07
 """Limits: m by which all ranges grow over a recording, and the change of the wheels' scale.
 Faultless recordings, 30 of simulated and three of real places, have up to 0.24 m and 0.05 (1.7 and 2.8 sigma)."""
-_TURN, _TURN_SIGMAS = 0.3, 4.0
-"""rad by which turns are wrong over a short stretch, and standard deviations. Faultless recordings, 30 of simulated and three
-of real places, have up to 3.6 sigma with 0.22 rad, the largest of about forty stretches in each."""
-_WAY, _MOST = 8, 128
-"""Steps of such a stretch, 2.4 m, and number of stretches that are tested: those on which the turns fit worst."""
 _STEP = 1e-4
 """Share of a unit that is the step of numeric derivatives."""
 
@@ -93,7 +86,6 @@ def check_drifts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             value, sigma, _, text = max(drifting, key=lambda each: abs(each[0]) / each[1])
             why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
             yield doubt("drift", why, value=float(value), sigma=float(sigma))
-    yield from _check_turns(graph, wheels, rec)
 
 
 def _age(recording: Recording, rec: Recordings) -> Floats:
@@ -107,21 +99,3 @@ def _growth(graph: Graph, wheels: OdometryEdges, since: Floats) -> Floats:
     """Return the change (e, 3) of the wheels' residuals by a scale that grows by 1 over a recording, by a small step."""
     motion = wheels.motion * (1.0 + _STEP * since[wheels.i, None] * np.array([1.0, 1.0, 0.0]))
     return (replace(wheels, motion=motion).residuals(graph) - wheels.residuals(graph)) / _STEP
-
-
-def _check_turns(graph: Graph, wheels: OdometryEdges, rec: Recordings) -> Iterator[Finding]:
-    """Doubt a map in which, by the ranges, the odometry turns wrongly over a short stretch."""
-    steps = np.arange(0, len(wheels) - _WAY + 1, _WAY // 2)[:, None] + np.arange(_WAY)
-    # The numerators of the test, with the graph at its optimum: a stretch that fits well needs no other turn.
-    score = np.einsum("eij,ei,e->ej", wheels.sqrt_information, wheels.residuals(graph), edge_weights(wheels, graph))[:, 2]
-    steps = steps[np.argsort(-np.abs(score[steps].sum(axis=1)), kind="stable")[:_MOST]]
-    shifts = np.zeros((len(steps), len(wheels), 3))
-    shifts[np.arange(len(steps))[:, None], steps] = wheels.sqrt_information[steps, :, 2] / _WAY
-    turns, sigmas = added_unknown(graph, wheels, shifts)
-    wrong = np.flatnonzero(np.abs(turns) > np.maximum(_TURN, _TURN_SIGMAS * sigmas))
-    if len(wrong):
-        worst = wrong[np.argmax(np.abs(turns[wrong]) / sigmas[wrong])]
-        span, turn = (int(wheels.i[steps[worst, 0]]), int(wheels.j[steps[worst, -1]])), float(np.abs(turns[worst]))
-        at = seconds(rec, span[0])
-        why = f"from t = {at:.0f} s the ranges contradict the odometry by {turn:.1f} rad within some metres: did a wheel slip?"
-        yield between_keyframes(doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at), rec, span)
