@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import BEYOND_NOISE, Bools, Floats, Ints
 from ..findings import Finding, doubt
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import JointCovariance
@@ -32,8 +32,6 @@ _SLIP = np.array([1.0, 1.0, 0.2])
 """m, m, rad, by which wheels that slip are off in a step at most."""
 _KNOWN, _KNOWN_SHARE = 0.5, 0.01
 """Share of it, and of the map's diameter, up to which the relative pose of two parts must be known, in any direction."""
-_SUDDEN = 5.0
-"""Standard deviations that a step of faultless wheels hardly ever exceeds."""
 _MOST = 64
 """Runs of such steps that are tested, those with the largest errors."""
 _ANCHORS, _MEASURED = 2, 3
@@ -185,7 +183,7 @@ def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
     off = np.abs(wheels.residuals(estimate.graph)).max(axis=1, initial=0.0)
-    slips = np.where((off > _SUDDEN)[:, None], np.minimum(off[:, None] * noise, _SLIP), 0.0)
+    slips = np.where((off > BEYOND_NOISE)[:, None], np.minimum(off[:, None] * noise, _SLIP), 0.0)
     rows = np.array([(r.rows.start, r.rows.stop) for r in recordings.each])[recordings.of_keyframe[wheels.i]]
     sides = np.minimum(wheels.i + 1 - rows[:, 0], rows[:, 1] - wheels.j)
     steps = np.flatnonzero(slips.any(axis=1) & (sides >= _PART))

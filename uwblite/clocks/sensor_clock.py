@@ -14,9 +14,8 @@ JUMP = 0.5
 _CONFIRMED = 4
 """Measurements, each after another odometry, that show that a reset lasts."""
 _WINDOW, _BUCKET = 5.0, 0.5
-"""s that the clock map looks back, and of one minimum: a link that becomes slower is a usual one after that time."""
-_LONGEST = 5.0
-"""s; steps of a sensor that are longer were silences."""
+"""s that the clock map looks back, and of one minimum: a link that becomes slower is a usual one after that time, and longer steps
+of a sensor were silences."""
 
 
 class SensorClock(Generic[T]):
@@ -66,7 +65,7 @@ class SensorClock(Generic[T]):
         last = free[-1][0]
         if now > self._now:  # while the odometry is silent its clock stands
             self._map.add(last, now)
-        self._longest = max(0.9 * self._longest, min(last - self._last, _LONGEST) if isfinite(self._last) else 0.0)
+        self._longest = max(0.9 * self._longest, min(last - self._last, _WINDOW) if isfinite(self._last) else 0.0)
         self._last, self._now, self._silences = last, now, silences
         return free
 

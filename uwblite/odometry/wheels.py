@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import TINY, Floats, Ints, spread, weighted_median
+from ..arrays import BEYOND_NOISE, MOST, TINY, Floats, Ints, spread, weighted_median
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
@@ -90,7 +90,7 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     off = np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off)
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     covariance = np.linalg.pinv(information, rcond=TINY, hermitian=True)
-    seen = np.einsum("eij,eji->ei", covariance, information) > 0.9
+    seen = np.einsum("eij,eji->ei", covariance, information) > MOST
     in_wheels = wheels.end_sqrt_information[own]
     sigma = np.sqrt(np.einsum("eij,ejk,eik->ei", in_wheels, covariance, in_wheels))
     well, factor = seen & (sigma < _MUCH_WORSE), np.ones(off.shape[1])
@@ -206,8 +206,8 @@ _TURNING = 0.1
 """rad; steps that turn by less, on average of lidar and wheels, do not show a ratio."""
 _PARTS = 8
 """Of a recording, equal in turning steps, whose scales are compared."""
-_SIGMAS, _SAME = 5.0, 0.05
-"""Standard deviations beyond which scales differ, and the difference that floors and tyres explain."""
+_SAME = 0.05
+"""Difference of scales that floors and tyres explain."""
 
 
 class TurnScale(NamedTuple):
@@ -220,7 +220,7 @@ class TurnScale(NamedTuple):
 
     def contradicts(self, heading_scale: float) -> bool:
         """Return whether a scale from the whole estimate cannot be that of the steps."""
-        return abs(heading_scale - self.value) > max(_SIGMAS * self.sigma, _SAME)
+        return abs(heading_scale - self.value) > max(BEYOND_NOISE * self.sigma, _SAME)
 
 
 def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[int, TurnScale]:

@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import OUTLIER, Bools, Ints
+from ..arrays import BEYOND_NOISE, ENOUGH, OUTLIER, Bools, Ints
 from ..graph.graph import Edges, Graph
 from ..graph.problem_checks import check, given_anchors
 from ..graph.range_edges import RangeEdges
@@ -37,11 +37,8 @@ class IncrementalPolicy:
     """Poses optimised after each piece, older ones fixed, and the factor on them where they do not fit; also those after which
     a new anchor is no longer the first to be removed."""
     resolve_factor: ClassVar[float] = 1.5
-    """Everything is optimised again when there are so many times the poses."""
-    significance: ClassVar[float] = 5.0
-    """Standard deviations by which chi2 may exceed the usual."""
-    ranges: ClassVar[int] = 20
-    """Ranges before an anchor is searched; it is searched again when there are `resolve_factor` times as many."""
+    """Everything is optimised again when there are so many times the poses, and an anchor searched again when there are so many
+    times the ranges."""
     position_sigma: ClassVar[float] = 0.5
     drift: ClassVar[float] = 0.1
     """An anchor less certain than this is not added yet, m; assumed error of the path that it is searched from, m."""
@@ -221,7 +218,7 @@ class _Incremental:
         solved, summary = optimize(part, IncrementalPolicy.step, None, self.allowed - self.work)
         self.work += summary.work
         scatter = np.sqrt(2.0 / max(summary.dof, 1))
-        most = self.usual * (1.0 + IncrementalPolicy.significance * scatter)
+        most = self.usual * (1.0 + BEYOND_NOISE * scatter)
         return _Part(solved, not summary.chi2_per_dof > most, summary.chi2_per_dof)
 
     def _edges(self, low: int, now: int, use: Bools, kernel: Kernel | None) -> Iterator[Edges]:
@@ -237,7 +234,7 @@ class _Incremental:
     def _search(self, now: int) -> None:
         """Place the anchors that the ranges so far make clear; at the end also those that stay doubtful."""
         last, counts, anchors = now == len(self.guess), self._counts(now), self.graph.anchors.copy()
-        enough = counts >= np.maximum(IncrementalPolicy.ranges, IncrementalPolicy.resolve_factor * self.tried)
+        enough = counts >= np.maximum(ENOUGH, IncrementalPolicy.resolve_factor * self.tried)
         for anchor in np.flatnonzero(~self.joined & (last | enough)).tolist():
             self.tried[anchor] = counts[anchor]
             measured = (edges.rows(edges.anchor == anchor) for edges in self._ranges(now))

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import OUTLIER, Bools, Floats, Ints, spread, unique_rows
+from ..arrays import ENOUGH, OUTLIER, Bools, Floats, Ints, spread, unique_rows
 from ..config import setting
 from ..graph.robust import Kernel
 
@@ -66,9 +66,8 @@ def assumed(config: RangeNoiseConfig) -> RangeNoise:
     return RangeNoise(float(np.sqrt(config.sigma**2 - slow**2)), slow, config.correlation_length)
 
 
-_ENOUGH_PAIRS, _SILENCE = 20, 4.0
-"""Pairs of residuals that show a covariance, or triples of neighbours in time that show noise; usual times between neighbours
-beyond which the robot has turned in between."""
+_SILENCE = 4.0
+"""Usual times between neighbours beyond which the robot has turned in between."""
 
 
 def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: RangeNoiseConfig) -> float:
@@ -89,7 +88,7 @@ def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: Range
     w = (t[1:-1] - t[:-2]) / span
     off = (r[1:-1] - (1.0 - w) * r[:-2] - w * r[2:]) / np.sqrt(1.0 + w**2 + (1.0 - w) ** 2)
     same &= span < _SILENCE * np.median(span[same])
-    return max(spread(off[same]), config.min_sigma) if same.sum() >= _ENOUGH_PAIRS else config.sigma
+    return max(spread(off[same]), config.min_sigma) if same.sum() >= ENOUGH else config.sigma
 
 
 _DISTANCES = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
@@ -117,7 +116,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     e = np.clip(e, -most, most)
     variance = max(float(e @ e) / len(e), config.min_sigma**2)
     covariance, pairs = _covariance_by_distance(p, e, _DISTANCES)
-    enough = pairs >= _ENOUGH_PAIRS
+    enough = pairs >= ENOUGH
     # Three unknowns; the white part shows in what is nearer than the correlation length.
     if enough.sum() <= 2 or not enough[:2].any():
         return assumed(config)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from .. import se2
-from ..arrays import MAD_TO_SIGMA, OUTLIER, TINY, Floats, chunks, row_medians
+from ..arrays import MAD_TO_SIGMA, MOST, OUTLIER, TINY, Floats, chunks, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
 from .range_noise import RangeNoiseConfig
@@ -132,7 +132,7 @@ def _of_one_size(
 
 def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, Floats, float]:
     """Return the best raster cells (s, 2), the best bias (s,) of each, and the cell size, m."""
-    reach = float(np.quantile(ranges, _FARTHEST)) + config.bias_sigma
+    reach = float(np.quantile(ranges, MOST)) + config.bias_sigma
     low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
     step = float(np.max(high - low)) / config.raster
     axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
@@ -153,8 +153,8 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     return cells[best], bias[best], step
 
 
-_FARTHEST, _OF_BIAS = 0.9, 0.05
-"""Quantile of the ranges beyond which they are false; cost of a cell of a bias of its standard deviation, in false ranges."""
+_OF_BIAS = 0.05
+"""Cost of a cell of a bias of its standard deviation, in false ranges."""
 
 
 def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
