@@ -16,7 +16,7 @@ from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.slips import LASTS
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio.bootstrap import bootstrap_graph, of_likeliest_slips
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -41,8 +41,8 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     attached = attach_ranges(radio, wheels, frames, mounting)
     edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), LONGEST_RANGE)
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
-    measured = Measured(wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path)
-    found = bootstrap_graph(graph, measured, BootstrapConfig(range_sigma=1.5 * SIGMA), TrilaterationConfig())
+    measured = Measured(wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path, 1.5 * SIGMA)
+    found = bootstrap_graph(graph, measured, TrilaterationConfig())
     return found, frames.stamps
 
 
@@ -245,9 +245,8 @@ def test_slips_that_nothing_pays_for_go_and_others_are_found(marked):
     rng = np.random.default_rng(8)
     distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T) + 0.05 * rng.standard_normal(120)
     wheels = chained(se2.chain(np.zeros(3), motion), (0.02, 0.02, 0.02))
-    measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0))
-    config = BootstrapConfig(range_sigma=0.05)
-    attempt = Attempt(Graph(truth.copy(), anchors), measured, config, TrilaterationConfig(), ())
+    measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0), 0.05)
+    attempt = Attempt(Graph(truth.copy(), anchors), measured, TrilaterationConfig(), ())
     attempt.placed[:], attempt.low, attempt.high, attempt.poses = True, 0, 40, truth.copy()
     for first, last in marked:
         attempt.slips[first:last] = 1.0

@@ -10,7 +10,7 @@ from helpers.planted_graphs import plain_ranges
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.odometry.slips import EVERY, LASTS
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, Measured
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapPolicy, Measured
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 
 
@@ -18,7 +18,7 @@ class Scheduled(Attempt):
     """A bootstrap whose steps only write down that they were taken; each extension adds what `agrees` does not say."""
 
     def __init__(self, poses, agrees, found):
-        self.path, self.config, self.hypotheses = np.arange(float(poses)), BootstrapConfig(), {}
+        self.path, self.assumed, self.hypotheses = np.arange(float(poses)), 0.15, {}
         self.placed, self.agrees, self.found = np.ones(1, dtype=bool), iter(agrees), iter(found)
         self.taken, self.low, self.high, self.tears_at = [], 0, 0, np.inf
 
@@ -35,7 +35,7 @@ class Scheduled(Attempt):
         self.taken.append((schedule[0], self.high))
 
     def _search(self, low, high, drift):
-        assert (low, high, drift) == (self.low, self.high, 2.0 * self.config.range_sigma)
+        assert (low, high, drift) == (self.low, self.high, 2.0 * self.assumed)
         return {}
 
     def _adopt(self, found):
@@ -80,8 +80,8 @@ def along_a_line(poses=12, sigma=0.1):
     distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
     graph = Graph(truth, anchors)
     wheels, radio = chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma)
-    measured = Measured(wheels, radio, np.arange(float(poses)))
-    attempt = Attempt(graph, measured, BootstrapConfig(range_sigma=sigma), TrilaterationConfig())
+    measured = Measured(wheels, radio, np.arange(float(poses)), sigma)
+    attempt = Attempt(graph, measured, TrilaterationConfig())
     attempt.placed[:] = True
     return attempt, truth
 
@@ -122,7 +122,7 @@ def test_the_misfit_is_a_median_in_standard_deviations_unless_the_path_is_torn()
         attempt, truth = along_a_line()
         attempt.placed[:] = False
         attempt.poses = truth + tear * (np.arange(12) >= 6)[:, None] * [0.0, 1.0, 0.0]
-        assert attempt.misfit() == (attempt.config.agreement if torn else 0.0)
+        assert attempt.misfit() == (BootstrapPolicy.agreement if torn else 0.0)
 
 
 def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
@@ -139,8 +139,8 @@ def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
 
     truth = np.column_stack([np.arange(41.0), np.zeros((41, 2))])
     ranges_to = plain_ranges(np.arange(41), np.arange(41) % 2, np.ones(41), 0.1)
-    measured = Measured(chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0))
-    attempt = Seeded(Graph(truth, np.zeros((2, 2))), measured, BootstrapConfig(range_sigma=0.1), TrilaterationConfig())
+    measured = Measured(chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0), 0.1)
+    attempt = Seeded(Graph(truth, np.zeros((2, 2))), measured, TrilaterationConfig())
     length = attempt._seed()
     # 25 m at both ends and between, then 10 and 4 m, then all: none is worth 0.35 for each of two anchors.
     assert [(low, high) for low, high, _ in tried[:2]] == [(0, 26), (15, 41)]

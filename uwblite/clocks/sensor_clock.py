@@ -14,8 +14,8 @@ JUMP = 0.5
 _CONFIRMED = 4
 """Measurements, each after another odometry, that show that a reset lasts."""
 _WINDOW, _BUCKET = 5.0, 0.5
-"""s that the clock map looks back, and of one minimum: a link that becomes slower is a usual one after that time, and longer steps
-of a sensor were silences."""
+"""s that the clock map looks back, and of one minimum: a link that becomes slower is a usual one after that time, and longer
+steps of a sensor were silences."""
 
 
 class SensorClock(Generic[T]):

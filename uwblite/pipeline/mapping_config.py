@@ -18,7 +18,6 @@ from ..lidar.submaps import SubmapConfig
 from ..loop_closure.closures import LoopClosureConfig
 from ..odometry.keyframes import KeyframeConfig
 from ..odometry.wheels import OdometryNoiseConfig
-from ..radio.bootstrap_attempt import BootstrapConfig
 from ..radio.range_noise import RangeNoiseConfig
 from ..radio.trilateration import TrilaterationConfig
 
@@ -46,7 +45,6 @@ class MappingConfig:
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
     ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
     trilateration: TrilaterationConfig = field(default_factory=TrilaterationConfig)
-    bootstrap: BootstrapConfig = field(default_factory=BootstrapConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     clouds: CloudConfig = field(default_factory=CloudConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)

@@ -118,9 +118,8 @@ def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
     # Differences of neighbours do not show the part of the errors that lasts.
     sigma = float(np.hypot(sigma, assumed(config.ranges).slow))
-    settings = replace(config.bootstrap, range_sigma=sigma)
-    measured = Measured(estimate.odometry, ranges, path - path[0])
-    result = bootstrap.bootstrap_graph(estimate.graph, measured, settings, config.trilateration)
+    measured = Measured(estimate.odometry, ranges, path - path[0], sigma)
+    result = bootstrap.bootstrap_graph(estimate.graph, measured, config.trilateration)
     number_if_several = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=sigma, placed=int(result.placed.sum()), **number_if_several)
     # The bootstrap starts in the middle of the path; the frame of the map is that of the odometry's first pose.

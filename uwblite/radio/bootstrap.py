@@ -9,11 +9,11 @@ from ..arrays import runs_of
 from ..graph.graph import Calibration, Graph
 from ..odometry.slips import LASTS
 from ..problem.alternatives import EvidencePolicy
-from .bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult, Measured
+from .bootstrap_attempt import Attempt, BootstrapPolicy, BootstrapResult, Measured
 from .trilateration import TrilaterationConfig
 
 
-def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, search: TrilaterationConfig) -> BootstrapResult:
+def bootstrap_graph(graph: Graph, measured: Measured, search: TrilaterationConfig) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
     Where the ranges do not agree in the end, gross errors of the heading, and wheels that slip, are the other explanations.
@@ -24,20 +24,20 @@ def bootstrap_graph(graph: Graph, measured: Measured, config: BootstrapConfig, s
     graph : poses (k, 3) by dead reckoning, anchors (a, 2) of any value, calibration block; its edges (priors) stay.
     """
     first, *others = (
-        Attempt(replace(graph, calibration=calibration), measured, config, search)
-        for heading_scale in config.heading_scales
+        Attempt(replace(graph, calibration=calibration), measured, search)
+        for heading_scale in BootstrapPolicy.heading_scales
         if (calibration := _with_heading_scale(graph.calibration, heading_scale)) is not None
     )
     # Where it has a jump, it is completed only if nothing else agrees.
     first.run(torn=not others)
-    if first.misfit() < config.agreement:
+    if first.misfit() < BootstrapPolicy.agreement:
         return of_likeliest_slips(first).estimate()
     heading, slipping = _likeliest_heading(first, others), list[Attempt]()
-    while len(slipping) < config.slipping_starts and (not slipping or slipping[-1].slips.any()):
+    while len(slipping) < BootstrapPolicy.slipping_starts and (not slipping or slipping[-1].slips.any()):
         # The wheels may have slipped in the first stretch as well.
-        slipping.append(Attempt(graph, measured, config, search, [each.first for each in slipping]))
+        slipping.append(Attempt(graph, measured, search, [each.first for each in slipping]))
         slipping[-1].run()
-    agreeing = [attempt for attempt in slipping if attempt.misfit() < config.agreement]
+    agreeing = [attempt for attempt in slipping if attempt.misfit() < BootstrapPolicy.agreement]
     return of_likeliest_slips(max([heading, *agreeing], key=Attempt.evidence)).estimate()
 
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from .. import se2
 from ..arrays import OUTLIER, TINY, Bools, Floats, Ints, runs_of, spread
-from ..config import setting
 from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph, edge_cost
 from ..graph.pose_edges import OdometryEdges
@@ -32,8 +31,8 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, tri
 
 
 @dataclass(frozen=True, slots=True)
-class BootstrapConfig:
-    """Bootstrap of the first estimate."""
+class BootstrapPolicy:
+    """How an attempt begins, grows, and is judged."""
 
     seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
     starts: ClassVar[int] = 5
@@ -50,8 +49,6 @@ class BootstrapConfig:
     scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, OUTLIER)
     """Scales of the ranges' kernel, one after the other, standard deviations."""
     solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
-    range_sigma: float = setting(0.15, advanced=True)
-    """Assumed standard deviation of ranges until it is learnt, m."""
     drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
     heading_scales: ClassVar[tuple[float, ...]] = tuple(2.0**k - 1.0 for k in (0, -1, 1, -0.5, 0.5, -0.25, 0.25))
@@ -94,6 +91,8 @@ class Measured:
     """All; those that cannot be distances have weight 0."""
     path: Floats
     """(k,) travelled distance at each pose, m."""
+    sigma: float
+    """Assumed standard deviation of ranges until it is learnt, m."""
 
 
 class Attempt:
@@ -109,19 +108,18 @@ class Attempt:
         self,
         graph: Graph,
         measured: Measured,
-        config: BootstrapConfig,
         search: TrilaterationConfig,
         without: Sequence[tuple[int, int]] | None = None,
     ) -> None:
         self.seeks, self.without, self.first = without is not None, without or (), (0, 0)
         self.odometry, self.ranges, self.path = measured.odometry, measured.ranges, measured.path
-        self.graph, self.config, self.search = graph, config, search
+        self.graph, self.assumed, self.search = graph, measured.sigma, search
         self.live = self.ranges.alive
         self.wheels, self.slips = self.odometry, np.zeros(len(self.odometry))
         self.poses = se2.chain(graph.poses[0], self.odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
-        self.sigma = np.full(len(graph.anchors), config.range_sigma)
+        self.sigma = np.full(len(graph.anchors), measured.sigma)
         self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
         self.low = self.high = self.solved = 0
         self.piece = self.smallest = 0.0
@@ -139,19 +137,19 @@ class Attempt:
         torn : continue where the trajectory has a jump; no attempt with a jump agrees with the ranges later.
         """
         if self.high == 0:
-            self.piece = self.config.piece * self._seed()
+            self.piece = BootstrapPolicy.piece * self._seed()
             self.first = self.low, self.high
-            self.smallest, self.solved = self.config.piece * self.piece, self.high - self.low
+            self.smallest, self.solved = BootstrapPolicy.piece * self.piece, self.high - self.low
             if self.placed.any():
-                self._solve(self.config.scales[1:])
+                self._solve(BootstrapPolicy.scales[1:])
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
-            held, failed = self.config.growth
+            held, failed = BootstrapPolicy.growth
             self.piece = held * self.piece if self._extend(self.piece) else max(failed * self.piece, self.smallest)
-            if self.high - self.low >= self.config.resolve_factor * self.solved or self.complete:
-                self._solve(self.config.scales[1:])
+            if self.high - self.low >= BootstrapPolicy.resolve_factor * self.solved or self.complete:
+                self._solve(BootstrapPolicy.scales[1:])
                 self.solved = self.high - self.low
-                if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
-                    self._solve(self.config.scales[1:])
+                if self._adopt(self._search(self.low, self.high, 2.0 * self.assumed)):
+                    self._solve(BootstrapPolicy.scales[1:])
                 if not torn and self._is_torn():
                     break
         if np.isinf(enough):
@@ -159,10 +157,10 @@ class Attempt:
 
     def agrees_to_the_end(self) -> bool:
         """Extend as long as the ranges agree; return whether they do over the whole path."""
-        length, agrees = self.config.enough, True
+        length, agrees = BootstrapPolicy.enough, True
         while agrees and not self.complete:
             self.run(length, torn=False)
-            length, agrees = 2.0 * length, bool(self.placed.any()) and self.misfit() < self.config.agreement
+            length, agrees = 2.0 * length, bool(self.placed.any()) and self.misfit() < BootstrapPolicy.agreement
         self._place_the_rest()
         return agrees and self.complete
 
@@ -197,7 +195,7 @@ class Attempt:
         edges = next((e for e in part.edges if isinstance(e, RangeEdges)), self.ranges.rows(np.zeros(0, dtype=np.intp)))
         groups = [edges.anchor == anchor for anchor in np.unique(edges.anchor)]
         shares = independent_shares(edges.tag_positions(part.poses), groups, RangeNoiseConfig())
-        density, learnt = log_densities(edges, part, self.config.range_sigma)
+        density, learnt = log_densities(edges, part, self.assumed)
         return edges, -edges.residuals(part)[:, 0] * edges.sigma, density, shares * (learnt > 0.0)
 
     def misfit(self) -> float:
@@ -207,8 +205,8 @@ class Attempt:
         """
         part = self._part(self.low, self.high or len(self.path))
         errors = [e.residuals(part)[:, 0] * e.sigma for e in part.edges if isinstance(e, RangeEdges)]
-        median = spread(errors[0]) / self.config.range_sigma if errors else 0.0
-        return max(median, self.config.agreement) if self._is_torn() else median
+        median = spread(errors[0]) / self.assumed if errors else 0.0
+        return max(median, BootstrapPolicy.agreement) if self._is_torn() else median
 
     def _place_the_rest(self) -> None:
         """Put the anchors that stay unclear at their likeliest places."""
@@ -220,7 +218,7 @@ class Attempt:
         """Return whether a step of the known poses differs grossly from the odometry's."""
         low, high = self.low, self.high or len(self.path)
         off = se2.between(self._motion[low : high - 1], se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
-        return bool(np.any(np.abs(off[self.slips[low : high - 1] == 0.0]) > self.config.tear))
+        return bool(np.any(np.abs(off[self.slips[low : high - 1] == 0.0]) > BootstrapPolicy.tear))
 
     @property
     def _motion(self) -> Floats:
@@ -232,21 +230,21 @@ class Attempt:
 
         Returns its length, m.
         """
-        best, most, config = None, 0.0, self.config
-        total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), config.seen)
-        for length in [d for d in config.seed_distances if d < total] + [total]:
-            places = 1 + max(0, min(config.starts, int(2 * total / max(length, TINY)) - 2))
+        best, most = None, 0.0
+        total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), BootstrapPolicy.seen)
+        for length in [d for d in BootstrapPolicy.seed_distances if d < total] + [total]:
+            places = 1 + max(0, min(BootstrapPolicy.starts, int(2 * total / max(length, TINY)) - 2))
             for start in np.linspace(0.0, total - length, places):
                 low = int(np.searchsorted(self.path, start))
                 high = int(np.searchsorted(self.path, start + length, "right"))
                 if any(low < last and first < high for first, last in self.without) and length < total:
                     continue
-                found = self._search(low, high, config.drift * length)
+                found = self._search(low, high, BootstrapPolicy.drift * length)
                 clear = [h[0] for h in found.values() if h and not ambiguous(h, self.search)]
-                worth = sum(1.0 / (1.0 + h.sigma / config.range_sigma + h.position_sigma) for h in clear)
+                worth = sum(1.0 / (1.0 + h.sigma / self.assumed + h.position_sigma) for h in clear)
                 if worth > most + TINY or (best is None and length == total):
                     best, most = (found, low, high), worth
-            if most > config.clear_enough * count:
+            if most > BootstrapPolicy.clear_enough * count:
                 break
         assert best is not None
         found, self.low, self.high = best
@@ -304,9 +302,9 @@ class Attempt:
         """
         part = self._part(low, high)
         errors = [np.abs(e.residuals(part)) for e in part.edges if isinstance(e, RangeEdges)]
-        if not errors or float(np.median(errors[0])) < self.config.agreement:
+        if not errors or float(np.median(errors[0])) < BootstrapPolicy.agreement:
             return True
-        self._anneal(low, high, end, self.config.scales)
+        self._anneal(low, high, end, BootstrapPolicy.scales)
         slips, forward = np.flatnonzero(self.slips > 0.0) + 1, end == low
         if forward:
             low = max(int(np.searchsorted(self.path, self.path[end] - piece)), int(slips[slips <= high].max(initial=self.low)))
@@ -345,14 +343,14 @@ class Attempt:
         other.poses[low:high] = found.poses if forward else found.poses[::-1]
         other.slips[slice(*ends)] = 1.0
         other.wheels = with_slips(self.odometry, other.slips)
-        other._anneal(low, high, low if forward else high - 1, self.config.scales[1:])
+        other._anneal(low, high, low if forward else high - 1, BootstrapPolicy.scales[1:])
         return other
 
     def with_slips(self, slips: Floats) -> Self:
         """Return the attempt solved with probabilities (e,) that the wheels slip over each step."""
         other = self._copy()
         other.slips, other.wheels = slips, with_slips(self.odometry, slips)
-        other._solve(self.config.scales[-1:])
+        other._solve(BootstrapPolicy.scales[-1:])
         return other
 
     def _copy(self) -> Self:
@@ -362,7 +360,7 @@ class Attempt:
 
     def _cost(self, low: int, high: int) -> float:
         """Return half the robust chi2 of wheels and ranges over the poses [low, high), that of ranges as annealing ends."""
-        part, kernel = self._part(low, high), Kernel("geman-mcclure", self.config.scales[-1])
+        part, kernel = self._part(low, high), Kernel("geman-mcclure", BootstrapPolicy.scales[-1])
         robust = (replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in part.edges)
         return 0.5 * float(sum(edge_cost(e, e.residuals(part)) for e in robust))
 
@@ -384,12 +382,12 @@ class Attempt:
             if isinstance(edges, RangeEdges):
                 error = edges.residuals(solved)[:, 0] * edges.sigma
                 for anchor in np.unique(edges.anchor):
-                    self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.config.range_sigma)
+                    self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.assumed)
 
     def _tightened(self, graph: Graph, scales: tuple[float, ...]) -> Graph:
         """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
         ranges = [k for k, e in enumerate(graph.edges) if isinstance(e, RangeEdges)]
-        return optimize_tightening(graph, ranges, scales, self.config.solver)
+        return optimize_tightening(graph, ranges, scales, BootstrapPolicy.solver)
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
