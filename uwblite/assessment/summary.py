@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, spread_about_median
+from ..arrays import OUTLIER, Floats, spread_about_median
 from ..findings import Finding
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
@@ -42,7 +42,7 @@ def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid |
         own = [residuals[ranges.anchor == k] for k in np.flatnonzero(estimate.placed)]
         typical = float(np.median([spread_about_median(r) for r in own])) if own else 0.0
     # Relative to the scatter of a typical anchor's ranges; relative to its own scatter, no anchor would ever disagree.
-    limit = 3.0 * max(typical, 0.05)
+    limit = OUTLIER * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
     anchors = _with_times(anchors, ranges, recordings)
     listed = {

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, run_starts, spread
+from ..arrays import OUTLIER, Bools, Floats, Ints, run_starts, spread
 from .surface_rays import MeasuredSurfaces, RayNoise, ShapePolicy, SurfaceRays, Surfaces, to_circle
 
 
@@ -33,7 +33,7 @@ class RayPolicy:
     """The same of one on a column, rad."""
     fewest: ClassVar[int] = 200
     """Least number of rays from which their noise is learnt."""
-    clip: ClassVar[float] = 3.0
+    clip: ClassVar[float] = OUTLIER
     """Standard deviations at which residuals are clipped: outliers give no information about the noise of inliers."""
     places: ClassVar[int] = 5
     """Least number of places of a surface from which the correlation of its residuals is learnt."""

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri, logit
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import OUTLIER, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
@@ -241,7 +241,7 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
     sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
     reach = np.hypot(clouds.points[:, 0], clouds.points[:, 1])
     arm = float(np.quantile(reach, PairPolicy.good_share)) if len(reach) else 0.0
-    return 3.0 * (sigma[:, 0] + sigma[:, 2] * arm)
+    return OUTLIER * (sigma[:, 0] + sigma[:, 2] * arm)
 
 
 def _edges(raster: CloudRasters, i: Ints, step: Floats) -> tuple[RelativePoseEdges, float]:

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import OUTLIER, Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..lidar import submaps
@@ -30,7 +30,7 @@ Tried = set[tuple[int, int, bool]]
 class CandidatePolicy:
     """Which pairs are worth a match."""
 
-    sigmas: ClassVar[float] = 3.0
+    sigmas: ClassVar[float] = OUTLIER
     """Standard deviations within which the truth is looked for."""
     shared: ClassVar[float] = 0.25
     """Least share of its surface that the smaller of two sub-maps should have in common with the other."""

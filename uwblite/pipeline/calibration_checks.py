@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import softmax
 
-from ..arrays import Floats
+from ..arrays import ENOUGH, Floats
 from ..errors import SolverError
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
@@ -31,8 +31,6 @@ _TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
 _PARTS = 8
 """Parts of a recording whose offsets are compared."""
-_LEAST = 20
-"""Least number of keyframes in a part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +170,7 @@ def _by_parts(estimate: Estimate, at: int, task: Task) -> tuple[Floats, Floats]:
     values, sigmas = [], []
     for recording in task.following(estimate).recordings.each:
         rows = np.arange(recording.rows.start, recording.rows.stop)
-        for part in np.array_split(rows, max(1, min(_PARTS, len(rows) // _LEAST))):
+        for part in np.array_split(rows, max(1, min(_PARTS, len(rows) // ENOUGH))):
             try:
                 alone = optimize(stretch(problem, int(part[0]), int(part[-1]) + 1), rough(task.config.solver))[0]
                 sigma = float(marginals(alone).covariances.calibration[at])

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, require_type
+from ..arrays import ENOUGH, Bools, Floats, Ints, require_type
 from ..constraints import Clock, Constraints
 from ..errors import DataError
 from ..grid.occupancy_grid import GridConfig
@@ -33,8 +33,6 @@ class RecordingPolicy:
     """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
     sparse: ClassVar[float] = 0.11
     """s between samples of an odometry slower than 10 Hz, which interpolation does not bridge well."""
-    alike: ClassVar[int] = 20
-    """Samples of the odometry of a moving robot that two recordings do not have in common by chance."""
     same_moment: ClassVar[float] = 1e-6
     """s; difference of stamps that is rounding."""
     scans_per_move: ClassVar[int] = 2
@@ -190,7 +188,7 @@ def _alike(one: SensorLog, other: SensorLog) -> bool:
     _, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
     same = np.all(a.poses[i] == b.poses[j], axis=1)
     moving = np.any(a.poses[i] != a.poses[np.maximum(i - 1, 0)], axis=1)
-    return int(np.sum(same & moving)) > RecordingPolicy.alike
+    return int(np.sum(same & moving)) > ENOUGH
 
 
 def later(recordings: Recordings, shift: float) -> Recordings:

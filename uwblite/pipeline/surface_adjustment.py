@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated, rms_length
+from ..arrays import OUTLIER, Bools, Floats, Ints, concatenated, rms_length
 from ..graph.calibration import LASER
 from ..graph.eliminated import BlockEquations, factor, sum_of_blocks
 from ..graph.graph import Graph
@@ -68,7 +68,7 @@ class SurfacePolicy:
     """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
     still: ClassVar[float] = STILL
     """The next change of the poses, rms, m, that ends them once noise and pairs have settled."""
-    kernel: ClassVar[float] = 3.0
+    kernel: ClassVar[float] = OUTLIER
     wider: ClassVar[float] = 4.0
     """Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
     step; half as much in each that follows (graduated non-convexity: A. Blake, A. Zisserman, Visual reconstruction, 1987)."""

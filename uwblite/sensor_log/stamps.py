@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import ENOUGH, Floats
 from .sensors import Odometry
 
 _WINDOW = 2.0
@@ -12,8 +12,8 @@ _READINGS, _STEPS = 4, 100
 """Least number of steps within a window, and of such steps in all, that show how regular stamps are."""
 _ARM = 0.3
 """m from the middle of a robot at which a turn counts as way."""
-_FEW_STAMPS, _BUFFERED = 20, 10.0
-"""Stamps that may be equal by chance; m, more than a robot drives while readings wait in a buffer: seconds at 3 m/s at most."""
+_BUFFERED = 10.0
+"""m, more than a robot drives while readings wait in a buffer: seconds at 3 m/s at most."""
 
 
 def in_bursts(stamps: Floats, progress: Floats | None = None) -> bool:
@@ -53,7 +53,7 @@ def odometry_in_bursts(odometry: Odometry) -> bool:
 def stand_still(stamps: Floats, travelled: Floats) -> bool:
     """Return whether stamps (n,), s, in the order of the readings, stand still while the robot drives, until each reading so
     far (n,), m, and farther within one stamp than while a buffer fills."""
-    if len(stamps) < _FEW_STAMPS or travelled[-1] - travelled[0] <= 0.0:
+    if len(stamps) < ENOUGH or travelled[-1] - travelled[0] <= 0.0:
         return False
     way = np.diff(travelled)
     group = np.concatenate([[0], np.cumsum(np.diff(stamps) != 0.0)])
