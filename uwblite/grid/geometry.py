@@ -12,7 +12,7 @@ from ..errors import ConfigError
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 MEGA = 1e6
-_STRIP = 256
+_STRIP = 64
 """Rows of a map that are processed at a time."""
 _OUTER = 0.01
 """Share of the points left out on each side of a box without outliers."""

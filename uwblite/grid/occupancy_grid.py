@@ -21,6 +21,8 @@ from .ray_counter import WEIGHT_UNIT, RayCounter
 
 OCCUPIED_ABOVE = 0.65
 """Probability above which a cell counts as occupied."""
+OCCUPIED_ODDS = math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE))
+"""The same as log-odds."""
 FREE_BELOW = 0.196
 """Probability below which a cell counts as free; between the two it is unknown."""
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
@@ -125,12 +127,12 @@ def walls_of(counter: RayCounter, config: GridConfig) -> Bools:
 
     Here as in from_counts, memory of cells that no ray met is not touched.
     """
-    occupied, walls = np.zeros(np.add(counter.hits.shape, 2), dtype=bool), np.zeros(counter.hits.shape, dtype=bool)
-    least = math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE))
+    walls, (last, cols) = np.zeros(counter.hits.shape, dtype=bool), counter.hits.shape
     for rows in counter.geometry.strips():
-        np.copyto(occupied[1:-1, 1:-1][rows], True, where=_log_odds(counter, rows, config).astype(np.float32) > least)
-    for rows in counter.geometry.strips():
-        around = occupied[rows.start : rows.stop + 2]
-        beside = around[:-2] | around[1:-1] | around[2:]
+        first, end = max(rows.start - 1, 0), min(rows.stop + 1, last)
+        occupied = np.zeros((rows.stop - rows.start + 2, cols + 2), dtype=bool)
+        within = slice(first - rows.start + 1, end - rows.start + 1)
+        occupied[within, 1:-1] = _log_odds(counter, slice(first, end), config).astype(np.float32) > OCCUPIED_ODDS
+        beside = occupied[:-2] | occupied[1:-1] | occupied[2:]
         np.copyto(walls[rows], True, where=beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:])
     return walls

@@ -16,7 +16,7 @@ from ..arrays import Bools, Floats, Ints, chunks
 from ..errors import DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
-from .occupancy_grid import OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid, from_counts, walls_of
+from .occupancy_grid import OCCUPIED_ODDS, GridConfig, OccupancyGrid, from_counts, walls_of
 from .ray_counter import RayCounter
 
 
@@ -130,7 +130,7 @@ def from_sweeps(
     counter = RayCounter(grid, config.clear_weight, most=count)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
-    def trace(walls: Bools | None, before: int) -> None:
+    def trace(counter: RayCounter, walls: Bools | None, before: int) -> None:
         for task in tasks:
             for some in task.parts():
                 rays = task.sweeps.rays(some, task.reach(some, empty=walls is not None))
@@ -139,10 +139,11 @@ def from_sweeps(
                 if progress is not None:
                     progress(before, count * (2 if clears else 1))
 
-    trace(None, 0)
+    trace(counter, None, 0)
     if clears:
-        trace(walls_of(counter, config), count)
+        trace(counter, walls_of(counter, config), count)
     drawn = from_counts(counter if geometry else counter.cropped(), config, spent=True)
+    del counter  # Its hits take half as much memory as the map.
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)
 
@@ -153,7 +154,7 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
     Beams that ended before the wall, at what is not in the map, do not count. nan where no beam meets a wall.
     """
     met = lost = 0
-    states, g = np.pad(grid.states(), 1, constant_values=UNKNOWN), grid.geometry
+    g = grid.geometry
     for sweeps in (each for each in recordings if len(each.first)):
         chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.intp))
         far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
@@ -164,7 +165,7 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
             origins, way = rays.origins[part], rays.endpoints[part] - rays.origins[part]
             row, col = g.cell_of(origins + along[:, None, None] * way)
             inside = g.inside(row, col)
-            wall = states[np.where(inside, row + 1, 0), np.where(inside, col + 1, 0)] == OCCUPIED
+            wall = inside & (grid.log_odds[np.where(inside, row, 0), np.where(inside, col, 0)] > OCCUPIED_ODDS)
             distance = np.where(wall.any(axis=0), reach * along[wall.argmax(axis=0)], np.inf)
             reading = readings[part]
             nothing = np.isposinf(reading)

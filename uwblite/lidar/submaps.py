@@ -12,9 +12,11 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, chunks, rms_length
 from ..config import setting
-from .clouds import CLOUDS_AT_ONCE, Clouds, joined
+from .clouds import Clouds, joined
 from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statistical_outlier_filter
 
+_CLOUDS = 1024
+"""That are merged together; bounds the memory."""
 _FACINGS = 4
 
 
@@ -85,9 +87,10 @@ def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
 def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:
     """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,) in the frames of reference
     keyframes (s,), and filter them: voxel, statistical, radius."""
+    # Long pieces have many clouds each.
+    at_once = max(_CLOUDS * len(first) // max(int(np.sum(last - first)), 1), 1)
     parts = [
-        _built(clouds, poses, first[some], last[some], reference[some], config)
-        for some in chunks(len(first), CLOUDS_AT_ONCE)
+        _built(clouds, poses, first[some], last[some], reference[some], config) for some in chunks(len(first), at_once)
     ]
     return Submaps(first, last, reference, replace(joined(parts), work=clouds.work), config.voxel)
 
