@@ -8,7 +8,7 @@ from typing import Any
 from ..assessment.recording import Diagnosis, diagnose, screened
 from ..errors import UwbliteError
 from ..findings import folded
-from ..pipeline.expected_cost import SECONDS_AT_LEAST, expected_cost, model_seconds
+from ..pipeline.expected_cost import SECONDS_AT_LEAST, expected_cost
 from ..report.printable import calibration_text, duration, signed
 from ..sensor_log import SensorLog
 from . import console
@@ -19,11 +19,12 @@ def run(args: argparse.Namespace) -> int:
     log = recording(args, args.log)
     began = time.perf_counter()
     repaired = screened(log)
+    needs = {} if repaired is None else expected_cost(repaired)
     if args.map:
         diagnosis, seconds = examined(log, repaired, began)
+        needs |= {"seconds": round(seconds, 1)} if needs else {}
     else:
-        diagnosis, seconds = diagnose(log, repaired=repaired), model_seconds(log)
-    needs = {} if repaired is None else {**expected_cost(repaired), "seconds": round(seconds, 1)}
+        diagnosis = diagnose(log, repaired=repaired)
     console.report(
         args.json, summary_json(args.log, diagnosis, needs), report_lines(args.log, diagnosis, needs, mapped=args.map)
     )

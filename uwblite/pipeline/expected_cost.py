@@ -9,6 +9,8 @@ from .. import se2
 from ..arrays import Floats
 from ..grid.geometry import MEGA
 from ..grid.occupancy_grid import GridConfig
+from ..odometry import keyframes
+from ..odometry.keyframes import KeyframeConfig
 from ..sensor_log import SensorLog
 
 _GRID = GridConfig()
@@ -19,14 +21,14 @@ _GRID = GridConfig()
 class Rates:
     """What maps of a kind of recordings cost, measured on the computer of docs/lab/performance.md."""
 
-    seconds: tuple[float, float, float]
-    """Per metre of driving, range, and reading of the laser."""
+    seconds: tuple[float, float, float, float]
+    """Per keyframe, range, reading of the laser, and scan placed between keyframes."""
     bytes: tuple[float, float, float]
     """Per metre of driving, reading, and cell of the grid, while which is counted half of the graph's memory is free again."""
 
 
-WITH_LIDAR = Rates((0.045, 1.5e-4, 2e-7), (0.2e6, 2.0, 8.0))
-RANGES_ALONE = Rates((0.0005, 8e-4, 0.0), (0.09e6, 0.0, 0.0))
+WITH_LIDAR = Rates((0.006, 1.5e-4, 2e-7, 1.5e-4), (0.2e6, 2.0, 8.0))
+RANGES_ALONE = Rates((1e-4, 8e-4, 0.0, 0.0), (0.09e6, 0.0, 0.0))
 """Ranges alone hold the trajectory, and an optimisation takes more steps."""
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files."""
@@ -38,10 +40,13 @@ _SCANS = 500
 
 def model_seconds(log: SensorLog) -> float:
     """Return the wall time of a map on the computer of docs/lab/performance.md, s."""
+    frames = len(keyframes.of(log, KeyframeConfig()).stamps)
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
-    readings = 0 if log.scans is None else log.scans.ranges.size
-    rates = WITH_LIDAR if readings else RANGES_ALONE
-    return SECONDS_AT_LEAST + float(np.dot(rates.seconds, (log.odometry.travelled[-1], ranges, readings)))
+    scans, beams = (0, 0) if log.scans is None else log.scans.ranges.shape
+    # Two of a step, where the odometry agrees with these.
+    placed = min(max(scans - frames, 0), 2 * frames)
+    rates = WITH_LIDAR if scans else RANGES_ALONE
+    return SECONDS_AT_LEAST + float(np.dot(rates.seconds, (frames, ranges, scans * beams, placed)))
 
 
 def seen_size(log: SensorLog) -> Floats:
