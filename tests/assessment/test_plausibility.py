@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import aligned_error, box, odometry, ranges, recording, scans, wander
-from helpers.planted_tasks import estimate_of, recordings_of, task_of
+from helpers.planted_tasks import estimate_of, recordings_of, standing, task_of
 
 from uwblite import se2
 from uwblite.assessment.plausibility import (
@@ -14,6 +14,7 @@ from uwblite.assessment.plausibility import (
     check_closures,
     check_fit,
     check_handedness,
+    check_lengths,
     check_moved_together,
 )
 from uwblite.constraints import Constraints, GivenAnchor
@@ -26,7 +27,7 @@ from uwblite.loop_closure.closures import no_closures
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
-from uwblite.sensor_log import SensorMounting
+from uwblite.sensor_log import OdometryBreaks, Screening, SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 LEVEL = SensorMounting(anchor_height=0.0)
@@ -298,3 +299,13 @@ def test_lengths_that_differ_by_more_than_15_percent_are_a_doubt(of, off, state,
     found = [(f.severity, f.kind) for f in check_calibration([value], {key: Unknown(key, 0.02, "1", "")}, task_of(lidar=True))]
     doubted = severity == "doubt" and of != "heading_scale"
     assert found == ([] if severity is None else [("doubt", "scales") if doubted else ("warning", "unusual-calibration")])
+
+
+@pytest.mark.parametrize(("ratios", "said"), [
+    ((), None), ((np.nan, 1.0), None), ((1.0, 1.16), 1.16), ((0.84, 2.0), 0.84), ((1.14, 0.86), None),
+])  # fmt: skip
+def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
+    """By the first such recording; recordings that compare nothing do not count."""
+    each = [{"screening": Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)} for ratio in ratios]
+    found = check_lengths(task_of(standing(len(ratios) + 1, lidar=True, each=each)))
+    assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])

@@ -73,6 +73,7 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: check_sensors([recording.log for recording in view.task.recordings.each]),
     lambda view: check_closures(view.estimate, view.grid),
     lambda view: check_calibration(view.calibrated, view.usual, view.task),
+    lambda view: check_lengths(view.task),
     lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
     lambda view: check_drifts(view.estimate, view.task),
     lambda view: check_untied_parts(view.estimate, view.task),
@@ -212,6 +213,22 @@ def check_calibration(
             text += "; the wheels missed some of the travelled distance: the map may be too short"
         add = doubt if short or unclear or kind == "scales" else warning
         yield add(kind, text, name=value.name, value=value.value, sigma=value.sigma, usual=sigma)
+
+
+def check_lengths(task: Task) -> Iterator[Finding]:
+    """Doubt a map whose lidar and wheels measured different lengths before a calibration could take that up.
+
+    The map has the lidar's lengths: where that is wrong, all of it has another scale, and no residual shows it.
+    """
+    screenings = [recording.log.screening for recording in task.recordings.each]
+    ratios = np.array([screening.lidar_by_wheels for screening in screenings if screening is not None])
+    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _OTHER_LENGTH)]
+    if len(off):
+        text = (
+            f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and the map has the lidar's scale; "
+            "check the units of both"
+        )
+        yield doubt("scales", text, lidar_by_wheels=float(off[0]))
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
