@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .. import se2
 from ..arrays import MOST, TINY, Floats
 from ..errors import DataError
 from ..sensor_log import LONGEST_RANGE, Odometry, SensorLog
@@ -192,9 +193,10 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
         return 1.0, False
     move = np.diff(xy[apart], axis=0)
     # As complex numbers: of squares the sign does not count.
-    along = (move[:, 0] + 1j * move[:, 1]) ** 2 / np.maximum(np.hypot(*move.T), np.finfo(float).tiny)
+    along = se2.as_complex(move) ** 2 / np.maximum(np.hypot(*move.T), np.finfo(float).tiny)
     weight, half = float(np.abs(along).sum()), 0.5 * (heading[apart[1:]] + heading[apart[:-1]])
-    return float(np.abs(np.sum(along * np.exp(-2j * factor * half)))) / weight, bool(np.abs(along.sum()) < MOST * weight)
+    turned = along * se2.unit_complex(-2.0 * factor * half)
+    return float(np.abs(turned.sum())) / weight, bool(np.abs(along.sum()) < MOST * weight)
 
 
 class HeadingReading(NamedTuple):
