@@ -19,6 +19,7 @@ from ..graph.graph import Graph
 from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
+from ..problem.alternatives import EvidencePolicy
 from .range_noise import MOST_RANGES
 from .trilateration import TrilaterationConfig, path_placements, trilaterate
 
@@ -26,10 +27,8 @@ _CLEARLY = 0.02
 """Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
 _LEAST_RANGES = 4
 """Of a chain: fewer are three unknowns and no check."""
-_BEND = 0.2
+_CHAIN_SIGMA = 0.2
 """m; standard deviation of a range along a rigid chain: the error after some minutes of odometry."""
-_KEPT, _APART = 4, 0.1
-"""Hypotheses kept, and m and rad between them."""
 
 
 class Start(NamedTuple):
@@ -139,7 +138,7 @@ def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
             for (cost, g), there in zip(hypotheses, anchors, strict=True)
             for more, T in _places(*_ties(g, there, mine, here))
         ]
-        hypotheses = sorted(found, key=lambda h: h[0])[:_KEPT]
+        hypotheses = sorted(found, key=lambda h: h[0])[: EvidencePolicy.searched]
         waiting.remove(chain)
         here = here | mine
     return [g for _, g in hypotheses]
@@ -183,7 +182,7 @@ def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Flo
     if len(ranges) < _LEAST_RANGES:
         return [(0.0, np.zeros(se2.POSE))]
     best: list[tuple[float, Floats]] = []
-    for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _BEND)):
-        if all(np.abs(se2.between(motion, other)).max() > _APART for _, other in best):
+    for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _CHAIN_SIGMA)):
+        if all(np.abs(se2.between(motion, other)).max() > EvidencePolicy.same_path for _, other in best):
             best.append((cost, motion))
-    return best[:_KEPT]
+    return best[: EvidencePolicy.searched]
