@@ -13,8 +13,8 @@ def a_bank(rival=-20.0):
     return hypotheses.reweighted(bank, np.array([0.0, rival]))
 
 
-def odds(scans=10.0, ranges=5.0, share=1.0, alone=False, agreed=0.0):
-    return Odds(scans, ranges, share, alone, agreed)
+def odds(scans=10.0, ranges=5.0, share=1.0, alone=False, agreed=0.0, tracked=False):
+    return Odds(scans, ranges, share, alone, agreed, tracked)
 
 
 def is_certain(found):
@@ -38,6 +38,13 @@ def test_what_fits_as_well_in_another_building_is_nowhere_until_the_searches_agr
     assert is_certain(odds(scans=-3.0, ranges=1.0, agreed=3.0))
 
 
+def test_a_robot_that_was_tracked_in_this_map_is_likely_to_be_in_it_still():
+    assert not is_certain(odds(scans=2.0, ranges=2.0))
+    assert is_certain(odds(scans=2.0, ranges=2.0, tracked=True))
+    # Carried to another building all the same: what contradicts is not outweighed.
+    assert "scans" in odds(scans=-7.0, ranges=2.0, tracked=True).nowhere
+
+
 def test_neither_scans_nor_agreement_outweigh_ranges_that_contradict():
     # An aisle that looks like the robot's own, which is not in the map.
     assert "ranges" in odds(scans=20.0, ranges=-24.0, share=0.4, agreed=6.0).nowhere
@@ -52,11 +59,11 @@ def test_what_one_kind_alone_says_is_not_outweighed_by_agreement():
 def test_odds_are_of_the_ranges_that_agree_and_of_scans_with_enough_ends():
     places, tags = np.array([[4.0, 0.0], [0.0, 3.0]]), np.zeros((2, 2))
     ranges = Ranges(np.arange(2), places, tags, np.array([4.0, 3.0]), *np.tile([[0.1], [0.0], [0.07], [1.5]], 2))
-    both = map_odds(3.0, FEW_ENDS, np.zeros(3), ranges, 1.0)
+    both = map_odds(3.0, FEW_ENDS, np.zeros(3), ranges, 1.0, False)
     assert (both.scans, both.share, both.alone, both.agreed) == (3.0, 1.0, False, 1.0)
     assert both.ranges > 2.0
-    assert map_odds(3.0, FEW_ENDS - 1, np.zeros(3), ranges, 1.0).scans == 0.0
-    wrong = map_odds(3.0, FEW_ENDS, np.array([3.0, 0.0, 0.0]), ranges, 1.0)
+    assert map_odds(3.0, FEW_ENDS - 1, np.zeros(3), ranges, 1.0, False).scans == 0.0
+    wrong = map_odds(3.0, FEW_ENDS, np.array([3.0, 0.0, 0.0]), ranges, 1.0, False)
     assert wrong.alone
     assert wrong.ranges < -3.0
 

@@ -85,6 +85,8 @@ class PoseEstimator:
         """Operations on elements of arrays since the caller last set it to 0."""
         self.tracks = False
         """Whether one place is tracked, however vague the pose has become."""
+        self._tracked = False
+        """Whether one was tracked before."""
         self._odometer = odometer
         self._bank = hypotheses.none(len(anchors.ids))
         self._places = PlaceSearch(known)
@@ -252,7 +254,7 @@ class PoseEstimator:
         undecided = verdict.undecided(self._bank, best, found.complete)
         # Agreement from before the part that is used speaks of a place from which the robot was carried away.
         agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
-        odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed)
+        odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed, self._tracked)
         self._reason = (
             undecided
             or verdict.imprecise(self._bank.pose_covariances[best])
@@ -269,7 +271,7 @@ class PoseEstimator:
         self._parts = 2 * self._parts if odds.nowhere and self._parts < _MOST_PARTS else 1
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
-            self.tracks = True
+            self.tracks = self._tracked = True
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
             self._running.restart(bool(self._window.looks))
 

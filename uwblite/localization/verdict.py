@@ -85,11 +85,13 @@ class Odds:
     agreed: float
     """m driven over which all searches found it and no other place: in another building the best place leaps. Each counts
     LIKELY; by scans or ranges alone, with nothing independent beside them, it is all that counts, up to twice what they say."""
+    tracked: bool = False
+    """A pose was tracked in this map before: that the robot is in another building now counts as LIKELY against it."""
 
     @property
     def total(self) -> float:
         """Of all together."""
-        measured, stays = self.scans + self.ranges, LIKELY * self.agreed
+        measured, stays = self.scans + self.ranges, LIKELY * (self.agreed + self.tracked)
         return min(stays, 2.0 * measured) if self.alone else stays + measured
 
     @property
@@ -104,18 +106,18 @@ class Odds:
         return "the scans fit the walls nowhere well; is this the right map?" if against else ""
 
 
-def map_odds(scans: float, ends: float, pose: Floats, ranges: Ranges, agreed: float) -> Odds:
-    """Return the odds of a pose (3,), where searches have agreed over so many m.
+def map_odds(scans: float, ends: float, pose: Floats, ranges: Ranges, agreed: float, tracked: bool) -> Odds:
+    """Return the odds of a pose (3,).
 
     Parameters
     ----------
-    scans : odds by the rays, of so many ends in known space.
+    scans : odds by the rays, of so many ends in known space. agreed, tracked : see Odds.
     """
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= SURE * ranges.sigma
     anchors, sees = len(np.unique(ranges.anchor[agree])), ends >= FEW_ENDS
     likelihood = float(shared_likelihood(pose[None], ranges)[0]) - _RANGE_ELSEWHERE * float(series(ranges).share.sum())
     share = float(agree.sum()) / max(len(ranges), 1)
-    return Odds(scans if sees else 0.0, likelihood, share, not (sees and anchors >= 2), agreed)
+    return Odds(scans if sees else 0.0, likelihood, share, not (sees and anchors >= 2), agreed, tracked)
 
 
 def other_unit(walls: Walls | None, pose: Floats, rays: Rays, independent: float, ranges: Ranges) -> str:
