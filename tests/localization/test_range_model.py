@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from uwblite import se2
-from uwblite.localization import hypotheses, range_model
+from uwblite.localization import range_model
 from uwblite.localization.range_model import Ranges
 from uwblite.radio.nlos_mixture import RangeMixture
 from uwblite.radio.range_errors import RangeErrors
@@ -81,32 +81,6 @@ def test_two_tags_that_measure_at_once_are_two_places():
     _, ranges = some_ranges(1)
     two = replace(ranges.rows(np.array([0, 3])), way=np.zeros(2), tags=np.array([[0.0, 0.0], [0.4, 0.0]]))
     np.testing.assert_allclose(range_model.series(two).stay[1], 0.95 * np.exp(-0.4 / 1.5))
-
-
-def test_a_common_error_moves_the_pose_as_its_effect_says():
-    """With exact ranges all weights are equal: a small error of all ranges to one anchor moves the best pose linearly."""
-    pose, ranges = some_ranges(2)
-    true = np.hypot(*(pose[:2] + se2.rotate(pose[2], ranges.tags) - ranges.places).T)
-    exact = replace(ranges, values=true, sigma=np.full(12, 0.02))
-    effect = range_model.bias_effect(pose[None], exact, 4)[0]
-    np.testing.assert_array_equal(effect[:, 3], 0.0)
-    for anchor in range(3):
-        shifted = replace(exact, values=true + 1e-4 * (exact.anchor == anchor))
-        found = hypotheses.refined(pose[None], shifted)[0] - pose
-        np.testing.assert_allclose(found, 1e-4 * effect[:, anchor], atol=2e-6)
-
-
-def test_poses_by_ranges_are_as_unsure_as_their_common_errors_and_correlated_with_them():
-    biases = np.array([0.1, 0.2, 0.3])
-    effect = np.random.default_rng(1).normal(size=(2, 3, 3)) * np.array([0.0, 1.0])[:, None, None]
-    found = hypotheses.started(np.ones((2, 3)), np.tile(0.04 * np.eye(3), (2, 1, 1)), biases, effect)
-    bare = hypotheses.started(np.ones((2, 3)), np.tile(0.04 * np.eye(3), (2, 1, 1)), biases)
-    np.testing.assert_array_equal(found.covariance[0], bare.covariance[0])
-    # The estimate is the truth plus effect times bias: the error that is left has the opposite sign.
-    shared = effect[1] * biases**2
-    np.testing.assert_allclose(found.pose_covariances[1], 0.04 * np.eye(3) + shared @ effect[1].T)
-    np.testing.assert_allclose(found.covariance[1, :3, -3:], -shared)
-    assert np.linalg.eigvalsh(found.covariance[1]).min() > 0
 
 
 def test_errors_that_the_map_s_own_ranges_had_at_a_place_are_expected_there():

@@ -1,20 +1,9 @@
-"""The newest part of what was measured."""
+"""What is kept of the measurements of the last metres."""
 
 import numpy as np
-import pytest
 
 from uwblite.localization.walls import Rays
 from uwblite.localization.window import Window, WindowLook, WindowRange
-
-
-@pytest.mark.parametrize(("parts", "kept"), [(1, 9), (2, 4), (4, 2)])
-def test_the_newest_part_of_a_window_is_of_its_time(parts, kept):
-    rays = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
-    window = Window([WindowLook(rays, np.zeros(3), 0.4 * k, float(k)) for k in range(9)])
-    assert [look.stamp for look in window.newest(parts).looks] == list(range(9 - kept, 9))
-    assert not Window().newest(parts).looks
-    assert window.newest(parts).length(4.0) == pytest.approx(4.0 - 0.4 * (9 - kept))
-    assert Window().length(4.0) == 0.0
 
 
 def look(way, stamp):

@@ -153,8 +153,7 @@ class PlaceSearch:
         hessian, _ = range_model.range_factors(poses, ranges)
         hessian /= _FLAT if walls is None else 1.0
         covariances = np.linalg.inv(hessian + range_model.POOR) + np.diag(np.square(_SIGMA_FLOOR))
-        effect = range_model.bias_effect(poses, ranges, len(anchors.ids))
-        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma, effect)
+        fresh = hypotheses.started(poses, covariances, anchors.bias_sigma)
         return fresh if walls is None else hypotheses.matched(fresh, walls, few, 1.0)
 
 

@@ -86,13 +86,12 @@ def none(anchors: int) -> Hypotheses:
     return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
-def started(poses: Floats, covariances: Floats, biases: Floats, effect: Floats | None = None) -> Hypotheses:
+def started(poses: Floats, covariances: Floats, biases: Floats) -> Hypotheses:
     """Return hypotheses at poses (h, 3) with covariances (h, 3, 3) and prior values of the other unknowns.
 
     Parameters
     ----------
     biases : (a,) standard deviations of each anchor's range error that stays, m.
-    effect : (h, 3, a) by how much the poses move with the error that the ranges to an anchor have in common.
     """
     n = FIRST_ANCHOR + 2 * len(biases)
     mean, whole = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
@@ -100,10 +99,6 @@ def started(poses: Floats, covariances: Floats, biases: Floats, effect: Floats |
     prior = [*WHEEL_SIGMA, *np.full(2 * HARMONICS, PATTERN_SIGMA), LASER_SIGMA, *np.full(len(biases), SLOW_SIGMA), *biases]
     rest = np.arange(WHEELS.start, n)
     whole[:, rest, rest] = np.square(prior)
-    if effect is not None:
-        stays, shared = slice(n - len(biases), n), -effect * np.square(biases)
-        whole[:, POSE, stays], whole[:, stays, POSE] = shared, shared.transpose(0, 2, 1)
-        whole[:, POSE, POSE] -= shared @ effect.transpose(0, 2, 1)
     return Hypotheses(mean, whole, np.zeros(len(poses)))
 
 

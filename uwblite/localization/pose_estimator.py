@@ -35,8 +35,6 @@ _SEARCH_TIME = 0.5
 """s between two searches."""
 _MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
 """Most hypotheses, and log-weight below which one is removed."""
-_MOST_PARTS = 4
-"""Most parts of the window: a quarter of ten metres is enough for a start."""
 _STANDS = np.zeros(se2.POSE)
 _SCANS_DIFFER = "the scans do not fit the walls any more"
 
@@ -90,13 +88,9 @@ class PoseEstimator:
         self._odometer = odometer
         self._bank = hypotheses.none(len(anchors.ids))
         self._places = PlaceSearch(known)
-        self._searched = Window()
-        """Measurements of the running search."""
         self._searched_ranges = 0
-        """Ranges that had come when it began."""
+        """Ranges that had come when the running search began."""
         self._window = Window()
-        self._parts = 1
-        """Number of parts of the window, of which the newest is used for the search."""
         self._way = self._scan_way = 0.0
         self._noise = anchors.noise
         self._range_way = np.full(len(anchors.ids), -np.inf)
@@ -180,7 +174,7 @@ class PoseEstimator:
         if not self.tracks and len(self._window.ranges) > 2 * self._searched_ranges:
             # The new ones leave far fewer places to compare: sooner done than what is under way.
             self._places.drop()
-            self._search_stamp, self._parts = -np.inf, 1
+            self._search_stamp = -np.inf
         if free and not self._places.idle:
             compared, done = self._places.advance(self._bank, odom)
             self.work += done
@@ -195,9 +189,9 @@ class PoseEstimator:
             self._search_stamp = now
             # For a doubtful pose, places are compared by the measurements since scans fitted there: ranges may agree with a
             # wrong place by chance.
-            self._searched = self._window.since(self._running.matched) if self.tracks else self._window.newest(self._parts)
-            self._searched_ranges = len(self._window.ranges)
-            self._places.begin(self._searched, odom, self._way)
+            window = self._window.since(self._running.matched) if self.tracks else self._window
+            self._searched_ranges = len(window.ranges)
+            self._places.begin(window, odom, self._way)
 
     def state(self, wheels: Floats) -> LocalizerState:
         """Return the pose at the time of the last odometry, which is wheels (3,) in the odometry frame."""
@@ -238,7 +232,7 @@ class PoseEstimator:
     def _lose(self, why: str, since: float) -> None:
         """Begin again with the measurements since a time, s."""
         self.tracks, self._confirmed, self._reason = False, None, why
-        self._window, self._parts = self._window.since(since), 1
+        self._window = self._window.since(since)
         self._places.drop()
         self._running.forget_anchors()
         self._search_stamp = -np.inf
@@ -252,8 +246,7 @@ class PoseEstimator:
         best = int(np.argmax(self._bank.log_weight))
         ranges, pose = found.ranges, self._bank.poses[best].copy()
         undecided = verdict.undecided(self._bank, best, found.complete)
-        # Agreement from before the part that is used speaks of a place from which the robot was carried away.
-        agreed = min(self._agreed(None if undecided else pose), self._searched.length(self._way))
+        agreed = self._agreed(None if undecided else pose)
         odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed, self._tracked)
         self._reason = (
             undecided
@@ -261,14 +254,8 @@ class PoseEstimator:
             or odds.nowhere
             or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
         )
-        # That the robot was carried within the window is as unlikely as what counts as certain.
-        if not self._reason and odds.total < verdict.CERTAIN * (1 + (self._parts > 1)):
+        if not self._reason and odds.total < verdict.CERTAIN:
             self._reason = "found; a little more driving will confirm it"
-        # Measurements that fit nowhere may be of two places, before and after the robot was carried: their newest half is
-        # tried, then their newest quarter. Once such a part is enough by itself, the rest is removed.
-        if self._parts > 1 and not self._reason:
-            self._window = self._searched
-        self._parts = 2 * self._parts if odds.nowhere and self._parts < _MOST_PARTS else 1
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
             self.tracks = self._tracked = True

@@ -217,29 +217,15 @@ def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     return ranges.values - distance, np.stack([ux, uy, uy * lx - ux * ly], axis=-1)
 
 
-def cauchy(error: Floats, sigma: Floats | float) -> Floats:
-    """Return the weights of errors with a Cauchy kernel of two standard deviations."""
-    return np.asarray(1.0 / (1.0 + np.square(error / (2.0 * sigma))))
-
-
-def _weighted(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
-    """Return the errors (h, m), the Jacobian (h, m, 3) and the same times the robust weights of the ranges."""
-    error, jacobian = range_errors(poses, ranges)
-    weight = series(ranges).share * cauchy(error, ranges.sigma) / ranges.sigma**2
-    return error, jacobian, jacobian * weight[..., None]
-
-
 def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
-    error, jacobian, weighted = _weighted(poses, ranges)
+    """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3).
+
+    With a Cauchy kernel of two standard deviations.
+    """
+    error, jacobian = range_errors(poses, ranges)
+    weight = series(ranges).share / (ranges.sigma**2 + np.square(0.5 * error))
+    weighted = jacobian * weight[..., None]
     return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)
-
-
-def bias_effect(poses: Floats, ranges: Ranges, anchors: int) -> Floats:
-    """Return by how much (h, 3, a) poses (h, 3) by ranges move with an error that all ranges to an anchor have in common."""
-    _, jacobian, weighted = _weighted(poses, ranges)
-    own = (ranges.anchor[:, None] == np.arange(anchors)).astype(np.float64)
-    return np.linalg.solve(weighted.transpose(0, 2, 1) @ jacobian + POOR, weighted.transpose(0, 2, 1) @ own)
 
 
 POOR = np.diag(np.square([0.1, 0.1, 0.3]))

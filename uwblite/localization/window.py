@@ -78,15 +78,6 @@ class Window:
         """Return a window of the measurements after a time, s."""
         return Window([e for e in self.entries if e.stamp > stamp])
 
-    def newest(self, parts: int) -> "Window":
-        """Return the newest of so many parts of the window's time."""
-        stamps = [e.stamp for e in self.entries]
-        return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
-
-    def length(self, way: float) -> float:
-        """Return how many metres ago the oldest measurement is, where the odometer is `way`, m."""
-        return way - self.entries[0].way if self.entries else 0.0
-
     def add_range(self, entry: WindowRange) -> None:
         """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""
         own = [r for r in self.ranges if r.anchor == entry.anchor]
