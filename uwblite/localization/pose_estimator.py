@@ -245,11 +245,11 @@ class PoseEstimator:
         self._bank = found.hypotheses
         best = int(np.argmax(self._bank.log_weight))
         ranges, pose = found.ranges, self._bank.poses[best].copy()
-        undecided = verdict.undecided(self._bank, best, found.complete)
-        agreed = self._agreed(None if undecided else pose)
+        alone = found.complete and verdict.odds_of_place(self._bank, best) > verdict.LIKELY
+        agreed = self._agreed(pose if alone else None)
         odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed, self._tracked)
         self._reason = (
-            undecided
+            verdict.undecided(self._bank, best, found.complete)
             or verdict.imprecise(self._bank.pose_covariances[best])
             or odds.nowhere
             or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
@@ -263,7 +263,7 @@ class PoseEstimator:
             self._running.restart(bool(self._window.looks))
 
     def _agreed(self, pose: Floats | None) -> float:
-        """Return over how many metres driven searches found the same place alone, that of a pose (3,) now; None = none."""
+        """Return over how many metres driven searches found the same place likely, that of a pose (3,) now; None = none."""
         odom, first = self._odometer.pose, self._confirmed
         if pose is None:
             self._confirmed = None

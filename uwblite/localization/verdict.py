@@ -33,15 +33,19 @@ SURE = 4.0
 """Standard deviations from which an error is certain, and a range disagrees."""
 
 
+def odds_of_place(bank: Hypotheses, best: int) -> float:
+    """Return the log-odds of the best place against all others together."""
+    return -float(np.logaddexp.reduce(bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)], initial=-np.inf))
+
+
 def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
     """Return why another place than the best one may be right; "" = none may."""
     if not complete:
         return "too many places are as likely; drive on"
-    rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
-    if np.logaddexp.reduce(rivals, initial=-np.inf) < -CERTAIN:
+    if odds_of_place(bank, best) > CERTAIN:
         return ""
-    count = 1 + max(int((rivals > -CERTAIN).sum()), 1)
-    return f"{count} places are as likely; drive on, around a corner or past another anchor"
+    count = int((bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)] > -CERTAIN).sum())
+    return f"{1 + max(count, 1)} places are as likely; drive on, around a corner or past another anchor"
 
 
 def imprecise(covariance: Floats) -> str:
@@ -83,8 +87,10 @@ class Odds:
     alone: bool
     """There are scans or ranges alone."""
     agreed: float
-    """m driven over which all searches found it and no other place: in another building the best place leaps. Each counts
-    LIKELY; by scans or ranges alone, with nothing independent beside them, it is all that counts, up to twice what they say."""
+    """m driven over which all searches found it LIKELY against all others: in another building the best place leaps. Each
+    counts as much; by scans or ranges alone, with nothing independent beside them, it is all that counts, up to twice what
+    they say.
+    """
     tracked: bool = False
     """A pose was tracked in this map before: that the robot is in another building now counts as LIKELY against it."""
 
