@@ -304,6 +304,22 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
     return z, root @ se2.rotation(z[:, 2]) / np.sqrt(variance)[:, None, None]
 
 
+def squared_distance(error: Floats, covariance: Floats, sqrt_information: Floats) -> Floats:
+    """Return the squared Mahalanobis distance (e,) between measured relative poses and others, in measured directions alone.
+
+    With a measurement's root L of information, its error e and the covariance C of the other pose, whitened errors L e have the
+    covariance 1 + L C L^T; a direction without information adds nothing to either.
+
+    Parameters
+    ----------
+    error : (e, 3) of the other poses, seen from the measured ones. covariance : (e, 3, 3) of the other poses, in the same
+        frames. sqrt_information : (e, 3, 3) L, in these frames.
+    """
+    whitened = np.einsum("eij,ej->ei", sqrt_information, error)
+    joint = np.eye(error.shape[1]) + sqrt_information @ covariance @ np.swapaxes(sqrt_information, 1, 2)
+    return np.einsum("ei,ei->e", whitened, np.linalg.solve(joint, whitened[..., None])[..., 0])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned(Table):
     """Final relative poses of pairs."""

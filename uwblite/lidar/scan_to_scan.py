@@ -32,7 +32,7 @@ from .registration import (
     search,
     with_neighbours,
 )
-from .scan_matching import SINGULAR, CloudPairs, PairPolicy, align_pairs, match, measured, pairs_of
+from .scan_matching import SINGULAR, CloudPairs, PairPolicy, align_pairs, match, measured, pairs_of, squared_distance
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,14 +157,10 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
 
 def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph) -> Bools:
     """Return over which steps (e,) of the odometry measured edges contradict it, in the directions that these measure."""
-    own = np.searchsorted(wheels.i, edges.i)
-    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
-    covariance = np.linalg.pinv(information, rcond=SINGULAR, hermitian=True)
-    onto, turn = covariance @ information, se2.rotation(edges.T_i_j[:, 2])
-    off = np.einsum("eij,ej->ei", onto, se2.between(edges.T_i_j, wheels.corrected(graph)[own]))
+    own, turn = np.searchsorted(wheels.i, edges.i), se2.rotation(edges.T_i_j[:, 2])
     by_wheels = np.swapaxes(turn, 1, 2) @ covariance_of(wheels, graph)[own] @ turn
-    joint = onto @ by_wheels @ np.swapaxes(onto, 1, 2) + covariance
-    squared = np.einsum("ei,eij,ej->e", off, np.linalg.pinv(joint, rcond=SINGULAR, hermitian=True), off)
+    off = se2.between(edges.T_i_j, wheels.corrected(graph)[own])
+    squared = squared_distance(off, by_wheels, edges.sqrt_information)
     # Single steps also hold the errors that telescope, which the wheels' noise leaves out.
     usual = max(float(np.median(squared)) / TrackingConfig.median, 1.0) if len(squared) else 1.0
     contradicted = np.zeros(len(wheels), dtype=bool)
