@@ -1,5 +1,7 @@
 """Errors of ranges: core, detours and nonsense separated; late errors pull less than early ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,7 @@ shapes = st.builds(
     st.floats(0.02, 0.5),
     st.floats(0.0, 0.6),
     st.floats(1.0, 5.0),
-    st.floats(1e-3, 0.3),
+    st.floats(0.0, 0.3),
     st.just(20.0),
 )
 
@@ -57,10 +59,10 @@ def test_the_density_is_that_of_its_three_parts(mixture):
 def test_no_error_is_impossible(mixture):
     """However far from the core: of any number of ranges, one may be a gross error."""
     far = mixture.centre + mixture.sigma * np.array([-1000.0, -60.0])
-    least = np.log(mixture.wild / mixture.width)
+    least = np.log(max(mixture.wild, 1e-3) / mixture.width)
     np.testing.assert_allclose(mixture.log_density(far), least, atol=1e-6)
-    errors = mixture.centre + mixture.sigma * np.linspace(-4.0, 9.0, 9)
-    np.testing.assert_allclose(mixture.log_density(errors), np.log(density(mixture, errors)), atol=1e-6)
+    errors, floored = mixture.centre + mixture.sigma * np.linspace(-4.0, 9.0, 9), replace(mixture, wild=max(mixture.wild, 1e-3))
+    np.testing.assert_allclose(mixture.log_density(errors), np.log(density(floored, errors)), atol=1e-6)
 
 
 @given(st.floats(0.02, 0.5), st.floats(0.1, 5.0), st.floats(-6.0, 30.0))
@@ -143,7 +145,6 @@ def test_few_or_equal_errors_give_finite_answers(errors):
     mixture = fit(np.array(errors), 0.03)
     assert mixture.sigma >= 0.03
     assert np.all(np.isfinite(mixture.weights(np.array([*errors, 1e3, -1e3]))))
-    assert mixture.wild >= 1e-3
     assert 0.0 <= mixture.tail + mixture.wild < 1.0
 
 

@@ -11,7 +11,7 @@ with psi = -f' / f: positive errors get less weight than negative ones of the sa
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import erfcx
@@ -30,6 +30,8 @@ _ROUNDS, _STILL = 60, 1e-4
 """Most rounds of a fit, and the move of the core, in its standard deviations, that ends it."""
 _PARTS = 256
 """Parts into which the interval with the mode is cut, three times: the last one is below a ten millionth of the first."""
+_NEVER = 1e-300
+"""Density, 1/m, that is added where all parts underflow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +47,7 @@ class RangeMixture:
     detour: float
     """Mean detour, m."""
     wild: float
-    """Share of gross errors, above 0."""
+    """Share of gross errors, 0..1."""
     width: float
     """Width of the distribution of gross errors, m."""
 
@@ -57,7 +59,7 @@ class RangeMixture:
     def density(self, errors: Floats) -> Floats:
         """Return the probability density (m,) of each error, 1/m."""
         normal, late, _ = _densities(errors - self.centre, self.sigma, self.detour)
-        return (1.0 - self.tail - self.wild) * normal + self.tail * late + self.wild / self.width
+        return (1.0 - self.tail - self.wild) * normal + self.tail * late + self.wild / self.width + _NEVER
 
     def core(self, errors: Floats) -> Floats:
         """Return the probability (m,) of each error to be of the core."""
@@ -65,8 +67,8 @@ class RangeMixture:
         return (1.0 - self.tail - self.wild) * normal / self.density(errors)
 
     def log_density(self, errors: Floats) -> Floats:
-        """Return the logarithm of the probability density (m,) of each error, 1/m."""
-        return np.log(self.density(errors))
+        """Return the logarithm of the probability density (m,) of each error, 1/m; some share of gross errors is certain."""
+        return np.log(replace(self, wild=max(self.wild, _LEAST_WILD)).density(errors))
 
     def mode(self) -> float:
         """Return the likeliest error, m."""
@@ -89,7 +91,7 @@ class RangeMixture:
         normal, late, _ = _densities(off, self.sigma, self.detour)
         core = (1.0 - self.tail - self.wild) * normal
         slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
-        return slope / (core + self.tail * late + self.wild / self.width)
+        return slope / (core + self.tail * late + self.wild / self.width + _NEVER)
 
 
 def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> RangeMixture:
@@ -108,11 +110,11 @@ def fit(errors: Floats, least_sigma: float, most_sigma: float = np.inf) -> Range
         off = errors - centre
         normal, late, expected = _densities(off, sigma, detour)
         core, slow, rest = (1.0 - tail - wild) * normal, tail * late, wild / width
-        each = 1.0 / (core + slow + rest)
+        each = 1.0 / (core + slow + (rest + _NEVER))
         core, slow = core * each, slow * each
         of_core, of_tail, gross = float(core.sum()), float(slow.sum()), rest * float(each.sum())
         total = of_core + of_tail + gross + _CLEAN
-        tail, wild = of_tail / total, max(gross / total, _LEAST_WILD)
+        tail, wild = of_tail / total, gross / total
         of_core, of_tail = max(of_core, TINY), max(of_tail, TINY)
         detour = max(float(slow @ expected) / of_tail, _SHORTEST * sigma)
         moved = float(core @ off) / of_core
