@@ -15,7 +15,7 @@ from .. import se2
 from ..arrays import OUTLIER, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
+from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, unseen_variance, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
@@ -62,7 +62,7 @@ class ScanOdometry:
     wheels: OdometryEdges
     """With the noise learnt from the measured steps, as if they had not slipped."""
     slipped: OdometryEdges
-    """The same with the uncertainty of slips."""
+    """The same with the uncertainty of slips, also of those that nothing shows."""
     miss: float
     """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
@@ -125,8 +125,9 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
     by_ranges = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
-    log_odds, motions = found.log_odds(), found.false_motions()
-    chain = posterior(log_odds + by_ranges, wheels.duration)
+    alone, motions = found.log_odds(), found.false_motions()
+    # A long slip of a little per step is likelier than none only as a whole.
+    chain = posterior(np.zeros(len(wheels)), wheels.duration)
     for _ in range(TrackingConfig.laps):
         expected = motions.by_neighbours(chain, wheels.duration)
         log_odds = found.log_odds(motions.log_marginal(expected))
@@ -136,22 +137,22 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     doubtful = steps.enough & (~good | (chain.probability > RegistrationConfig.doubtful))
     rest = np.clip(logit(np.clip(chain.probability, SINGULAR, 1.0 - SINGULAR)) - log_odds, -np.inf, 0.0)
     found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
-    log_odds[doubtful] = choice.log_odds
+    alone[doubtful] = log_odds[doubtful] = choice.log_odds
     slips = posterior(log_odds + by_ranges, wheels.duration).probability
+    slipped = with_slips(noise, slips, unseen_variance(log_odds + by_ranges, wheels.duration))
     variance, sound, mode = sigma**2 * PairPolicy.correlation, found.sound, choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
     tempting = found.candidates.rows(found.best(found.candidates.share))
     captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
     own = np.flatnonzero(~doubtful[np.searchsorted(i, certain.i)])
     matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
-    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (~good | (log_odds < 0.0))
+    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (~good | (alone < 0.0))
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
     miss = _miss(raster.clouds, noise)
     return ScanOdometry(
-        edges, noise, with_slips(noise, slips), float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips,
-        rejected,
+        edges, noise, slipped, float(np.median(miss)) if len(miss) else 0.0, len(found.searched), slips, rejected,
     )
 
 

@@ -68,8 +68,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
-    wheels = track.slipped if by_ranges is not None or slipped.any() else track.wheels
-    return _match_neighbours(replace(estimate, odometry=wheels), track, task)
+    return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
