@@ -14,11 +14,11 @@ import numpy as np
 
 from ..arrays import BEYOND_NOISE, Bools, Floats, Ints
 from ..findings import Finding, doubt
-from ..graph.graph import Edges, Graph
+from ..graph.graph import Edges
 from ..graph.marginals import JointCovariance
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
-from ..loop_closure.chain_breaks import TiePolicy, fixing
+from ..loop_closure.chain_breaks import TiePolicy
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.recordings import Recording, Recordings
 from ..sensor_log.sensors import radio_name
@@ -143,16 +143,21 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     ]
 
 
-def _independent(edges: Edges, graph: Graph, path: Floats) -> Edges:
-    """Return scan edges between visits, and between neighbours those that leave no direction free.
+def _independent(edges: Edges, path: Floats) -> Edges:
+    """Return scan edges between neighbours and between visits, with the directions that they measure well.
 
-    The others were matched where the chain had put the clouds: many weak ones seem to measure the way along a bare wall.
+    Others of one visit were matched where the chain had put the clouds, and so were all of them in weak directions: many seem
+    to measure the way along a bare wall.
     """
     if not isinstance(edges, ScanEdges):
         return edges
     again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
-    clear = (np.abs(edges.i - edges.j) <= TiePolicy.near) & fixing(edges, graph)
-    return edges.rows(np.flatnonzero(clear | again))
+    edges = edges.rows(np.flatnonzero(again | (np.abs(edges.i - edges.j) <= TiePolicy.near)))
+    unit = np.array(TiePolicy.clear)
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    root = np.sqrt(np.where(values > 1.0, values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2) / unit
+    return replace(edges, sqrt_information=root)
 
 
 def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> Bools:
@@ -165,7 +170,7 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
     steps, root = np.flatnonzero(slips.any(axis=1)), estimate.odometry.sqrt_information.copy()
     covariance = np.linalg.inv(np.swapaxes(root[steps], 1, 2) @ root[steps]) + slips[steps, :, None] ** 2 * np.eye(3)
     root[steps] = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
-    others = [_independent(e, estimate.graph, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
+    others = [_independent(e, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
     graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
     extent = float(np.hypot(*np.ptp(graph.poses[:, :2], axis=0)))
@@ -174,16 +179,17 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
 
 
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
-    """Return the steps (s,) of the odometry that the map contradicts and whose sides nothing else connects.
+    """Return the steps (s,) of the odometry that slipped, or that the map contradicts, and whose sides nothing else connects.
 
-    Their noise is enlarged by as much as the map contradicts them, to that of slip at most; that of others, also of known
-    slips, is in the map's own uncertainty. Those with hardly any keyframes between them are one run; a few keyframes at an end
-    of a recording are no part.
+    Their noise is enlarged by as much as the map contradicts them, to that of slip at most. Those with hardly any keyframes
+    between them are one run; a few keyframes at an end of a recording are no part.
     """
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
     off = np.abs(wheels.residuals(estimate.graph)).max(axis=1, initial=0.0)
-    slips = np.where((off > BEYOND_NOISE)[:, None], np.minimum(off[:, None] * noise, _SLIP), 0.0)
+    # Ranges connect parts better than one pose with another: then known slips are in the map's own uncertainty.
+    larger = np.where(off > BEYOND_NOISE, off, estimate.slipped & (estimate.ranges is None))
+    slips = np.minimum(larger[:, None] * noise, _SLIP)
     rows = np.array([(r.rows.start, r.rows.stop) for r in recordings.each])[recordings.of_keyframe[wheels.i]]
     sides = np.minimum(wheels.i + 1 - rows[:, 0], rows[:, 1] - wheels.j)
     steps = np.flatnonzero(slips.any(axis=1) & (sides >= _PART))

@@ -15,7 +15,7 @@ from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from ..lidar.cloud_rasters import ScanClouds
 from ..lidar.surface_rays import MeasuredSurfaces
 from ..loop_closure.closures import Closures, no_closures
-from ..odometry.slips import expected
+from ..odometry.slips import expected, slip_sigma
 from ..problem.solution import solve
 from ..radio.bootstrap_attempt import BootstrapResult
 from .mapping_config import MappingConfig
@@ -122,6 +122,12 @@ class Estimate:
             if isinstance(edges, ScanEdges):
                 held[edges.i] = held[edges.j] = True
         return held
+
+    @property
+    def slipped(self) -> Bools:
+        """(e,) steps of the odometry whose noise is that of wheels that slip, or half of it at least."""
+        noise = 1.0 / np.einsum("eii->ei", self.odometry.sqrt_information)
+        return np.asarray((2.0 * noise > slip_sigma(self.odometry)).all(axis=1))
 
     @property
     def rests_on_ranges(self) -> bool:
