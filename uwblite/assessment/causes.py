@@ -34,7 +34,7 @@ _BY_RANGES = _of(
 )
 """What a map by ranges and wheels alone shows of a fault of either."""
 _BY_SCANS = _of(
-    "free-space-violation no-closure open-loops loose-links turn-scale scales uncertain",
+    "free-space-violation no-closure loose-links turn-scale scales uncertain",
     "poor-fit untied-parts unusual-calibration mirrored",
 )
 """What a map shows of a fault of lidar or wheels."""

@@ -232,12 +232,6 @@ TEXTS: Mapping[str, Text] = {
         "{scans} scans are so far from the {used} others that no grid can hold both; they are not drawn",
         DOUBT,
     ),
-    "open-loops": Text(
-        "the scans at t = {first:.0f} s and at t = {second:.0f} s may show the same place, but their relative position is "
-        "known to {sigma:.1f} m only and no scan match confirms it ({pairs} such pairs): drive there once more in the same "
-        "direction, or force the closure",
-        DOUBT,
-    ),
     "exchanged-names": Text(
         "from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
         "wheels, but {exchanged:those of {anchors:list} fit the places of others|fit no places at all}: check the anchors' ids "

@@ -8,16 +8,12 @@ from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
-from ..lidar.submaps import Submaps
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, paper_method, verification
 from ..loop_closure.candidates import CandidatePolicy, Tried
 from ..loop_closure.closures import Closures
 from .estimate import Estimate, Task
 from .progress import Stage, solver_figures
-
-_OPEN = 8.0
-"""m, three standard deviations, from which on two sub-maps that may overlap are an open loop."""
 
 
 def close_loops(estimate: Estimate, task: Task) -> Estimate:
@@ -48,20 +44,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
             break
         if len(new.edges):
             covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
-    _check_open_loops(base, covariance, pieces, task)
     return replace(estimate, closures=found).with_estimates_of(base)
-
-
-def _check_open_loops(base: Graph, covariance: JointCovariance, pieces: Submaps, task: Task) -> None:
-    """Note sub-maps that may well show the same place and are too uncertain for that to be decided."""
-    recordings, rules = task.recordings, task.config.loop_closure
-    every = closure_candidates.propose(base, covariance, pieces, recordings.of_keyframe, Tried(), True, rules)
-    left = every.rows(np.flatnonzero(every.overlapping(1.0, rules) & (every.spread > _OPEN)))
-    if not len(left.target):
-        return
-    a, b = (float(recordings.stamps[pieces.reference[k[0]]] - recordings.stamps[0]) for k in (left.target, left.source))
-    sigma = float(left.spread[0]) / CandidatePolicy.sigmas
-    task.stages.note("open-loops", pairs=len(left.target), first=a, second=b, sigma=sigma)
 
 
 def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
