@@ -99,7 +99,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "scan-to-scan matching": LeftOut(("scan_to_scan.on=false",)),
     "loop closures of sub-maps": LeftOut(("loop_closure.rounds=0",)),
     "free space of closures": LeftOut(("loop_closure.through=1",)),
-    "long sub-maps": LeftOut(("submaps.epsilon=5",)),
+    "long stretches": LeftOut(patches=(("loop_closure.candidates.any_uncertain", lambda *given: False),)),
     "joint refinement": LeftOut(("refinement.rounds=0",)),
     "second scan per keyframe": LeftOut(("keyframes.scans=1",)),
     "scans between keyframes": _stage("lidar_stages.place_scans_between"),

@@ -161,7 +161,7 @@ def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
     ("setting", "words"),
     [
         ("growth.drift=1", "unknown setting 'growth'"),
-        ("loop_closure.search_angle=1", "it is now a constant of LoopClosureConfig, 0.7"),
+        ("loop_closure.uniqueness=1", "it is now a constant of LoopClosureConfig, 0.85"),
         ("loop_closure.partnerz=1", "did you mean 'loop_closure.partners'"),
         ("turn_laser=false", "unknown setting 'turn_laser'"),
     ],

@@ -73,24 +73,33 @@ def test_clouds_that_meet_in_part_speak_for_the_true_place_alone():
         assert net(clouds, [slid, 0.0, 0.0], free) < 0.3 * right
 
 
+def test_where_free_space_is_not_asked_all_points_count_as_in_view():
+    clouds = scanned(np.array([[-1.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), NICHES, 0.01, 2, beams=720, reach=6.0)
+    true = [5.0, 0.0, 0.0]
+    assert net(clouds, true, None) < net(clouds, true, free_around(clouds))
+
+
 def test_clouds_out_of_each_others_view_say_nothing():
     clouds = scanned(POSES, HALL, 0.01, 1, beams=360, reach=9.0)
     assert net(clouds, [90.0, 0.0, 0.0], free_around(clouds)) == 0.0
+    assert net(clouds, [90.0, 0.0, 0.0], None) < 0.0
 
 
 def test_clouds_without_any_point_say_nothing():
-    clouds = scanned(np.zeros((2, 3)), HALL, reach=0.1)
-    assert net(clouds, np.zeros(3), free_around(clouds)) == 0.0
+    assert net(scanned(np.zeros((2, 3)), HALL, reach=0.1), np.zeros(3), None) == 0.0
 
 
 def test_what_other_clouds_there_are_does_not_matter():
     """One seen elsewhere in front of the pair and one behind it, a pair of which with fewer points is asked about as well."""
     pair = scanned(POSES, HALL, 0.0, beams=360, reach=9.0)
     more = scanned(np.array([[3.0, 1.0, 0.0], *POSES, [-3.0, 0.0, 1.0]]), HALL, 0.0, beams=360, reach=9.0)
-    alone = net(pair, se2.between(*POSES), free_around(pair))
-    i, j = np.array([1, 0, 3]), np.array([2, 3, 0])
-    among = net_overlap(rasterize(more, 0.05, 0.5), free_around(more), i, j, np.tile(se2.between(*POSES), (3, 1)), GATE)
-    assert SPACING * among[0] == pytest.approx(alone, rel=1e-9)
+    for free in (False, True):
+        alone = net(pair, se2.between(*POSES), free_around(pair) if free else None)
+        among = net_overlap(
+            rasterize(more, 0.05, 0.5), free_around(more) if free else None, np.array([1, 0, 3]), np.array([2, 3, 0]),
+            np.tile(se2.between(*POSES), (3, 1)), GATE,
+        )  # fmt: skip
+        assert SPACING * among[0] == pytest.approx(alone, rel=1e-9)
 
 
 def share(clouds, pose):

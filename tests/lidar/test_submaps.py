@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.submaps import SubmapConfig, build, cut, overlapping
+from uwblite.lidar.submaps import SubmapConfig, build, cut, of_pieces
 
 KEEP = SubmapConfig(epsilon=2.0, voxel=0.08, std_ratio=1e6, min_neighbours=0)
 """No filter but the voxels."""
@@ -104,19 +104,14 @@ def test_sub_maps_of_a_recording_without_returns_are_empty():
     assert made.clouds.counts.tolist() == [0, 0, 0]
 
 
-def test_each_overlapping_sub_map_begins_in_the_middle_of_the_one_before():
-    """Two recordings of 75 m and 40 m, which no sub-map has both of."""
-    path = np.concatenate([np.arange(0.0, 75.0, 0.5), 1000.0 + np.arange(0.0, 40.0, 0.5)])
-    recording = np.repeat([0, 1], [150, 80])
-    first, last = overlapping(path, recording, 15.0)
-    assert np.all(recording[first] == recording[last - 1])
-    covered = path[last - 1] - path[first]
-    begins = np.diff(path[first])[np.diff(recording[first]) == 0]
-    # A rest at the end of a recording is shorter.
-    assert np.median(begins) == 7.5
-    assert begins.max() <= 9.0
-    inner = np.append(recording[first[1:]] == recording[first[:-1]], False)
-    assert np.median(covered[inner]) == 14.5
-    assert covered.max() <= 16.5
-    assert np.all(first[1:][inner[:-1]] < last[:-1][inner[:-1]])
-    assert set(np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])) == set(range(230))
+def test_what_moves_as_a_whole_is_not_bent():
+    """Two sub-maps moved apart, and one of them bent by 3 cm at one of its five keyframes."""
+    poses = np.column_stack([np.arange(10.0), np.zeros(10), np.linspace(0.0, 3.0, 10)])
+    first, last = np.array([0, 5]), np.array([5, 10])
+    made = of_pieces(scanned(poses, ROOM), poses, first, last, np.array([2, 7]), KEEP)
+    after = poses.copy()
+    for rows, motion in ((slice(0, 5), [0.3, -0.2, 0.5]), (slice(5, 10), [-1.0, 2.0, -2.0])):
+        after[rows] = se2.compose(np.array(motion), poses[rows])
+    assert made.bent(poses, after) < 1e-12
+    after[9, :2] += [0.018, 0.024]
+    assert made.bent(poses, after) == pytest.approx(0.03 / np.sqrt(10.0), rel=1e-6)

@@ -7,6 +7,7 @@ from helpers.laser_walks import walked, with_a_walker
 from uwblite import se2
 from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.lidar.visibility import (
+    dynamic_share,
     free_space_violation,
     nearest_by_bearing,
     observed_free_space,
@@ -113,3 +114,22 @@ def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(hall):
     assert walkers[0] > 100
     # Not all: some stood where no other view of the sub-map looked.
     assert walkers[1] < 0.7 * walkers[0]
+
+
+def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(hall):
+    truth, path, clouds = hall
+    recording = np.zeros(len(truth), dtype=np.intp)
+
+    def of(own):
+        pieces = build(own, truth, path, recording, SubmapConfig(epsilon=4.0))
+        return dynamic_share(pieces, observed_free_space(own, pieces, truth), truth, recording)
+
+    assert of(clouds) < 0.05
+    assert of(with_a_walker(truth, clouds)) > of(clouds) + 0.05
+
+
+def test_sub_maps_of_different_recordings_do_not_follow_each_other(hall):
+    truth, path, clouds = hall
+    recording = np.arange(len(truth))
+    pieces = build(clouds, truth, path, recording, SubmapConfig(epsilon=4.0))
+    assert dynamic_share(pieces, observed_free_space(clouds, pieces, truth), truth, recording) == 0.0

@@ -1,5 +1,6 @@
 """What of a match is handed on: free space is asked only for promising matches, with the points of both sub-maps."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,6 @@ from helpers.laser_walks import HALL, scanned
 
 from uwblite import se2
 from uwblite.lidar.correlative_matching import CorrelativeConfig
-from uwblite.lidar.visibility import free_around
 from uwblite.loop_closure import matching
 from uwblite.loop_closure.candidates import Candidates
 from uwblite.loop_closure.closures import LoopClosureConfig
@@ -25,32 +25,37 @@ def test_free_space_is_asked_with_the_points_of_both_sub_maps(monkeypatch):
         return 0.25
 
     monkeypatch.setattr(matching, "violates_free_space", violations)
-    net, rms = config.net_overlap + np.array([0.0, -0.01, 1.0, 1.0]), np.array([config.sigma, 0.0, config.sigma * 1.01, 0.0])
+    least = min(config.overlap, config.overlap_after_search)
+    share, rms = np.array([least, least - 0.01, 1.0, 1.0]), np.array([config.sigma, 0.0, config.sigma * 1.01, 0.0])
     candidates = SimpleNamespace(target=np.array([0, 0, 0, 1]), source=np.array([1, 1, 2, 2]))
-    best = SimpleNamespace(rms=rms, pose=["first", "few", "far", "last"])
-    promising = matching._promising(best, net, config)
+    best = SimpleNamespace(share=share, rms=rms, pose=["first", "few", "far", "last"])
+    promising = matching._promising(best, np.full(4, np.inf), config)
     batch = SimpleNamespace(candidates=candidates, free=["a", "b", "c"], clouds=clouds)
     assert matching._free_space_violations(batch, best, promising).tolist() == [0.25, 0.0, 0.0, 0.25]
     assert asked == [("a", "b", "first"), ("b", "c", "last")]
+    batch.free = None
+    assert matching._free_space_violations(batch, best, promising).tolist() == [0.0] * 4
 
 
-def test_sub_maps_are_compared_by_the_surface_that_speaks_for_a_place(monkeypatch):
+def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypatch):
+    """Sub-maps by the share of all points."""
     truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
     clouds, config = scanned(truth, HALL), LoopClosureConfig()
     ends, guess = np.array([0, 0]), np.tile(se2.between(truth[0], truth[1]), (2, 1))
-    candidates = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), np.ones(2), False)
+    stretches = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), np.ones(2), False, long=True)
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
     monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[2]), 13.7))
-    found, _ = matching._fit(matching._Batch(candidates, clouds, 1.0, free_around(clouds), config, CorrelativeConfig()))
-    assert found.net.tolist() == [13.7, 13.7]
-    np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
-    assert found.found.all()
+    for candidates, net in ((stretches, 13.7), (replace(stretches, long=False), np.inf)):
+        found, _ = matching._fit(matching._Batch(candidates, clouds, 1.0, None, config, CorrelativeConfig()))
+        assert found.net.tolist() == [net, net]
+        np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
+        assert found.found.all()
 
 
-def test_the_net_overlap_is_enough():
-    """Sub-maps that meet for a third of their length are a promising pair; long walls alone are none."""
+def test_of_a_wide_search_the_net_overlap_is_enough():
+    """Stretches that meet for a third of their length are a promising pair; long walls alone are none."""
     config = LoopClosureConfig()
-    best = SimpleNamespace(rms=np.zeros(2))
+    best = SimpleNamespace(share=np.array([0.3, 0.9]), rms=np.zeros(2))
     net = config.net_overlap + np.array([0.1, -0.1])
     assert matching._promising(best, net, config).tolist() == [True, False]
 
@@ -72,13 +77,15 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
         target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
     )  # fmt: skip
     numbers = SimpleNamespace(chosen=lambda which: int(which[0]))
-    rows, guesses = matching._guesses(matching._Batch(candidates, numbers, 0.1, [], config, CorrelativeConfig()))
-    wide = (3, 7, 9.0, 9.0, config.search_angle)
-    assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), wide]
-    # Twice the cells, and finer headings for long clouds.
-    assert steps == [pytest.approx((0.3, 0.24, 0.02))] * 3
-    assert rows.tolist() == [0] + [1] * 30 + [2] * 30 + [3] * 30
-    np.testing.assert_array_equal(guesses, candidates.guess[rows])
+    fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
+    for candidates.long, places, step in ((False, config.places, fine), (True, matching.MatchingPolicy.many_places, coarse)):
+        asked.clear(), steps.clear()
+        rows, guesses = matching._guesses(matching._Batch(candidates, numbers, 0.1, None, config, CorrelativeConfig()))
+        wide = (3, 7, 9.0, 9.0, config.search_angle)
+        assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), wide]
+        assert steps == [step] * 3
+        assert rows.tolist() == [0] + [1] * places + [2] * places + [3] * places
+        np.testing.assert_array_equal(guesses, candidates.guess[rows])
 
 
 @pytest.mark.parametrize("guess", [(0.0, 0.0, 0.2), (35.0, -80.0, 1.0), (-4.0, 15.0, 0.0)])

@@ -14,7 +14,6 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, build
-from uwblite.lidar.visibility import observed_free_space
 from uwblite.loop_closure.candidates import Candidates, propose
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
 from uwblite.loop_closure.matching import ClosureMatches
@@ -45,16 +44,16 @@ def hall():
     pieces = build(clouds, graph.poses, path, recording, SubmapConfig(epsilon=4.0))
     covariances = JointCovariance(graph, pieces.reference)
     proposed = propose(graph, covariances, pieces, recording, set(), True, CONFIG)
-    return truth, graph, covariances, pieces, recording, proposed, observed_free_space(clouds, pieces, graph.poses)
+    return truth, graph, covariances, pieces, recording, proposed
 
 
 @pytest.fixture(scope="module")
 def closures(hall):
-    return find(hall[5], hall[3], hall[6], CONFIG, SEARCH)
+    return find(hall[5], hall[3], CONFIG, SEARCH)
 
 
 def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess(hall):
-    _, graph, covariances, pieces, _, candidates, _ = hall
+    _, graph, covariances, pieces, _, candidates = hall
     assert len(candidates.target) > 5
     assert np.all(candidates.source - candidates.target > 1)
     i, j = pieces.reference[candidates.target], pieces.reference[candidates.source]
@@ -68,47 +67,48 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
 
 
 def test_where_nothing_is_near_nothing_is_proposed(hall):
-    _, graph, covariances, pieces, recording, _, _ = hall
-    none = propose(graph, covariances, pieces, recording, set(), True, replace(CONFIG, reach=1e-6))
+    _, graph, covariances, pieces, recording, _ = hall
+    none = propose(graph, covariances, pieces, recording, set(), True, replace(CONFIG, reach=0.0, search_limit=0.0))
     assert [getattr(none, name).shape for name in ("target", "source", "guess", "covariance", "spread")] == [
         (0,), (0,), (0, 3), (0, 3, 3), (0,)
     ]  # fmt: skip
 
 
 def test_what_was_tried_is_not_proposed_again(hall):
-    _, graph, covariances, pieces, recording, candidates, _ = hall
+    _, graph, covariances, pieces, recording, candidates = hall
     tried = candidates.names(CONFIG)
     again = propose(graph, covariances, pieces, recording, tried, True, CONFIG)
     assert not tried & again.names(CONFIG)
 
 
 def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
-    _, graph, covariances, pieces, recording, _, _ = hall
+    _, graph, covariances, pieces, recording, _ = hall
     half = (np.arange(len(recording)) >= pieces.first[len(pieces) // 2]).astype(np.intp)
     candidates = propose(graph, covariances, pieces, half, set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
 
 
-GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "net": 20.0, "spread": 7.0, "off": 0.0,
-        "constrained": True, "along": 1e4, "strength": 1e4}  # fmt: skip
+GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "net": np.inf, "spread": 7.0, "off": 0.0,
+        "constrained": True, "long": False, "along": 1e4, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
 
 @pytest.mark.parametrize(("figures", "outcome"), [
     ({}, "accepted"),
     ({"found": False}, "not-found"),
+    ({"share": CONFIG.overlap_after_search - 0.001}, "few-matches"),
+    ({"share": CONFIG.overlap - 0.001, "spread": 0.0}, "few-matches"),
+    ({"share": CONFIG.overlap + 0.001, "spread": 0.0}, "accepted"),
     ({"rms": CONFIG.sigma + 1e-4}, "far-matches"),
     ({"through": CONFIG.through + 0.001}, "free-space-violation"),
     ({"along": 0.0}, "accepted"),
     ({"along": 0.0, "strength": 0.9}, "degenerate"),
     ({"along": 0.0, "strength": 1.1}, "accepted"),
-    ({"second": 20.001 - CONFIG.net_overlap}, "ambiguous"),
-    ({"second": 19.999 - CONFIG.net_overlap}, "accepted"),
-    ({"second": 20.001 - CONFIG.net_overlap, "spread": 0.0}, "accepted"),
-    ({"net": CONFIG.net_overlap - 0.001}, "few-matches"),
-    ({"net": CONFIG.net_overlap - 0.001, "spread": 0.0}, "few-matches"),
-    ({"net": CONFIG.net_overlap + 0.001, "second": 0.0, "share": 0.2}, "accepted"),
+    ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
+    ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
+    ({"net": CONFIG.net_overlap - 0.001, "spread": 20.0}, "few-matches"),
+    ({"net": CONFIG.net_overlap + 0.001, "share": 0.2, "spread": 20.0, "long": True}, "accepted"),
     ({"off": 0.1 * CONFIG.agrees * 1.01}, "contradicts-graph"),
     ({"off": 0.1 * CONFIG.agrees * 0.97}, "accepted"),
     ({"off": 5.0, "constrained": False}, "accepted"),
@@ -120,7 +120,7 @@ def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "net")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
     spread = np.array([f["spread"]])
-    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, spread, f["constrained"])
+    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, spread, f["constrained"], f["long"])
     root = np.sqrt(np.diag([f["along"], f["strength"], 1e4]))[None]
     ((found, reason),) = _judge(candidates, fits, np.zeros((1, 3)), root, CONFIG)
     assert found == outcome
@@ -161,6 +161,7 @@ def test_every_candidate_has_its_record(closures):
         assert np.all(np.linalg.eigvalsh(c.information) >= -1e-6 * np.trace(c.information))
         if c.accepted:
             assert c.fitness <= CONFIG.sigma
+            assert c.overlap >= CONFIG.overlap
 
 
 def test_closures_take_the_drift_out(hall, closures):
@@ -196,7 +197,7 @@ def test_a_match_that_the_graph_rules_out_is_rejected(hall, closures):
     pairs = accepted_pairs(hall, closures)
     one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.01, 0.01, 0.004])
     guess = true_poses(hall, one) + np.array([0.18, 0.18, 0.0])
-    found = find(replace(one, guess=guess), hall[3], hall[6], CONFIG, SEARCH)
+    found = find(replace(one, guess=guess), hall[3], CONFIG, SEARCH)
     assert not any(c.accepted for c in found.candidates)
     assert sum("Mahalanobis" in c.reason for c in found.candidates) > 0.6 * len(pairs)
 
@@ -210,7 +211,7 @@ def test_sub_maps_of_different_places_are_rejected_with_a_reason(hall):
     assert len(pairs) >= 5
     rng = np.random.default_rng(9)
     guess = np.column_stack([rng.normal(0, 0.3, (len(pairs), 2)), rng.uniform(-3, 3, len(pairs))])
-    found = find(given(hall, pairs, guess, [0.1, 0.1, 0.05]), pieces, hall[6], CONFIG, SEARCH)
+    found = find(given(hall, pairs, guess, [0.1, 0.1, 0.05]), pieces, CONFIG, SEARCH)
     assert len(found.edges) == 0
     assert all(c.reason and not c.accepted for c in found.candidates)
 
@@ -221,7 +222,7 @@ def test_where_the_search_finds_no_place_at_all_that_is_the_reason(hall, closure
     one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.5, 0.5, 0.15])
     guess = true_poses(hall, one)
     guess[lost, 0] += 200.0
-    found = find(replace(one, guess=guess), hall[3], hall[6], CONFIG, SEARCH)
+    found = find(replace(one, guess=guess), hall[3], CONFIG, SEARCH)
     assert [c.reason for c in found.candidates][lost] == ["the search found no place for it"] * len(pairs[lost])
     assert not any(c.accepted for c in found.candidates[lost])
 
@@ -235,7 +236,7 @@ def test_a_wide_uncertainty_is_searched(hall, closures):
     off = np.column_stack([rng.uniform(-0.8, 0.8, (len(pairs), 2)), rng.uniform(-0.3, 0.3, len(pairs))])
     one = replace(one, guess=exact + off)
     reported = []
-    found = find(one, hall[3], hall[6], CONFIG, SEARCH, lambda done, total: reported.append((done, total)))
+    found = find(one, hall[3], CONFIG, SEARCH, lambda done, total: reported.append((done, total)))
     assert reported == [(len(pairs), len(pairs))]
     assert len(found.edges) >= len(pairs) // 2
     good = [k for k, c in enumerate(found.candidates) if c.accepted]
@@ -255,11 +256,10 @@ def test_equal_pillars_are_recognised_as_ambiguous():
     poses = truth[pieces.reference]
     covariance = np.tile(np.diag([1.0**2, 0.3**2, 0.02**2]), (2, 1, 1))
     unsure = Candidates(a, b, se2.between(poses[a], poses[b]) + np.array([0.4, 0.0, 0.0]), covariance, np.full(2, 3.0))
-    free = observed_free_space(clouds, pieces, truth)
-    found = find(unsure, pieces, free, CONFIG, SEARCH)
+    found = find(unsure, pieces, CONFIG, SEARCH)
     assert all("another place" in c.reason for c in found.candidates)
     sure = Candidates(a, b, se2.between(poses[a], poses[b]), covariance / 1e4, np.full(2, 0.03))
-    assert all(c.accepted for c in find(sure, pieces, free, CONFIG, SEARCH).candidates)
+    assert all(c.accepted for c in find(sure, pieces, CONFIG, SEARCH).candidates)
 
 
 def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarray]:
@@ -327,7 +327,7 @@ def test_no_closures_change_nothing(hall):
     assert left.candidates == ()
     none = np.zeros(0, dtype=np.intp)
     empty = Candidates(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
-    assert find(empty, hall[3], hall[6], CONFIG, SEARCH).candidates == ()
+    assert find(empty, hall[3], CONFIG, SEARCH).candidates == ()
 
 
 def test_merged_collections_keep_their_order(closures):
@@ -345,7 +345,7 @@ def test_a_robot_that_never_returns_has_no_candidates():
     graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
     recording = np.zeros(60, dtype=np.intp)
     pieces = build(clouds, graph.poses, truth[:, 0], recording, SubmapConfig(epsilon=8.0))
-    covariances, near = JointCovariance(graph, pieces.reference), replace(CONFIG, reach=6.0)
+    covariances, near = JointCovariance(graph, pieces.reference), replace(CONFIG, reach=6.0, search_limit=1.0)
     far = propose(graph, covariances, pieces, recording, set(), True, near)
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
     assert np.all(apart < 7.0)

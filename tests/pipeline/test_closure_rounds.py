@@ -1,4 +1,4 @@
-"""Rounds of loop closing: pairs of sub-maps are tried once, the likeliest first."""
+"""Rounds of loop closing: long stretches come first where ends are uncertain."""
 
 import numpy as np
 import pytest
@@ -10,17 +10,17 @@ from uwblite.lidar.cloud_rasters import ScanClouds, rasterize
 from uwblite.pipeline import closure_rounds
 
 
-@pytest.mark.parametrize("far", [0.0, 1.0, 6.0])
-def test_pairs_are_tried_once_each_and_what_does_not_match_moves_nothing(far):
-    """Between bare walls no match holds."""
+@pytest.mark.parametrize(("far", "tried"), [(0.0, False), (1.0, True), (6.0, True)])
+def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_were(far, tried):
+    """Wherever a search is needed; between bare walls no match holds, so all pairs are tried once and nothing moves."""
     truth, graph, _, clouds = returned(CORRIDOR, max(far, 1.0), [1.0, 0.0, 0.0])
     graph = graph if far else Graph(truth, edges=(chained(truth, np.full(3, 1e-4)),))
     task = task_of(recordings_of(truth))
     estimate = estimate_of(graph, scans=ScanClouds(clouds, rasterize(clouds, 0.1, 1.0), 0.0))
-    closed = closure_rounds.close_loops(estimate, task)
-    np.testing.assert_array_equal(closed.graph.poses, graph.poses)
-    assert len(closed.closures.edges) == 0
-    pairs = {(closure.i, closure.j) for closure in closed.closures.candidates}
-    tried = [s.figures["candidates"] for s in task.stages.done]
-    assert len(pairs) == len(closed.closures.candidates) == sum(tried) > 0
-    assert [s.figures["accepted"] for s in task.stages.done] == [0] * len(tried)
+    base, found = closure_rounds._with_long_stretches_tied(graph, estimate, task)
+    assert base is graph
+    assert len(found.edges) == 0
+    assert [(s.name, s.figures["accepted"]) for s in task.stages.done] == [("long stretches", 0)] * tried
+    if tried:
+        pairs = {(closure.i, closure.j) for closure in found.candidates}
+        assert len(pairs) == len(found.candidates) == task.stages.done[0].figures["candidates"] > 0

@@ -4,14 +4,13 @@
 """
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, chunks
+from ..arrays import Floats, Ints, chunks, rms_length
 from ..config import setting
 from .clouds import Clouds, joined
 from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statistical_outlier_filter
@@ -25,9 +24,8 @@ _FACINGS = 4
 class SubmapConfig:
     """Size and cleaning of sub-maps."""
 
-    epsilon: float = 15.0
-    """Travelled distance of one sub-map, m (the paper's epsilon; it uses 9). It should contain several doors or pillars, and
-    the drift of a chain of scans over it should stay within the gate of the final matching."""
+    epsilon: float = 5.0
+    """Travelled distance of one sub-map, m (the paper's epsilon; it uses 9)."""
     voxel: float = setting(0.08, advanced=True)
     """Cell over which points are averaged, m."""
     neighbours: ClassVar[int] = 8
@@ -58,6 +56,12 @@ class Submaps:
     def __len__(self) -> int:
         return len(self.first)
 
+    def bent(self, before: Floats, after: Floats) -> float:
+        """Return how far keyframes have moved in the frames of their sub-maps, rms, m; from all present poses (k, 3)."""
+        of = np.repeat(self.reference, self.last - self.first)
+        one, other = (se2.between(poses[of], poses[self.first[0] : self.last[-1]]) for poses in (before, after))
+        return rms_length((one - other)[:, :2])
+
 
 def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
     """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording, and
@@ -68,26 +72,21 @@ def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
     return first, np.append(first[1:], len(path))
 
 
-def overlapping(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
-    """Cut keyframes into pieces each of which begins in the middle of the one before; see cut."""
-    first, last = cut(path, recording, epsilon / 2.0)
-    last[:-1] = np.where(recording[first[1:]] == recording[first[:-1]], last[1:], last[:-1])
-    return first, last
+def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig) -> Submaps:
+    """Merge the clouds of each piece of the trajectory, with poses (k, 3) T_map_base, and filter them; see cut."""
+    first, last = cut(path, recording, config.epsilon)
+    return of_pieces(clouds, poses, first, last, references(path, recording, config.epsilon), config)
 
 
-def build(
-    clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig,
-    pieces: Callable[[Floats, Ints, float], tuple[Ints, Ints]] = cut,
-) -> Submaps:
-    """Merge the clouds of pieces of the trajectory in the frames of the keyframes in their middle, and filter them: voxel,
-    statistical, radius.
+def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
+    """Return the reference keyframes (s,) of the sub-maps that are built of such pieces: those in the middle."""
+    first, last = cut(path, recording, epsilon)
+    return (first + last - 1) // 2
 
-    Parameters
-    ----------
-    poses : (k, 3) T_map_base. path, recording : see cut. pieces : cut or overlapping.
-    """
-    first, last = pieces(path, recording, config.epsilon)
-    reference = (first + last - 1) // 2
+
+def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:
+    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,) in the frames of reference
+    keyframes (s,), and filter them: voxel, statistical, radius."""
     # Long pieces have many clouds each.
     at_once = max(_CLOUDS * len(first) // max(int(np.sum(last - first)), 1), 1)
     parts = [

@@ -64,6 +64,8 @@ class VisibilityPolicy:
     """Points of the other that a visit must be able to see to be compared."""
     neighbours: ClassVar[int] = 64
     """Keyframes around one among which another visit is sought."""
+    usual: ClassVar[float] = 0.9
+    """Share of the pairs of sub-maps of which no more stands in the next one's free space than is said of all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +167,26 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
     return max(one, other)
 
 
+def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
+    """Return the share of a sub-map in the next one's free space, which only people, glass and drift can cause.
+
+    One pair in ten of sub-maps driven one after the other exceeds it, 0..1; 0 where there is no such pair.
+
+    Parameters
+    ----------
+    free : see observed_free_space. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
+    """
+    reference = submaps.reference
+    pairs = np.flatnonzero(np.diff(recording[reference]) == 0)
+    steps = se2.between(poses[reference[pairs]], poses[reference[pairs + 1]])
+    points = [submaps.clouds.cloud(k)[0] for k in range(len(submaps))]
+    shares = [
+        violates_free_space(free[k], points[k], free[k + 1], points[k + 1], step)
+        for k, step in zip(pairs.tolist(), steps, strict=True)
+    ]
+    return float(np.quantile(shares, VisibilityPolicy.usual)) if shares else 0.0
+
+
 def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, float, int]:
     """Return the share, 0..1, of points of one visit that stand in the free space of another visit to the same place, of those
     that it could see; the same within one visit; and the number of different keyframes on the smaller side of the comparisons
@@ -223,7 +245,7 @@ def directional_overlap(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, g
 
 
 def net_overlap(
-    raster: CloudRasters, free: Sequence[FreeSpace], i: Ints, j: Ints, T_i_j: Floats, gate: float
+    raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, gate: float
 ) -> Floats:
     """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), counted both ways.
 
@@ -232,11 +254,13 @@ def net_overlap(
 
     Parameters
     ----------
-    free : observed free space of each cloud. gate : farthest match, m.
+    free : observed free space of each cloud; None = all points count as in view. gate : farthest match, m.
     """
 
     def weight(found: Correspondences, pairs: CloudPairs, T_i_j: Floats) -> Floats:
-        missed = (found.row >= 0) & ~found.good & _in_view(raster.clouds, free, pairs.i, T_i_j, found)
+        missed = (found.row >= 0) & ~found.good
+        if free is not None:
+            missed &= _in_view(raster.clouds, free, pairs.i, T_i_j, found)
         # The points looked up stand for those left out.
         asked = np.maximum((found.row >= 0).sum(axis=1), 1)
         return np.asarray((found.good - OverlapPolicy.against * missed) * (raster.clouds.counts[pairs.j] / asked)[:, None])

@@ -1,12 +1,14 @@
 """Candidates for loop closures: pairs of sub-maps that may overlap by the graph's covariance.
 
-A search narrower than the uncertainty may miss the true place, and one over all of it finds many places at which a short piece
-of a corridor fits, but one only at which doors and pillars match as well as walls (net_overlap). So sub-maps are so long that
-each contains several of them. The likeliest pairs come first: each closed loop makes the others more certain.
+Where the covariance of two sub-maps is small, they are candidates if they should share surfaces; where it is large, if they
+may. Where any pair is uncertain by many metres, stretches of tens of metres are compared first: a search narrower than the
+uncertainty may miss the true place, and a search over all of it finds many places at which one sub-map of a corridor fits, but
+one only at which doors and pillars match as well as walls (net_overlap). The likeliest pairs come first: each closed loop
+makes the others more certain.
 """
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +17,9 @@ from .. import se2
 from ..arrays import OUTLIER, Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
+from ..lidar import submaps
 from ..lidar.submaps import Submaps
+from ..lidar.visibility import surface_cells
 from .closures import LoopClosureConfig
 
 Tried = set[tuple[int, int, bool]]
@@ -28,13 +32,20 @@ class CandidatePolicy:
 
     sigmas: ClassVar[float] = OUTLIER
     """Standard deviations within which the truth is looked for."""
+    shared: ClassVar[float] = 0.25
+    """Least share of its surface that the smaller of two sub-maps should have in common with the other."""
+    cells: ClassVar[int] = 5
+    """Surface of a sub-map, in cells, up to which it shows no place."""
+    length: ClassVar[float] = 30.0
+    """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays
+    within the gate of the final matching. Each begins in the middle of the one before."""
     wider: ClassVar[float] = 2.0
     """Factor on the standard deviations of a chain of steps: a bias that following steps share adds up along the way, and the
     covariance contains none (twice the stated heading in a hospital)."""
     never: ClassVar[float] = 1e-4
-    """Probability of an overlap up to which a pair is not tried; the covariance may be too small, but not by so much."""
+    """Probability of an overlap up to which stretches are not tried; the covariance may be too small, but not by so much."""
     at_once: ClassVar[int] = 40
-    """Pairs that are searched before the graph is solved again."""
+    """Pairs of stretches tried before the graph is solved again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,42 +64,46 @@ class Candidates(Table):
     """(c,) m, of its position: half-width of a search."""
     constrained: bool = True
     """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
+    long: bool = False
+    """The sub-maps are long stretches, of which a part may overlap."""
 
     def names(self, config: LoopClosureConfig) -> Tried:
         """Return them as a record of the pairs tried."""
         doubtful = self.spread > config.direct
         return set(zip(self.target.tolist(), self.source.tolist(), doubtful.tolist(), strict=True))
 
-    def overlapping(self, sigmas: float, config: LoopClosureConfig) -> Bools:
-        """Return which pairs (c,) are within reach of each other, or within so many standard deviations of that."""
-        reach = config.reach + self.spread * (sigmas / CandidatePolicy.sigmas)
-        return np.asarray(np.hypot(self.guess[:, 0], self.guess[:, 1]) < reach)
-
 
 def propose(
     graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: Tried, constrained: bool,
-    config: LoopClosureConfig,
+    config: LoopClosureConfig, beyond: float = -1.0,
 ) -> Candidates:
-    """List pairs of sub-maps that may overlap, the best partners of each sub-map, the likeliest pair first.
+    """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
     Parameters
     ----------
     graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
-    recording : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
+    recording : (k,) recording of each keyframe.
     tried : in earlier rounds; not proposed again.
-    constrained : ranges constrain the trajectory; else a guess is taken as uncertain as a chain of steps may be.
+    constrained : ranges constrain the trajectory.
+    beyond : pairs that are no more uncertain, m, are left out.
     """
-    reference, of = submaps.reference, recording[submaps.reference]
-    a, b = np.triu_indices(len(reference), 1)
-    a, b = (ends[(b - a > 1) | (of[a] != of[b])] for ends in (a, b))
-    guess, covariance = se2.between(*graph.poses[reference[[a, b]]]), marginals.relative(reference[a], reference[b])
-    chance = overlap_probability(guess, covariance, config.reach)
-    wider = 1.0 if constrained else CandidatePolicy.wider
-    every = Candidates(a, b, guess, wider**2 * covariance, wider * _spread(covariance), constrained)
-    possible = every.overlapping(CandidatePolicy.sigmas / wider, config) & (chance > CandidatePolicy.never)
-    possible &= ~_among(np.stack([a, b, every.spread > config.direct]), tried)
-    kept = best_per_submap(a, b, np.where(possible, chance, -1.0), config.partners)
-    return every.rows(kept[np.argsort(-chance[kept], kind="stable")])
+    reference, rules = submaps.reference, CandidatePolicy
+    poses = graph.poses[reference]
+    a, b, distance = _near(poses, recording[reference], config)
+    guess, covariance = se2.between(poses[a], poses[b]), marginals.relative(reference[a], reference[b])
+    spread = _spread(covariance)
+    seen = surface_cells(submaps.clouds, poses)
+    common = np.asarray((seen @ seen.T).todense())[a, b]
+    size = np.maximum(np.diff(seen.indptr), 1)
+    expected = common / np.minimum(size[a], size[b])
+    doubtful = spread > config.direct
+    worth = np.where(doubtful, overlap_probability(guess, covariance, config.reach), expected)
+    near = distance < config.reach + np.minimum(spread, config.search_limit)
+    possible = np.where(doubtful, near & (worth > 0.0), expected > rules.shared)
+    possible &= (np.minimum(size[a], size[b]) > rules.cells) & (spread > beyond) & (spread <= config.search_limit)
+    possible &= ~_among(np.stack([a, b, doubtful]), tried)
+    kept = best_per_submap(a, b, np.where(possible, worth, -1.0), config.partners)
+    return Candidates(a[kept], b[kept], guess[kept], covariance[kept], spread[kept], constrained)
 
 
 def overlap_probability(guess: Floats, covariance: Floats, reach: float) -> Floats:
@@ -109,6 +124,14 @@ def _among(columns: Ints, names: Set[tuple[int, ...]]) -> Bools:
     return np.isin(places @ columns, places @ named)
 
 
+def _near(poses: Floats, recording: Ints, config: LoopClosureConfig) -> tuple[Ints, Ints, Floats]:
+    """Return pairs (p,), (p,) of poses (s, 3) that may be tried, and their distances, m; neighbours in time may not."""
+    a, b = np.triu_indices(len(poses), 1)
+    distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)
+    near = ((b - a > 1) | (recording[a] != recording[b])) & (distance < config.reach + config.search_limit)
+    return a[near], b[near], distance[near]
+
+
 def _spread(covariance: Floats) -> Floats:
     """Return how far (p,), m, places may be off in the direction in which they are least certain."""
     return CandidatePolicy.sigmas * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
@@ -122,3 +145,52 @@ def best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
         rank = np.arange(len(order)) - np.searchsorted(one[order], one[order])
         kept.update(order[(rank < limit) & (worth[order] > 0.0)].tolist())
     return np.array(sorted(kept), dtype=np.intp)
+
+
+def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return first keyframe (s,), one past the last (s,) and reference (s,) of stretches, each overlapping the next by half.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m. recording : (k,).
+    """
+    first, last = submaps.cut(path, recording, CandidatePolicy.length / 2.0)
+    goes_on = recording[first[1:]] == recording[first[:-1]]
+    last[:-1] = np.where(goes_on, last[1:], last[:-1])
+    return first, last, (first + last - 1) // 2
+
+
+def _of_stretches(config: LoopClosureConfig) -> LoopClosureConfig:
+    return replace(config, reach=CandidatePolicy.length / 2.0, search_limit=np.inf)
+
+
+def any_uncertain(
+    graph: Graph, covariance: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig
+) -> bool:
+    """Return whether any stretches, or sub-maps, that may overlap are too uncertain for a search of sub-maps.
+
+    Parameters
+    ----------
+    reference : (s,) keyframes in the middle of each. recording : (k,).
+    """
+    a, b, _ = _near(graph.poses[reference], recording[reference], _of_stretches(config))
+    return bool(_spread(covariance.relative(reference[a], reference[b])).max(initial=0.0) > config.search_limit)
+
+
+def uncertain_pairs(
+    graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: Tried, constrained: bool,
+    config: LoopClosureConfig, beyond: float,
+) -> Candidates:
+    """Return pairs of stretches that may overlap and are more uncertain than a limit, m, the likeliest first; see propose."""
+    wide = _of_stretches(config)
+    found = replace(propose(graph, covariance, pieces, recording, tried, constrained, wide, beyond), long=True)
+    chance = overlap_probability(found.guess, found.covariance, wide.reach)
+    order = np.argsort(-chance, kind="stable")
+    return found.rows(order[chance[order] > CandidatePolicy.never])
+
+
+def first_of(candidates: Candidates) -> Candidates:
+    """Return the candidates that are tried before the graph is solved again, as uncertain as a chain of steps may be."""
+    first = candidates.rows(slice(0, CandidatePolicy.at_once))
+    wider = 1.0 if candidates.constrained else CandidatePolicy.wider
+    return replace(first, covariance=wider**2 * first.covariance, spread=wider * first.spread)

@@ -21,25 +21,32 @@ class LoopClosureConfig:
     method: Literal["search", "icp"] = "search"
     """search: candidates by the uncertainty of the graph, verified by all settings of this group. icp: the paper's method
     with the settings of [icp]; of this group it uses rounds, partners and correlation only."""
-    partners: int = 2
-    """Candidates per sub-map and round, those that most probably overlap."""
-    rounds: int = 12
-    """Most rounds of searching and solving; ends early when nothing is left to be tried."""
+    partners: int = 4
+    """Candidates per sub-map and round, best expected overlap first."""
+    rounds: int = 4
+    """Most rounds of searching and solving; ends early when a round finds nothing new."""
     direct: ClassVar[float] = 0.5
     """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
-    reach: float = setting(7.5, advanced=True)
+    reach: float = setting(6.0, advanced=True)
     """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
+    search_limit: float = setting(8.0, advanced=True)
+    """Largest half-width of a search among sub-maps, m. Where a pair is less certain, long stretches are compared first."""
     search_angle: ClassVar[float] = 0.7
     """Largest half-width of a search, rad."""
     gate: float = 0.15
     """Outlier distance d of the final matching, m (the paper uses 0.1)."""
     sigma: float = 0.05
     """Fitness: greatest root mean square distance of matched points, m."""
+    overlap: float = 0.4
+    """Least share of points with a match when the graph's guess was good."""
+    overlap_after_search: ClassVar[float] = 0.5
+    """Least share of points with a match after a search, which can be fooled."""
     net_overlap: ClassVar[float] = 10.0
-    """Least surface that speaks for a place in every direction (see lidar/visibility.py), m, counted both ways: along a
-    corridor, five metres of doors and pillars. So much more must speak for it than for any other place that a search finds,
-    too. Of 220 pairs of pieces of 30 m searched over 20 m in four buildings, 49 of the 73 best places that are right have
-    more, and 4 of the 147 that are wrong, 3 where one corridor is a copy of another."""
+    """Least surface that speaks for a place of long stretches in every direction (see lidar/visibility.py), m, counted both
+    ways: along a corridor, five metres of doors and pillars. Of 220 pairs searched over 20 m in four buildings, 49 of the 73
+    best places that are right have more, and 4 of the 147 that are wrong, 3 where one corridor is a copy of another."""
+    uniqueness: ClassVar[float] = 0.85
+    """A second place that matches this share as well as the first makes a search ambiguous."""
     agrees: ClassVar[float] = 4.0
     """Standard deviations within which measurements of a pose agree; of its three directions together, by the Mahalanobis
     distance, 0.1 % are farther off. Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong far
@@ -51,7 +58,10 @@ class LoopClosureConfig:
     correlation: float = setting(24.0, advanced=True)
     """Matches that together weigh as one: they share the bending of both sub-maps."""
     through: float = setting(0.12, advanced=True)
-    """Largest share of one sub-map's points that may stand where the other saw free space."""
+    """Largest share of one sub-map's points that may stand where the other saw free space. Where sub-maps driven one after
+    the other have more, because people walk about, their share is the limit."""
+    places: ClassVar[int] = 3
+    """Places found by a search that are matched before one is chosen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

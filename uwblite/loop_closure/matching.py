@@ -34,12 +34,12 @@ class MatchingPolicy:
     """m, of the rasters in which nearest points are looked up."""
     least_turn: ClassVar[float] = 0.1
     """Least half-width of a search, rad."""
-    places: ClassVar[int] = 20
-    """Places found by a search that are matched before one is chosen: along a corridor the walls fit at many places."""
+    many_places: ClassVar[int] = 20
+    """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
     same_place: ClassVar[float] = 0.3
     """Matches nearer to each other than this, m and rad, are one place."""
     finer: ClassVar[float] = 1.5
-    """Factor by which the headings of a search are closer than among the clouds of keyframes: sub-maps are long."""
+    """Factor by which the headings of a wide search are closer."""
     extent: ClassVar[float] = 0.95
     """Share of the points of a cloud that its extent contains: those that are far are few."""
 
@@ -53,11 +53,11 @@ class ClosureMatches(Table):
     found: Bools
     """A place was found."""
     second: Floats
-    """m, the net matching surface at another place; 0 where there is no better one."""
+    """Ratio of the matches at the second-best place to those at the best."""
     through: Floats
     """Share of its points that would stand in free space."""
     net: Floats
-    """m, net matching surface, see net_overlap."""
+    """m, net matching surface, see net_overlap; inf where no wide search was made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,20 +67,26 @@ class _Batch:
     candidates: Candidates
     clouds: Clouds
     spacing: float
-    free: Sequence[FreeSpace]
+    free: Sequence[FreeSpace] | None
     config: LoopClosureConfig
     search: CorrelativeConfig
 
 
 def fit(
-    candidates: Candidates, submaps: Submaps, free: Sequence[FreeSpace], config: LoopClosureConfig,
-    search_config: CorrelativeConfig, progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
+    free: Sequence[FreeSpace] | None = None, progress: Callable[[int, int], None] | None = None,
+    executor: Executor | None = None,
 ) -> ClosureMatches:
-    """Find where each candidate fits, given the observed free space of each sub-map."""
+    """Find where each candidate fits.
+
+    Parameters
+    ----------
+    free : observed free space of each sub-map; None = not tested.
+    """
     tasks = (
         _Batch(
             replace(candidates.rows(rows), target=target, source=source), replace(submaps.clouds.chosen(used), work=Work()),
-            submaps.spacing, [free[k] for k in used.tolist()], config, search_config,
+            submaps.spacing, None if free is None else [free[k] for k in used.tolist()], config, search_config,
         )
         for rows, used, target, source in batches(candidates.target, candidates.source)
     )
@@ -102,10 +108,15 @@ def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     row, guess = _guesses(batch)
     target, source = candidates.target[row], candidates.source[row]
     tries = align_pairs(raster, pairs_of(clouds, target, source, config.points), guess, rules.reach, gate)
-    score = batch.spacing * net_overlap(raster, batch.free, target, source, tries.pose, gate)
+    score = tries.share
+    if candidates.long:
+        score = batch.spacing * net_overlap(raster, batch.free, target, source, tries.pose, gate)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
-    found, pose, net = place >= 0, candidates.guess.copy(), np.zeros(len(place))
-    pose[found], net[found] = tries.pose[place[found]], score[place[found]]
+    found, pose = place >= 0, candidates.guess.copy()
+    net = np.full(len(place), np.inf)
+    if candidates.long:
+        net[found] = score[place[found]]
+    pose[found] = tries.pose[place[found]]
     pairs = pairs_of(clouds, candidates.target, candidates.source, config.points)
     factors = match(raster, pairs, pose, gate, gate / 2.0)
     best = Aligned(pose, factors)
@@ -121,11 +132,14 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
+            search_config, places = batch.search, config.places
+            if candidates.long:
+                search_config, places = _coarse(batch.search), MatchingPolicy.many_places
             turn = CandidatePolicy.sigmas * np.sqrt(candidates.covariance[k, 2, 2])
             turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
             target, source = (chosen(int(of[k])) for of in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
-            poses = search(target, source, centre, half_widths, _coarse(batch.search)).poses
+            poses = search(target, source, centre, half_widths, search_config).poses[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
     return np.concatenate(rows).astype(np.intp), np.concatenate(guesses)
@@ -147,33 +161,35 @@ def _window(
 
 
 def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
-    """Return the settings of a search of sub-maps: larger cells, finer headings, and many places."""
+    """Return the settings of a wide search: larger cells, finer headings for long clouds, and many places."""
     return replace(
         config, resolution=2.0 * config.resolution, spread=2.0 * config.spread,
-        angle_step=config.angle_step / MatchingPolicy.finer, candidates=MatchingPolicy.places,
+        angle_step=config.angle_step / MatchingPolicy.finer, candidates=MatchingPolicy.many_places,
     )
 
 
-def _best_places(row: Ints, pose: Floats, score: Floats, candidates: int) -> tuple[Ints, Floats]:
-    """Return the best try of each candidate (c,), -1 = none, and the score (c,) that another place reaches, at least 0.
+def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tuple[Ints, Floats]:
+    """Return the best try of each candidate (c,), -1 = none, and what share of its matches another place reaches (c,).
 
     Parameters
     ----------
-    row : (g,) candidate of each try. pose : (g, 3). score : (g,).
+    row : (g,) candidate of each try. pose : (g, 3). share : (g,) that matches.
     """
     best, second = np.full(candidates, -1, dtype=np.intp), np.zeros(candidates)
-    order = np.lexsort((-score, row))
+    order = np.lexsort((-share, row))
     tried, first = np.unique(row[order], return_index=True)
     best[tried] = order[first]
     apart = se2.between(pose[best[row]], pose)
     other = (np.hypot(apart[:, 0], apart[:, 1]) > MatchingPolicy.same_place) | (np.abs(apart[:, 2]) > MatchingPolicy.same_place)
-    np.maximum.at(second, row[other], score[other])
+    np.maximum.at(second, row[other], share[other])
+    second[tried] /= np.maximum(share[best[tried]], np.finfo(np.float64).tiny)
     return best, second
 
 
 def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:
-    """Return which matches (c,), with net overlaps (c,), have enough surface and small distances."""
-    return np.asarray((net >= config.net_overlap) & (best.rms <= config.sigma))
+    """Return which matches (c,), with net overlaps (c,), have enough points and small distances."""
+    enough = best.share >= min(config.overlap, config.overlap_after_search)
+    return np.asarray(np.where(np.isfinite(net), net >= config.net_overlap, enough) & (best.rms <= config.sigma))
 
 
 def _free_space_violations(batch: _Batch, best: Aligned, promising: Bools) -> Floats:
@@ -183,6 +199,8 @@ def _free_space_violations(batch: _Batch, best: Aligned, promising: Bools) -> Fl
     """
     candidates, free = batch.candidates, batch.free
     through = np.zeros(len(candidates.target))
+    if free is None:
+        return through
     for k in np.flatnonzero(promising):
         a, b = int(candidates.target[k]), int(candidates.source[k])
         through[k] = violates_free_space(free[a], batch.clouds.cloud(a)[0], free[b], batch.clouds.cloud(b)[0], best.pose[k])

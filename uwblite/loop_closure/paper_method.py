@@ -17,12 +17,10 @@ from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
-from .candidates import best_per_submap
+from .candidates import CandidatePolicy, best_per_submap
 from .closures import Closures, LoopClosureConfig, collected
 from .parallel import batches, in_order
 
-_SHARED = 0.25
-"""Least share of its surface that the smaller of two sub-maps should have in common with the other."""
 _CELL = 0.5
 """m, edge of squares; the overlap of two sub-maps is the share of the smaller one's squares in which both have points."""
 
@@ -67,7 +65,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
     a, b = np.triu_indices(len(submaps), 1)
     first = recording[submaps.reference]
     worth = np.where((b - a > 1) | (first[a] != first[b]), _shared(poses[submaps.reference], submaps)[a, b], 0.0)
-    rows = best_per_submap(a, b, np.where(worth >= _SHARED, worth, 0.0), limit)
+    rows = best_per_submap(a, b, np.where(worth >= CandidatePolicy.shared, worth, 0.0), limit)
     return a[rows], b[rows]
 
 

@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import TINY, Floats
 from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
-from ..lidar.scan_matching import measured, squared_distance
+from ..lidar.scan_matching import measured
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import FreeSpace
 from ..map_result import LoopClosure
@@ -37,19 +37,20 @@ _SLID = 3
 
 
 def find(
-    candidates: Candidates, submaps: Submaps, free: Sequence[FreeSpace], config: LoopClosureConfig,
-    search_config: CorrelativeConfig, progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
+    progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
+    executor: Executor | None = None,
 ) -> Closures:
     """Match candidates and verify each on its own; accepted ones become edges between the sub-maps' keyframes.
 
     Parameters
     ----------
-    free : see visibility.observed_free_space.
+    free : see visibility.observed_free_space; None = free-space violations are not tested.
     executor : the result does not depend on it.
     """
     if not len(candidates.target):
         return no_closures()
-    fits = fit(candidates, submaps, free, config, search_config, progress, executor)
+    fits = fit(candidates, submaps, config, search_config, free, progress, executor)
     best = fits.best
     variance = np.full(len(best.pose), config.match_sigma**2 * config.correlation)
     z, root = measured(best.factors, best.pose, variance)
@@ -65,17 +66,27 @@ def _judge(
 ) -> list[tuple[str, str]]:
     """Return the outcome of each candidate so far, one of map_result.OUTCOMES, and its reason in words."""
     result, searched = fits.best, candidates.spread > config.direct
-    distance = squared_distance(se2.between(z, candidates.guess), candidates.covariance, sqrt_information)
-    strength = np.linalg.eigvalsh(np.swapaxes(sqrt_information, 1, 2) @ sqrt_information)[:, 1]
+    error = se2.between(z, candidates.guess)
+    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    seen = np.linalg.pinv(information, rcond=TINY, hermitian=True)
+    # Only directions that the match measures are compared: project the error onto them.
+    onto = seen @ information
+    visible = np.einsum("eij,ej->ei", onto, error)
+    joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
+    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=TINY, hermitian=True), visible)
+    strength = np.linalg.eigvalsh(information)[:, 1]
     share, rms = result.share, result.rms
     most = config.agrees**2 if candidates.constrained else np.inf
     verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
+        least = config.overlap_after_search if searched[k] else config.overlap
         if not fits.found[k]:
             verdict = "not-found", "the search found no place for it"
         elif fits.net[k] < config.net_overlap:
             text = f"only {fits.net[k]:.1f} m of surface speak for it in one direction (least {config.net_overlap:g} m)"
             verdict = "few-matches", text
+        elif share[k] < least and not candidates.long:
+            verdict = "few-matches", f"only {share[k]:.0%} of its points match (least {least:.0%})"
         elif rms[k] > config.sigma:
             verdict = "far-matches", f"matches lie {rms[k]:.3f} m apart (most {config.sigma:g} m)"
         elif fits.through[k] > config.through:
@@ -83,8 +94,8 @@ def _judge(
             verdict = "free-space-violation", text
         elif strength[k] < 1.0:
             verdict = "degenerate", "the surfaces fix neither position nor heading"
-        elif searched[k] and fits.net[k] - fits.second[k] < config.net_overlap:
-            verdict = "ambiguous", f"for another place speak {fits.second[k]:.1f} m of surface, here {fits.net[k]:.1f} m"
+        elif searched[k] and fits.second[k] > config.uniqueness:
+            verdict = "ambiguous", f"another place matches {fits.second[k]:.0%} as well"
         elif distance[k] > most:
             text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
             verdict = "contradicts-graph", text
@@ -109,6 +120,7 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
         reasons = [f"the odometry would have to jump by {jump:.1f} m and back again" for jump in by]
         solved, left = _tightened(graph, left.without(by == 0.0, "contradicts-graph", reasons), config, solver)
     return solved, left
+
 
 
 def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

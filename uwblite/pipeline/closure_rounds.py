@@ -1,50 +1,119 @@
-"""Rounds of loop closing: candidates among sub-maps, matches, second optimisation, until nothing is left to be tried."""
+"""Rounds of loop closing: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
+from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
+from ..lidar.submaps import Submaps
+from ..lidar.visibility import FreeSpace
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, paper_method, verification
-from ..loop_closure.candidates import CandidatePolicy, Tried
-from ..loop_closure.closures import Closures
+from ..loop_closure.candidates import Candidates, Tried
+from ..loop_closure.closures import Closures, LoopClosureConfig
 from .estimate import Estimate, Task
+from .mapping_config import MappingConfig
 from .progress import Stage, solver_figures
 
 
+@dataclass(frozen=True, slots=True)
+class RoundPolicy:
+    """Rounds of loop closing."""
+
+    per_stretch: ClassVar[int] = 3
+    """Sub-maps in half a stretch."""
+    bent: ClassVar[float] = 0.01
+    """How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
+    few: ClassVar[float] = 0.05
+    """Share of the closures up to which new ones change nothing."""
+    wide_rounds: ClassVar[int] = 12
+    """Rounds of searching among long stretches, at most; a bound on the time where no loop closes."""
+
+
 def close_loops(estimate: Estimate, task: Task) -> Estimate:
-    """Build sub-maps, find closures among them and solve again, the likeliest pairs first (paper: second optimisation)."""
-    config, recordings, with_ranges = task.config, task.recordings, estimate.ranges is not None
-    rules, of, base, found = config.loop_closure, recordings.of_keyframe, estimate.problem, closures.no_closures()
-    scans = estimate.lidar.clouds
-    pieces = submaps.build(scans, base.poses, recordings.path, of, config.submaps, submaps.overlapping)
-    free = visibility.observed_free_space(scans, pieces, base.poses)
-    pieces = visibility.static_points(pieces, free)
-    covariance, tried = JointCovariance(base, pieces.reference), Tried()
+    """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
+    config, recordings, scans = task.config, task.recordings, estimate.lidar
+    rules, of, with_ranges = config.loop_closure, recordings.of_keyframe, estimate.ranges is not None
+    base, found = estimate.problem, closures.no_closures()
+    reference = submaps.references(recordings.path, of, config.submaps.epsilon)
+    first, some = JointCovariance(base, reference), reference[:: RoundPolicy.per_stretch]
+    covariance: JointCovariance | None = first
+    if closure_candidates.any_uncertain(base, first, some, of, rules):
+        base, found = _with_long_stretches_tied(base, estimate, task)
+        covariance = None
+    del first
+    tried = Tried()
+    refined = config.refinement.rounds > 0 and not estimate.rests_on_ranges
+    pieces, built, dynamic = None, base.poses, 0.0
     for lap in range(rules.rounds):
+        if pieces is None or pieces.bent(built, base.poses) > RoundPolicy.bent:
+            pieces = submaps.build(scans.clouds, base.poses, recordings.path, of, config.submaps)
+            (pieces, free), built = _static(pieces, base, estimate), base.poses
+            dynamic = visibility.dynamic_share(pieces, free, base.poses, of)
+        covariance = covariance or JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = closure_candidates.propose(base, covariance, pieces, of, tried, with_ranges, rules)
-        if lap and not len(candidates.target):
-            break
-        # Each closed loop makes the others more certain, and their searches smaller.
-        candidates = candidates.rows(np.cumsum(candidates.spread > rules.direct) <= CandidatePolicy.at_once)
-        certain, before = bool(np.all(candidates.spread <= rules.direct)), base.poses
+        covariance = None  # For a thousand sub-maps it takes a hundred megabytes.
         tried |= candidates.names(rules)
-        report = task.stages.reporter("loop closure")
-        new = verification.find(candidates, pieces, free, rules, config.correlative, report, task.executor)
-        new = _without_forbidden(new, task)
+        loose = replace(rules, through=max(rules.through, dynamic))
+        new = _verified(candidates, pieces, free, loose, task, task.stages.reporter("loop closure"))
+        before = base.poses
         base, found = _reconciled(base, found, new, task)
         counts = {"candidates": len(candidates.target), "accepted": len(new.edges), "kept": len(found.edges)}
         task.stages.end(Stage("loop closure", lap + 1), submaps=len(pieces), **counts)
-        if certain and np.hypot(*(base.poses - before)[:, :2].T).max() < config.refinement.first_gate:
-            # From here the joint refinement matches whatever further closures would connect.
+        if len(new.edges) <= RoundPolicy.few * len(found.edges) or (refined and _settled(candidates, before, base, config)):
             break
-        if len(new.edges):
-            covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
     return replace(estimate, closures=found).with_estimates_of(base)
+
+
+def _settled(candidates: Candidates, before: Floats, graph: Graph, config: MappingConfig) -> bool:
+    """Return whether the joint refinement matches from the poses of a graph whatever further closures would connect.
+
+    Parameters
+    ----------
+    before : (k, 3) poses without the closures of these candidates.
+    """
+    moved = np.hypot(*(graph.poses - before)[:, :2].T)
+    certain = candidates.spread <= config.loop_closure.direct
+    return bool(certain.all()) and float(moved.max(initial=0.0)) < config.refinement.first_gate
+
+
+def _with_long_stretches_tied(base: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Closures]:
+    """Close loops whose ends are too uncertain for a search of sub-maps, the most certain first, in rounds.
+
+    Returns
+    -------
+    The solved graph and the closures.
+    """
+    recordings, rules, found = task.recordings, task.config.loop_closure, closures.no_closures()
+    first, last, reference = closure_candidates.cut(recordings.path, recordings.of_keyframe)
+    covariance = JointCovariance(base, reference)
+    pieces = submaps.of_pieces(estimate.lidar.clouds, base.poses, first, last, reference, task.config.submaps)
+    pieces, free = _static(pieces, base, estimate)
+    tried, accepted, with_ranges = Tried(), 0, estimate.ranges is not None
+    for _ in range(RoundPolicy.wide_rounds):
+        pairs = closure_candidates.first_of(
+            closure_candidates.uncertain_pairs(
+                base, covariance, pieces, recordings.of_keyframe, tried, with_ranges, rules, rules.direct
+            )
+        )
+        if not len(pairs.target):
+            break
+        tried |= pairs.names(rules)
+        new = _verified(pairs, pieces, free, rules, task)
+        base, found = _reconciled(base, found, new, task)
+        if len(new.edges):
+            covariance = JointCovariance(base.with_edges(found.edges), reference)
+            accepted += len(new.edges)
+    if not tried:
+        return base, found
+    task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=accepted)
+    return base, found
 
 
 def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
@@ -66,6 +135,21 @@ def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
         estimate = replace(estimate, closures=found).with_estimates_of(solved)
         task.stages.end(Stage("second optimisation", lap + 1), **solver_figures(result))
     return estimate
+
+
+def _static(pieces: Submaps, graph: Graph, estimate: Estimate) -> tuple[Submaps, list[FreeSpace]]:
+    """Return sub-maps without moving objects, and the observed free space of each."""
+    free = visibility.observed_free_space(estimate.lidar.clouds, pieces, graph.poses)
+    return visibility.static_points(pieces, free), free
+
+
+def _verified(
+    candidates: Candidates, pieces: Submaps, free: Sequence[FreeSpace], rules: LoopClosureConfig, task: Task,
+    report: Callable[[int, int], None] | None = None,
+) -> Closures:
+    """Match candidates and return the outcome of each."""
+    found = verification.find(candidates, pieces, rules, task.config.correlative, report, free, task.executor)
+    return _without_forbidden(found, task)
 
 
 def _reconciled(base: Graph, found: Closures, new: Closures, task: Task) -> tuple[Graph, Closures]:
