@@ -8,12 +8,11 @@ from hypothesis.extra import numpy as hnp
 
 from uwblite.errors import DataError
 from uwblite.lidar.point_cloud import (
-    cell_number,
     estimate_normals,
     make_tree,
-    mean_by_key,
     radius_outlier_filter,
     statistical_outlier_filter,
+    voxel_filter,
 )
 
 clouds = hnp.arrays(np.float64, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5.0, 5.0, allow_subnormal=False))
@@ -48,13 +47,12 @@ def test_radius_filter_equals_brute_force(points, radius, least):
 
 @settings(max_examples=25, deadline=None)
 @given(clouds, st.floats(0.05, 3.0))
-def test_means_of_squares_equal_brute_force(points, size):
+def test_voxel_filter_equals_brute_force(points, size):
     squares = {}
     for point, square in zip(points, np.floor(points / size).tolist(), strict=True):
         squares.setdefault(tuple(square), []).append(point)
     expected = np.array([np.mean(squares[key], axis=0) for key in sorted(squares)]).reshape(-1, 2)
-    found = mean_by_key(cell_number(np.zeros(len(points), dtype=np.int64), points, size), points)[1]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(voxel_filter(points, size), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("points", "words"), [
@@ -62,13 +60,15 @@ def test_means_of_squares_equal_brute_force(points, size):
     ("wall", "points must hold numbers, not str"),
 ])  # fmt: skip
 def test_filters_say_what_is_wrong_with_points(points, words):
-    for call in (lambda p: statistical_outlier_filter(p, 3, 1.0), lambda p: radius_outlier_filter(p, 0.1, 1)):
+    for call in (lambda p: voxel_filter(p, 0.1), lambda p: statistical_outlier_filter(p, 3, 1.0),
+                 lambda p: radius_outlier_filter(p, 0.1, 1)):  # fmt: skip
         with pytest.raises(DataError, match=words):
             call(points)
 
 
 def test_filters_take_lists():
     points = [[0, 0], [0, 1], [5, 5]]
+    np.testing.assert_array_equal(voxel_filter(points, 2.0), [[0.0, 0.5], [5.0, 5.0]])
     assert radius_outlier_filter(points, 1.0, 1).tolist() == [True, True, False]
     assert statistical_outlier_filter(points, 1, 0.5).tolist() == [True, True, False]
 

@@ -31,6 +31,12 @@ def as_points(points: ArrayLike, name: str = "points") -> Floats:
     return array
 
 
+def voxel_filter(points: ArrayLike, size: float) -> Floats:
+    """Return the mean (m, 2) of the points (n, 2) in each occupied square of an edge, m, by x and y of the squares."""
+    points = as_points(points)
+    return mean_by_key(cell_number(np.zeros(len(points), dtype=WIDE), points, size), points)[1]
+
+
 def statistical_outlier_filter(points: ArrayLike, neighbours: int, std_ratio: float) -> Bools:
     """Return which points (n, 2), m, have a mean distance to their nearest neighbours of at most mean + std_ratio * standard
     deviation of that distance over the whole cloud; a small cloud uses all its points."""
