@@ -8,6 +8,7 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite.assessment import facts
 from uwblite.assessment.recording import diagnose
+from uwblite.assessment.sensor_checks import check_sensors
 from uwblite.findings import doubt, warning
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting
 
@@ -134,8 +135,10 @@ def test_clocks_that_have_nothing_in_common(sound):
 
 
 def test_missing_sensors_and_notes_of_the_reader(without_scans):
-    assert_named(without_scans.without(uwb=True), "warning", "no UWB ranges")
-    assert_named(without_scans, "warning", "no lidar in use")
+    assert_named(without_scans.without(uwb=True), "warning", "no UWB ranges in use: the path rests on odometry alone")
+    assert_named(without_scans, "warning", "no lidar in use: no map, and only the odometry's turns")
+    cures = {finding.kind: finding.cure for finding in check_sensors([without_scans.without(uwb=True)])}
+    assert cures == {"no-ranges": "check the tag if that is not meant", "no-lidar": "check the lidar if that is not meant"}
     notes = LogNotes(lines=1000, broken=30, broken_lines=((17, "not a number"),), warnings=("3 messages out of order",))
     noted = replace(without_scans, notes=notes)
     assert_named(noted, "warning", "30 of 1000 lines are broken and were skipped (line 17: not a number)")

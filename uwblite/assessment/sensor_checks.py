@@ -36,13 +36,19 @@ class CheckPolicy:
 
 
 def check_sensors(logs: Sequence[SensorLog]) -> Iterator[Finding]:
-    """Warn of sensors without data in all of some recordings."""
-    if not any(log.ranges is not None and len(log.ranges.stamps) for log in logs):
-        yield Finding("no-ranges", WARNING, "no UWB ranges in use: the map rests on odometry and lidar", sensor="radio")
+    """Warn of sensors without data in all recordings."""
     scans = [log.scans for log in logs if log.scans is not None and len(log.scans.stamps)]
+    ranges = any(log.ranges is not None and len(log.ranges.stamps) for log in logs)
+    if not ranges:
+        text = "no UWB ranges in use: " + (
+            "the map rests on odometry and lidar" if scans else "the path rests on odometry alone"
+        )
+        yield Finding("no-ranges", WARNING, text, "check the tag if that is not meant", "radio")
     if not scans:
-        text = "no lidar in use: no map, and only the odometry's turns show that trajectory and anchors are not mirrored"
-        yield Finding("no-lidar", WARNING, text, sensor="lidar")
+        text = "no lidar in use: no map" + (
+            ", and only the odometry's turns show that trajectory and anchors are not mirrored" if ranges else ""
+        )
+        yield Finding("no-lidar", WARNING, text, "check the lidar if that is not meant", "lidar")
     elif not any(np.isfinite(each.ranges).any() for each in scans):
         yield Finding("empty-scans", WARNING, "no scan has a reading: the map is empty", sensor="lidar")
 
