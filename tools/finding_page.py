@@ -25,7 +25,7 @@ FACTORIES = {"doubt": "doubt", "warning": "warning", "Finding": "", "say": "", "
 """Functions that make a finding of the kind that is their first argument, and its severity where they say it."""
 MAKES = re.compile(r"\b(?:doubt|warning|Finding)\b|\b(?:say|add)\(\s*f?\"")
 """What stands in a file that makes findings."""
-KIND = re.compile(r"[a-z]+(-[a-z]+)+|gyro|drift|scales|carried|uncertain|mirrored")
+KIND = re.compile(r"[a-z]+(-[a-z]+)+|gyro|drift|scales|carried|uncertain|mirrored|reader|refused|silences|spikes")
 
 HEAD = """\
 # Findings
@@ -51,7 +51,7 @@ class Rule:
 
     kind: str
     severity: str
-    """'doubt', 'warning' or 'warning or doubt'."""
+    """'doubt', 'warning', 'note', or several of them, as 'warning or doubt'."""
     room: str
     says: str
     """Docstring of the function; empty for a row of a table, whose text tells all."""
@@ -97,8 +97,8 @@ def _rules_of(function: ast.FunctionDef, room: str) -> Iterator[Rule]:
             continue
         severity = FACTORIES.get(name, "")
         if name == "Finding" and len(call.args) > 1:
-            name = getattr(call.args[1], "id", "").lower()
-            severity, name = name if name in ("doubt", "warning", "note") else "", "Finding"
+            names = {part.id.lower() for part in ast.walk(call.args[1]) if isinstance(part, ast.Name)}
+            severity = " or ".join(sorted(names & {"doubt", "warning", "note"}, reverse=True))
         text = call.args[2 if name == "Finding" else 1] if len(call.args) > (2 if name == "Finding" else 1) else None
         if isinstance(text, ast.Name):
             before = [value for line, target, value in texts if target == text.id and line <= call.lineno]

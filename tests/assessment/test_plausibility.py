@@ -288,17 +288,30 @@ def test_a_scale_that_another_unit_explains_is_a_doubt_where_no_lidar_says_whose
     assert len(stages.doubts) + len(stages.warnings) == 1
 
 
-@pytest.mark.parametrize("of", ["range_scale", "odometry_scale", "heading_scale"])
-@pytest.mark.parametrize(("off", "state", "severity"), [
-    (0.149, "estimated", "warning"), (0.151, "estimated", "doubt"), (-0.151, "estimated", "doubt"), (0.151, "prior", None),
+@pytest.mark.parametrize(("of", "off", "state", "said"), [
+    ("range_scale", 0.149, "estimated", True), ("range_scale", 0.151, "estimated", False),
+    ("odometry_scale", 0.151, "estimated", True),
+    ("heading_scale", -0.3, "estimated", True), ("heading_scale", -0.3, "prior", False),
 ])  # fmt: skip
-def test_lengths_that_differ_by_more_than_15_percent_are_a_doubt(of, off, state, severity):
-    """Of ranges or wheels; turns are no lengths, and what the recording does not show is no finding."""
+def test_unusual_values_are_warnings_and_gross_lengths_of_ranges_are_told_elsewhere(of, off, state, said):
+    """By check_lengths; what the recording does not show is no finding."""
     key = UnknownKey(of)
     value = CalibrationEstimate(key, off, 0.01, "1", "relative error of all lengths", state)
     found = [(f.severity, f.kind) for f in check_calibration([value], {key: Unknown(key, 0.02, "1", "")}, task_of(lidar=True))]
-    doubted = severity == "doubt" and of != "heading_scale"
-    assert found == ([] if severity is None else [("doubt", "scales") if doubted else ("warning", "unusual-calibration")])
+    assert found == ([("warning", "unusual-calibration")] if said else [])
+
+
+@pytest.mark.parametrize(("scale", "placed", "doubted"), [
+    (1.149, True, False), (1.151, True, True), (0.849, True, True), (2.0, False, False), (None, True, False),
+])  # fmt: skip
+def test_ranges_of_another_scale_are_a_doubt_where_anchors_are_placed(scale, placed, doubted):
+    """However uncertain the scale is."""
+    of, value = ("bias", 5.0) if scale is None else ("range_scale", scale - 1.0)
+    calibration = Calibration((UnknownKey(of, "A" if scale is None else None),), np.array([value]))
+    graph = Graph(np.zeros((3, 3)), np.zeros((1, 2)), calibration=calibration)
+    found = list(check_lengths(estimate_of(graph, placed=[placed]), task_of(lidar=True)))
+    assert [(n.severity, n.kind, n.figures["range_scale"]) for n in found] == ([("doubt", "scales", scale)] if doubted else [])
+    assert all(f"the ranges are {scale:.2f} times the distances on the map" in n.text for n in found)
 
 
 @pytest.mark.parametrize(("ratios", "said"), [
@@ -307,5 +320,5 @@ def test_lengths_that_differ_by_more_than_15_percent_are_a_doubt(of, off, state,
 def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
     """By the first such recording; recordings that compare nothing do not count."""
     each = [{"screening": Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)} for ratio in ratios]
-    found = check_lengths(task_of(standing(len(ratios) + 1, lidar=True, each=each)))
+    found = check_lengths(estimate_of(Graph(np.zeros((3, 3)))), task_of(standing(len(ratios) + 1, lidar=True, each=each)))
     assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])

@@ -73,7 +73,7 @@ RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
     lambda view: check_sensors([recording.log for recording in view.task.recordings.each]),
     lambda view: check_closures(view.estimate, view.grid),
     lambda view: check_calibration(view.calibrated, view.usual, view.task),
-    lambda view: check_lengths(view.task),
+    lambda view: check_lengths(view.estimate, view.task),
     lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
     lambda view: check_drifts(view.estimate, view.task),
     lambda view: check_untied_parts(view.estimate, view.task),
@@ -182,12 +182,11 @@ def check_closures(estimate: Estimate, grid: OccupancyGrid | None) -> Iterator[F
 def check_calibration(
     calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task
 ) -> Iterator[Finding]:
-    """Warn of each calibration value far outside its usual size; doubt lengths of wheels or radio that are not the map's.
+    """Warn of each calibration value far outside its usual size; gross errors of the scale of ranges are `scales`.
 
-    The map has the lidar's lengths, and without one those of the radio, which measures times of flight. Ranges that are too
-    long where the wheels counted nothing are a doubt: scans along a bare wall show only some of such stretches, and a map that
-    lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar shows whether the unit is that
-    of the wheels or of the radio.
+    Ranges that are too long where the wheels counted nothing are a doubt: scans along a bare wall show only some of
+    such stretches, and a map that lacks the others is too short. A value that a wrong unit explains is a doubt where no lidar
+    shows whether the unit is that of the wheels or of the radio.
 
     Parameters
     ----------
@@ -195,15 +194,14 @@ def check_calibration(
     """
     said = kinds(task.stages.findings)
     for value in calibrated:
-        scale, length = value.key.kind == RANGE_SCALE, value.key.kind in (RANGE_SCALE, "odometry_scale")
+        scale = value.key.kind == RANGE_SCALE
         sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
-        clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma)
+        clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma) and not (scale and abs(value.value) > _OTHER_LENGTH)
         if value.state != "estimated" or value.key.kind == HEIGHT or not clear:
             continue
         unit = "" if value.unit == "1" else f" {value.unit}"
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
-        kind = "scales" if length and abs(value.value) > _OTHER_LENGTH else "unusual-calibration"
-        unit_of = likely_unit(1.0 + value.value) if length else ""
+        unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
         text = (
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
@@ -211,15 +209,22 @@ def check_calibration(
         )
         if short:
             text += "; the wheels missed some of the travelled distance: the map may be too short"
-        add = doubt if short or unclear or kind == "scales" else warning
-        yield add(kind, text, name=value.name, value=value.value, sigma=value.sigma, usual=sigma)
+        add, figures = doubt if short or unclear else warning, {"value": value.value, "sigma": value.sigma, "usual": sigma}
+        yield add("unusual-calibration", text, name=value.name, **figures)
 
 
-def check_lengths(task: Task) -> Iterator[Finding]:
-    """Doubt a map whose lidar and wheels measured different lengths before a calibration could take that up.
+def check_lengths(estimate: Estimate, task: Task) -> Iterator[Finding]:
+    """Doubt a map whose ranges have other lengths, however uncertain, or whose lidar and wheels measured different ones.
 
-    The map has the lidar's lengths: where that is wrong, all of it has another scale, and no residual shows it.
+    The map has the lidar's lengths, and without one those of the radio, which measures times of flight. What lidar and wheels
+    measured is compared as it was before a calibration could take that up: no residual shows it.
     """
+    calibration = estimate.graph.calibration
+    place = calibration.index(RANGE_SCALE)
+    error = float(calibration.values[place]) if place >= 0 and estimate.placed.any() else 0.0
+    if abs(error) > _OTHER_LENGTH:
+        text = f"the ranges are {1.0 + error:.2f} times the distances on the map: {_RADIO_OR_WHEELS}{likely_unit(1.0 + error)}"
+        yield doubt("scales", text, range_scale=1.0 + error)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([screening.lidar_by_wheels for screening in screenings if screening is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _OTHER_LENGTH)]
@@ -244,7 +249,7 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
     if given > 2 or task.config.calibration.heading_scale <= 0.0:
         return
     for error in graph.calibration.values[graph.calibration.of_kinds("heading_scale")].tolist():
-        factor, kind = 1.0 + error, "mirrored"
+        factor = 1.0 + error
         if -_SLIPS_AT_MOST <= error <= _WRONG_TURNS or (task.recordings.have_scans and factor >= _UNRELATED):
             continue
         if not task.recordings.have_scans:
@@ -253,18 +258,19 @@ def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
                 f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
                 "or give the places of three anchors"
             )
+            yield doubt("mirrored", text, factor=factor)
         elif factor > -_UNRELATED:
-            kind = WHEELS_AGAINST_LIDAR
             text = (
                 "wheels and lidar measure different motions throughout: their turns have nothing in common (factor "
                 f"{factor:.2f}); check the order of scans and beams, and whether the wheels count"
             )
+            yield doubt(WHEELS_AGAINST_LIDAR, text, factor=factor)
         else:
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
                 "is the laser upside down (`mounting.laser_flipped`), or has the odometry's heading the wrong sign?"
             )
-        yield doubt(kind, text, factor=factor)
+            yield doubt("mirrored", text, factor=factor)
 
 
 def check_fit(task: Task) -> Iterator[Finding]:

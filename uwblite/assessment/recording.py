@@ -97,8 +97,8 @@ def _check_notes(view: RecordingView) -> Iterator[Finding]:
         text = f"{notes.broken} of {notes.lines} lines are broken and were skipped ({first})"
         cure = "a recorder that was cut off leaves one; more point to a bad disk, cable or writer"
         yield Finding("broken-lines", WARNING if notes.broken > _BROKEN * max(notes.lines, 1) else NOTE, text, cure, "log")
-    for text in notes.warnings:
-        yield Finding("reader", WARNING, text, sensor="log")
+    for words in notes.warnings:
+        yield Finding("reader", WARNING, words, sensor="log")
 
 
 def _check_map(view: RecordingView) -> Iterator[Finding]:

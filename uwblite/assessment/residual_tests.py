@@ -89,16 +89,16 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
             typical = _typical_spread(residuals[free], ranges.anchor[free])
     if typical <= most:
         return
-    kind = "range-scatter"
     text = f"the ranges scatter by {typical:.1f} m about the map: they are not distances to stationary anchors; check the ids"
-    if typical > _TIMES_NOISE * short:
+    if typical <= _TIMES_NOISE * short:
+        yield doubt("range-scatter", text, typical=typical, short_term=short)
+    else:
         # The ranges are good distances: what is wrong is the path, or to which time or anchor they belong.
-        kind = "ranges-disagree"
         text = (
             f"the ranges differ from the map by {typical:.2f} m (median), but from one to the next by {short:.2f} m only: the "
             "radio's clock, anchor ids or the trajectory are wrong"
         )
-    yield doubt(kind, text, typical=typical, short_term=short)
+        yield doubt("ranges-disagree", text, typical=typical, short_term=short)
 
 
 def check_odometry(estimate: Estimate, task: Task) -> Iterator[Finding]:
