@@ -10,6 +10,7 @@ from helpers.told import told
 
 from uwblite import se2
 from uwblite.errors import DataError
+from uwblite.findings import Fact
 from uwblite.screening import clocks, cuts, repeats
 from uwblite.screening import screen as screening
 from uwblite.screening.screen import screen
@@ -230,6 +231,21 @@ def test_laser_and_wheels_that_turn_opposite_ways_are_a_doubt(sound):
     assert done.mounting.laser_flipped
     left = screen(replace(sound, scans=replace(sound.scans, ranges=sound.scans.ranges[:, ::-1].copy())), turn_laser=False)
     assert not left.mounting.laser_flipped
+
+
+def test_late_scans_are_placed_with_the_laser_as_it_is_mounted_and_the_wheels_compared_again(sound, monkeypatch):
+    """The wheels of such a recording are set right where its scans show them."""
+    placed = []
+
+    def late(log):
+        placed.append(log.mounting.laser_flipped)
+        return with_poses(log, sound.odometry.poses * (1.25, 1.25, 1.0)), [Fact.of("late-scans", count=1, total=9)]
+
+    monkeypatch.setattr("uwblite.screening.clocks.with_late_scans_placed", late)
+    done = screen(replace(sound, scans=replace(sound.scans, ranges=sound.scans.ranges[:, ::-1].copy())))
+    assert placed == [True]
+    assert {"laser-turned-over", "late-scans"} <= {fact.kind for fact in done.screening.facts}
+    assert done.screening.lidar_by_wheels == pytest.approx(0.8, abs=0.03)
 
 
 def test_a_base_that_drives_backwards_has_its_laser_turned(sound):

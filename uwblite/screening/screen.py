@@ -48,7 +48,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     facts += [*set_right, *outside, *repeated, *spread, *times, *glitches, *broken, *turned]
     repairs = [repeats.without_repeated_scans, repeats.without_lidar_marks, repeats.without_own_body]
     repairs += [repeats.without_marks, repeats.without_repeated_ranges]
-    repairs += [explained_by_ranges, directions.heading_with_the_path, clocks.with_late_scans_placed]
+    repairs += [explained_by_ranges, directions.heading_with_the_path]
     for repair in repairs:
         log, more = repair(log)
         facts += more
@@ -61,6 +61,9 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
         if pairs is not None:
             log, mounted = mounted_as_seen(log, pairs)
             pairs, silent = wheel_motion.compare(log) if mounted else pairs, silent + mounted
+    # Where a scan was taken shows only with the laser mounted as it is.
+    log, late = clocks.with_late_scans_placed(log)
+    pairs, silent = wheel_motion.compare(log) if late and pairs is not None else pairs, silent + late
     ratio = float("nan") if pairs is None else pairs.way_ratio
     units.refuse_other_ranges(range_motion.change_by_way(log), ratio)
     log, pairs, lost, standing = _lost_wheels(log, pairs)
