@@ -130,6 +130,23 @@ def test_where_ranges_leave_too_many_places_no_place_is_tried():
     assert (len(found.poses), found.complete) == (0, False)
 
 
+def test_of_many_places_the_first_of_those_near_each_other_are_kept_with_work_for_what_is_near():
+    """As many as a house has at half a metre and 0.3 rad; to compare all with all would be 80 million operations."""
+    poses = np.random.default_rng(4).uniform((0.0, 0.0, -np.pi), (40.0, 30.0, np.pi), (4000, 3))
+    work = sum(search._distinct(poses, 4000, True))
+    found, kept = finished(search._distinct(poses, 4000, True)), poses[:0]
+    for pose in poses:
+        if search.apart(pose, kept).all():
+            kept = np.vstack([kept, pose])
+    np.testing.assert_array_equal(found.poses, kept)
+    looks = work - len(kept) * search._PER_LOOK
+    assert (found.complete, looks < 100 * search._PER_PLACE * len(poses)) == (True, True)
+    for most, complete in ((len(kept), True), (len(kept) - 1, False)):
+        few = finished(search._distinct(poses, most, True))
+        np.testing.assert_array_equal(few.poses, kept[:most])
+        assert few.complete is complete
+
+
 def test_a_cell_holds_the_likelihood_of_its_distance_to_the_nearest_wall(walls, room):
     rng = np.random.default_rng(1)
     rows, cols = (rng.integers(room.margin - 10, n - room.margin + 10, 400) for n in room.free.shape)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, chunks
@@ -53,6 +54,8 @@ UNIT = 1_000_000
 """Operations of a unit of work at most: 1 to 2 ms on one core."""
 _PER_POINT, _PER_PLACE, _PER_REFINED = 3, 10, 60 * MATCHES
 """Operations for a point of a scan at a place, for a range to a place, and for a range in a refinement."""
+_PER_LOOK = UNIT // MOST_PLACES
+"""Operations in whose time the places near one are looked up: of as many as are returned in a unit of work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,9 +301,16 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
 
 def _distinct(poses: Floats, most: int, complete: bool) -> Steps:
     """Return the first of poses (n, 3), best first, that are not near an earlier one, at most so many."""
-    kept, left = [poses[:0]], poses
-    while len(left) and len(kept) <= most:
-        kept.append(left[:1])
-        yield _PER_PLACE * len(left)
-        left = left[apart(left[0], left)]
-    return Places(np.concatenate(kept), complete and not len(left))
+    tree, left, kept = cKDTree(poses[:, :2], compact_nodes=False, balanced_tree=False), np.ones(len(poses), bool), list[int]()
+    yield _PER_PLACE * len(poses)
+    for k in range(len(poses)):
+        if not left[k]:
+            continue
+        if len(kept) == most:
+            return Places(poses[kept], False)
+        kept.append(k)
+        # Only what is near is compared: every place with all that are left would take the square of their number.
+        near = np.array(tree.query_ball_point(poses[k, :2], SAME[0] + CELL), dtype=np.intp)
+        left[near[~apart(poses[k], poses[near])]] = False
+        yield _PER_LOOK + _PER_PLACE * len(near)
+    return Places(poses[kept], complete)
