@@ -152,10 +152,12 @@ def test_a_cell_holds_the_likelihood_of_its_distance_to_the_nearest_wall(walls, 
     rows, cols = (rng.integers(room.margin - 10, n - room.margin + 10, 400) for n in room.free.shape)
     centres = room.origin + (np.stack([cols, rows], axis=1) + 0.5) * room.cell
     apart = np.hypot(*(centres[:, None] - walls.points[None]).transpose(2, 0, 1)).min(axis=1)
-    expected = 255.0 * np.exp(-0.5 * (apart / search._SPREAD) ** 2)
+    # An end is 0.1 m about its wall, and 0.1 m within its cell.
+    spread = np.hypot(0.1, 0.1)
+    expected = 255.0 * np.exp(-0.5 * (apart / spread) ** 2)
     found = room.levels[0][rows, cols].astype(float)
     # The table of nearest walls has cells of 0.05 m: the distance is known to half a diagonal of one.
-    slope = 255.0 * np.exp(-0.5) / search._SPREAD
+    slope = 255.0 * np.exp(-0.5) / spread
     assert np.abs(found - expected).max() < slope * 0.5 * np.sqrt(2.0) * walls.cell + 1.0
     assert (found[apart > 0.8] == 0).all()
 
