@@ -111,6 +111,16 @@ def test_cropping_keeps_the_cells_where_they_are():
     assert replace(grid, scans_used=3).scans_used == 3
 
 
+@pytest.mark.parametrize("shift", [0.0, 5e5, 5e6])
+def test_a_box_along_edges_of_cells_holds_these_also_far_from_the_origin(shift):
+    """Of projected coordinates: rounding there is a billionth of a metre."""
+    grid = OccupancyGrid(GridGeometry(0.05, np.array([shift, shift]), 40, 40), np.zeros((40, 40), np.float32))
+    for first in range(30):
+        part = cropped(grid, tuple(shift + 0.05 * np.array([first, first, first + 10, first + 10])))
+        assert (part.geometry.rows, part.geometry.cols) == (10, 10)
+        np.testing.assert_allclose(part.geometry.origin, shift + 0.05 * first, rtol=0.0, atol=1e-6)
+
+
 @given(st.floats(-10.0, 10.0))
 def test_an_angle_is_moved_by_quarter_turns(angle):
     found = float(_quarter(np.array(angle)))

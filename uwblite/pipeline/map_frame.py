@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import TINY, Bools, Floats
+from ..arrays import Bools, Floats
 from ..errors import ConfigError, DataError
 from ..graph.graph import Graph, PriorEdges
 from ..grid.occupancy_grid import OccupancyGrid
@@ -20,6 +20,8 @@ _BINS = 90
 """Of directions of walls, one degree each."""
 _WIDTHS = np.radians([5.0, 2.0])
 """Of the kernels about their main direction, rad."""
+_EDGE = 1e-6
+"""Of a cell; a box that ends so near to the edge of one ends there. At coordinates of 5e6 m rounding is 2e-8 of one of 5 cm."""
 
 
 def wall_direction(normals: Floats) -> float:
@@ -125,8 +127,8 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
     """
     x0, y0, x1, y1 = box
     geometry = grid.geometry
-    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + TINY), 0, None).astype(np.intp)
-    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - TINY).astype(np.intp)
+    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + _EDGE), 0, None).astype(np.intp)
+    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - _EDGE).astype(np.intp)
     high = np.minimum(high, [geometry.cols, geometry.rows])
     if not np.all(high > low):
         (west, south), (east, north) = geometry.origin, geometry.corner
