@@ -21,6 +21,7 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import evidence_against, first_optimisation, reestimate_ranges, select_range_priors
 from uwblite.pipeline.recordings import gather
+from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.sensor_log import SensorLog, SensorMounting
 
 
@@ -49,7 +50,7 @@ def test_poses_have_let_ranges_go_where_those_of_most_anchors_scatter_more(growt
         Estimate(graph, None, plain_ranges(0 * anchor, anchor, 30.0 + np.repeat(times, 200) * np.tile(off, count), 0.1), ())
         for times in (np.ones(count), np.array(growth))
     ]
-    assert radio_stages._let_go(*of) is gone
+    assert radio_stages._let_go(*of, RangeNoiseConfig()) is gone
 
 
 def test_ranges_keep_a_path_that_scans_hardly_see():

@@ -235,7 +235,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     optimizer = Optimizer()
     held = estimate.solved(rough(task.config.solver), optimizer)[0]
-    estimate = _learn_ranges(held if _let_go(held, estimate) else estimate, task, optimizer)
+    estimate = _learn_ranges(held if _let_go(held, estimate, task.config.ranges) else estimate, task, optimizer)
     task.stages.end("ranges re-estimated")
     return estimate
 
@@ -250,7 +250,7 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     if estimate.steps is None or not estimate.rests_on_ranges:
         weak = _learn_ranges(estimate, task, Optimizer(), steady=True)
-        estimate = _learn_ranges(estimate, task, Optimizer()) if _let_go(estimate, weak) else weak
+        estimate = _learn_ranges(estimate, task, Optimizer()) if _let_go(estimate, weak, task.config.ranges) else weak
     return with_selected_priors(estimate, task.config)
 
 
@@ -268,13 +268,13 @@ def _learn_ranges(estimate: Estimate, task: Task, optimizer: Optimizer, *, stead
     return estimate
 
 
-def _let_go(held: Estimate, weak: Estimate) -> bool:
+def _let_go(held: Estimate, weak: Estimate, config: RangeNoiseConfig) -> bool:
     """Return whether most anchors' residuals grew where ranges had little weight: then nothing else constrains the poses.
 
     Noise learnt there would be the error of the poses, and would fix them where they are. Sustained outliers of one anchor
     cause residuals too, but of this anchor only.
     """
-    growth = np.array([b / max(a, RangeNoiseConfig().min_sigma) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
+    growth = np.array([b / max(a, config.min_sigma) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
     return len(growth) > 0 and float(np.median(growth)) > LapPolicy.most_growth
 
 
