@@ -19,6 +19,9 @@ from ..arrays import ENOUGH, OUTLIER, Bools, Floats, Ints, spread, unique_rows
 from ..config import setting
 from ..graph.robust import Kernel
 
+USUAL_KERNEL = Kernel("cauchy", 2.5)
+"""On errors of ranges, some of which are false."""
+
 
 @dataclass(frozen=True, slots=True)
 class RangeNoiseConfig:
@@ -37,7 +40,7 @@ class RangeNoiseConfig:
     Radiation pattern and received power alone cause as much. Residuals do not show it: a shifted anchor explains it as well."""
     learn: bool = True
     """Estimate from the residuals how much of the error is new in every range, and how much changes slowly with the place."""
-    kernel: Kernel = setting(Kernel("cauchy", 2.5), advanced=True)
+    kernel: Kernel = setting(USUAL_KERNEL, advanced=True)
     """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
     enough: ClassVar[int] = 30
     """Ranges from which the noise, a correlation, or a covariance of an anchor is learnt."""

@@ -19,7 +19,7 @@ from .. import se2
 from ..arrays import MAD_TO_SIGMA, MOST, OUTLIER, TINY, Floats, chunks, row_medians
 from ..config import setting
 from ..sensor_log import LONGEST_RANGE
-from .range_noise import RangeNoiseConfig
+from .range_noise import USUAL_KERNEL
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,12 +244,12 @@ def path_placements(
         distance = np.hypot(*(se2.transform(motion, tags) - points).T)
         return np.append(roots * (distance - ranges), motion / size)
 
-    found, loss = list[PathPlacement](), RangeNoiseConfig().kernel.scale
+    found = list[PathPlacement]()
     for heading in np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False):
         away = points - se2.rotate(np.full(len(tags), heading), tags)
         rows = roots[:, None] * np.column_stack([-2.0 * away, np.ones(len(away))])
         place = np.linalg.lstsq(rows, roots * (ranges**2 - np.sum(away**2, axis=1)), rcond=None)[0][:2]
-        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=loss)
+        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=USUAL_KERNEL.scale)
         motion = np.append(done.x[:2], se2.wrap_angle(done.x[2]))
         found.append(PathPlacement(float(done.cost), motion, done.jac.T @ done.jac))
     return sorted(found, key=lambda each: each.cost)
