@@ -42,8 +42,10 @@ class IncrementalPolicy:
     position_sigma: ClassVar[float] = 0.5
     drift: ClassVar[float] = 0.1
     """An anchor less certain than this is not added yet, m; assumed error of the path that it is searched from, m."""
+    outlier: ClassVar[float] = OUTLIER + 1.0
     outlier_share: ClassVar[float] = 0.3
-    """Share of outliers among its ranges with which an anchor is removed."""
+    """Standard deviations beyond which a range is an outlier where optima are rough, and the share of these with which an
+    anchor is removed."""
     search: ClassVar[TrilaterationConfig] = TrilaterationConfig(ambiguity=0.7)
     """Stricter than usual, since another try comes soon."""
     step: ClassVar[SolverConfig] = rough(SolverConfig())
@@ -192,11 +194,11 @@ class _Incremental:
 
     def _outlying(self, low: int, now: int) -> Bools:
         """Return the anchors most of whose ranges disagree with the rest, by a robust optimisation."""
-        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", OUTLIER + 1.0)).graph
+        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", IncrementalPolicy.outlier + 1.0)).graph
         measured, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
         for edges in robust.edges:
             if isinstance(edges, RangeEdges):
-                off = np.abs(edges.residuals(robust)[:, 0]) > OUTLIER
+                off = np.abs(edges.residuals(robust)[:, 0]) > IncrementalPolicy.outlier
                 measured += np.bincount(edges.anchor, minlength=len(measured))
                 outliers += np.bincount(edges.anchor, off, len(measured))
         return self.ranged & (outliers > IncrementalPolicy.outlier_share * np.maximum(measured, 1.0))
