@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from .. import se2
-from ..arrays import Bools, Floats, Table
+from ..arrays import Bools, Floats, Table, unique_rows
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid
 from ..lidar.object_likelihood import ObjectPolicy
@@ -195,7 +195,7 @@ class Walls:
 
 def _by_things(value: Floats, ends: Floats) -> Floats:
     """Return the log-likelihoods (h, o) of things by those of the rays (h, p) that meet them; ends (p, 2), m, of the rays."""
-    _, thing = np.unique(np.floor(ends / ObjectPolicy.long), axis=0, return_inverse=True)
+    _, thing = unique_rows(np.floor(ends / ObjectPolicy.long))
     order = np.argsort(thing, kind="stable")
     whole = np.add.reduceat(value[:, order], np.flatnonzero(np.diff(thing[order], prepend=-1)), axis=1)
     return np.logaddexp(np.log1p(-ObjectPolicy.moves) + whole, np.log(ObjectPolicy.moves))
