@@ -27,6 +27,8 @@ _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _LONG_TIMES = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _SELDOM, _OFTEN, _RAPID = 1.0, 0.005, 0.002
 """Limits of the time between readings, s, within which stamps are taken as seconds; no odometry is faster than the last."""
+_MOVES = 1e-6
+"""m or rad; below it nothing moves."""
 _TURN_RATE = 3.0
 """Mean turn rate, rad/s, that no robot keeps; a third of it is fast."""
 _PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, IMPOSSIBLE)
@@ -88,7 +90,7 @@ def _speeds(odometry: Odometry) -> Floats:
     second = np.clip(np.searchsorted(stamps, stamps[first] + 1.0), first + 1, len(first))
     span = stamps[second] - stamps[first]
     length = np.hypot(*(odometry.poses[second] - odometry.poses[first])[:, :2].T)
-    moving = (length > TINY) & (span > 0.5)
+    moving = (length > _MOVES) & (span > 0.5)
     return np.asarray(length[moving] / span[moving])
 
 
@@ -105,7 +107,7 @@ def _odometry_stamps(odometry: Odometry) -> str:
     """
     span, steps = float(np.ptp(odometry.stamps)), np.abs(np.diff(odometry.poses, axis=0))
     length, times = np.hypot(steps[:, 0], steps[:, 1]), np.diff(odometry.stamps)
-    moving = (length > TINY) & (times > 0.0)
+    moving = (length > _MOVES) & (times > 0.0)
     if span <= 0.0 or moving.sum() < _ENOUGH:
         return ""
     period, speed = span / len(steps), float(np.quantile(length[moving] / times[moving], MOST))
@@ -223,7 +225,7 @@ def refuse_degrees(odometry: Odometry) -> None:
     """Raise DataError where the odometry's heading is clearly in degrees."""
     reading = heading_reading(odometry)
     turn, span = np.abs(np.diff(odometry.poses[:, 2])), np.diff(odometry.stamps)
-    turning = (turn > TINY) & (span > 0)
+    turning = (turn > _MOVES) & (span > 0)
     rate = float(np.median(turn[turning] / span[turning])) if turning.sum() >= _ENOUGH else 0.0
     large = rate > _TURN_RATE / 3.0 or float(np.ptp(odometry.poses[:, 2])) > 2.0 * np.pi
     if large and not reading.sound and reading.degrees > max(reading.plain, reading.mirrored) + CLEARLY:
