@@ -20,13 +20,14 @@ from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
 from ..graph.problem_checks import tied_chains
 from ..graph.range_edges import RangeEdges
 from ..problem.alternatives import EvidencePolicy
-from .range_noise import MOST_RANGES
 from .trilateration import TrilaterationConfig, path_placements, trilaterate
 
 _CLEARLY = 0.02
 """Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
-_LEAST_RANGES = 4
-"""Of a chain: fewer are three unknowns and no check."""
+_MOST_RANGES, _LEAST_RANGES = 300, 4
+"""Ranges used for one chain: more add no information; fewer are three unknowns and no check."""
+_APART = 0.1
+"""m and rad between places of a chain that are two."""
 _CHAIN_SIGMA = 0.2
 """m; standard deviation of a range along a rigid chain: the error after some minutes of odometry."""
 
@@ -164,7 +165,7 @@ def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floa
             else:
                 own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
                 ranges.append(np.zeros(int(tied.sum())))
-    every = max(-(-sum(map(len, ranges)) // MOST_RANGES), 1)
+    every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
     return np.concatenate(there)[::every], np.concatenate(own)[::every], np.concatenate(ranges)[::every]
 
 
@@ -183,6 +184,6 @@ def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Flo
         return [(0.0, np.zeros(se2.POSE))]
     best: list[tuple[float, Floats]] = []
     for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _CHAIN_SIGMA)):
-        if all(np.abs(se2.between(motion, other)).max() > EvidencePolicy.same_path for _, other in best):
+        if all(np.abs(se2.between(motion, other)).max() > _APART for _, other in best):
             best.append((cost, motion))
     return best[: EvidencePolicy.searched]
