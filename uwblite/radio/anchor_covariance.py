@@ -58,7 +58,7 @@ def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Float
         own = np.flatnonzero((edges.anchor == anchor) & (weights > 0.0))
         if (
             place[0] < 0
-            or len(own) < config.enough
+            or len(own) < config.learnt_from
             or np.trace(own_covariances[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1))
         ):
             continue  # given, hardly measured, or with an uncertainty above its distance: there the linearisation is invalid
@@ -170,7 +170,7 @@ def _scatter(
     shown = np.einsum("ms,ms->s", left, _times_correlation(edges, offsets, left))
     unexplained = max(float(np.mean(np.minimum(np.abs(residuals[alive]), most) ** 2) - np.mean(by_others)), 0.0)
     checks = len(alive) * float(np.mean(shown))
-    scatter = np.sqrt((config.enough * config.sigma**2 + len(alive) * unexplained) / (config.enough + checks))
+    scatter = np.sqrt((config.learnt_from * config.sigma**2 + len(alive) * unexplained) / (config.learnt_from + checks))
     return max(config.steady, float(scatter))
 
 

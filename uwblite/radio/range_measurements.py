@@ -78,7 +78,7 @@ def learn_noise(
     noises = []
     for anchor in range(anchors):
         own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
-        clear = own[~late[own]] if np.sum(~late[own]) >= config.enough else own
+        clear = own[~late[own]] if np.sum(~late[own]) >= config.learnt_from else own
         noise, trust = assumed(config), np.ones(len(own))
         if config.learn and len(own) >= _ENOUGH_ERRORS:
             mixture = nlos_mixture.fit(errors[clear], config.min_sigma)

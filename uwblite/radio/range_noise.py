@@ -42,7 +42,7 @@ class RangeNoiseConfig:
     """Estimate from the residuals how much of the error is new in every range, and how much changes slowly with the place."""
     kernel: Kernel = setting(USUAL_KERNEL, advanced=True)
     """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
-    enough: ClassVar[int] = 30
+    learnt_from: ClassVar[int] = 30
     """Ranges from which the noise, a correlation, or a covariance of an anchor is learnt."""
 
 
@@ -112,7 +112,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     config : assumption that is used where there are too few residuals.
     """
     kept = weights > 0.5
-    if not config.learn or kept.sum() < config.enough:
+    if not config.learn or kept.sum() < config.learnt_from:
         return assumed(config)
     p, e = positions[kept], residuals[kept] - np.median(residuals[kept])
     most = OUTLIER * max(spread(e), config.min_sigma)
