@@ -36,7 +36,7 @@ class Reply:
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """Return the bytes of a request; commands with bit 7 set carry a payload of at most 255 bytes."""
+    """Return the bytes of a request; a payload has at most 255 bytes, and its length and checksum are added."""
     if not payload:
         return bytes((SYNC, command))
     body = bytes((SYNC, command, len(payload))) + payload

@@ -133,9 +133,11 @@ def minimise(
     progress: Progress | None = None,
     allowed: float = np.inf,
 ) -> tuple[Graph, SolverSummary]:
-    """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
+    """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since.
+
+    The list of linearisations is empty afterwards.
+    """
     descent = _Descent(graph, linearized, normal, config, allowed)
-    del linearized
     chi2_initial, reason = descent.chi2, descent.prepare()
     while not reason:
         reason = descent.step()
@@ -203,6 +205,7 @@ class _Descent:
             weights = [_weights_if_any(e, lin.residuals) for e, lin in zip(self.graph.edges, at, strict=True)]
             self.normal.fill(at, weights, again)
             # The normal equations contain all of it now; the Jacobians of a recording of hours are large.
+            at.clear()
             self.linearized, self.current = [], again
             diagonal = self.normal.diagonal
             curvature = np.where(diagonal > 0, diagonal, 1.0)

@@ -133,7 +133,7 @@ class Surroundings:
     """(x, y) whether a square is near a column; the outermost ones are not."""
 
     def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
-        """Return the rows (n,) of points (p, 2) on such squares, the column nearest to each, and how far its centre is, m."""
+        """Return the rows (n,) of points (p, 2) in squares near a column, the column of nearest centre, and its distance, m."""
         x, y = (
             np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.intp)
             for k in range(2)
