@@ -26,7 +26,6 @@ from uwblite.odometry.slips import (
     log_densities,
     posterior,
     slip_sigma,
-    unseen_variance,
     with_slips,
 )
 
@@ -104,21 +103,6 @@ def test_a_slip_that_no_step_shows_by_itself_shows_in_all_of_them(steady, slippe
         chain = posterior(alone + measured.log_marginal(measured.by_neighbours(chain, duration)), duration)
     assert np.all((chain.probability[inside] > 0.5) == slipped)
     assert chain.probability[~inside].max() < 0.3
-
-
-@pytest.mark.parametrize(
-    ("slips", "unmeasured", "expected"), [(0, 150, 0.0), (0, 300, 150.0 / 950.0), (3, 200, 4.0 * 100.0 / 950.0)]
-)
-def test_slips_that_nothing_shows_are_as_frequent_as_those_that_were_seen(slips, unmeasured, expected):
-    """Over 350 s; what is less probable than 10 % is in no variance."""
-    log_odds = np.full(700, -9.0)
-    log_odds[80 : 80 + unmeasured] = 0.0
-    for slip in range(slips):
-        log_odds[400 + 90 * slip : 404 + 90 * slip] = 9.0
-    variance = unseen_variance(log_odds, np.full(700, 0.5))
-    assert variance[:, 0].sum() == pytest.approx((SPEED * LASTS) ** 2 * expected, rel=0.12)
-    assert variance[:, 2].sum() == pytest.approx((TURN_RATE * LASTS) ** 2 * expected, rel=0.12)
-    assert variance[420:480].max() <= 0.01 * variance.max()
 
 
 def test_without_evidence_slips_are_as_rare_as_beforehand():

@@ -15,7 +15,7 @@ from .. import se2
 from ..arrays import OUTLIER, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, unseen_variance, with_slips
+from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
 from ..odometry.wheels import reestimate_wheel_noise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
@@ -62,7 +62,7 @@ class ScanOdometry:
     wheels: OdometryEdges
     """With the noise learnt from the measured steps, as if they had not slipped."""
     slipped: OdometryEdges
-    """The same with the uncertainty of slips, also of those that nothing shows."""
+    """The same with the uncertainty of slips."""
     miss: float
     """Typical error that the odometry causes in points of the next cloud, 3 sigma, m."""
     searched: int
@@ -139,7 +139,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
     alone[doubtful] = log_odds[doubtful] = choice.log_odds
     slips = posterior(log_odds + by_ranges, wheels.duration).probability
-    slipped = with_slips(noise, slips, unseen_variance(log_odds + by_ranges, wheels.duration))
+    slipped = with_slips(noise, slips)
     variance, sound, mode = sigma**2 * PairPolicy.correlation, found.sound, choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
     tempting = found.candidates.rows(found.best(found.candidates.share))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import MOST, Bools, Floats
+from ..arrays import Bools, Floats
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges
 
@@ -62,26 +62,20 @@ class SlipChain:
     after: Floats
     """(e,) the same of the step after it."""
 
-    @property
-    def begins(self) -> Floats:
-        """(e,) probability that a slip begins with each step."""
-        return self.probability * (1.0 - self.before)
 
-
-def posterior(log_odds: Floats, duration: Floats, every: float = EVERY) -> SlipChain:
+def posterior(log_odds: Floats, duration: Floats) -> SlipChain:
     """Return the probabilities that the wheels slip in each of following steps.
 
     Parameters
     ----------
     log_odds : (e,) log of the likelihood of what was measured over each step if they slip, by that if they do not; 0 where
-        nothing was. duration : (e,) s. every : mean time between two slips, s.
+        nothing was. duration : (e,) s.
     """
-    share = LASTS / (every + LASTS)
-    settled = -np.expm1(-duration * (1.0 / every + 1.0 / LASTS))
-    starts, ends = share * settled, (1.0 - share) * settled
+    settled = -np.expm1(-duration * (1.0 / EVERY + 1.0 / LASTS))
+    starts, ends = _SHARE * settled, (1.0 - _SHARE) * settled
     likelihood = np.exp(np.stack([np.minimum(-log_odds, 0.0), np.minimum(log_odds, 0.0)], axis=1))
     steps = np.stack([np.stack([1.0 - starts, starts], axis=1), np.stack([ends, 1.0 - ends], axis=1)], axis=1)
-    stationary = np.array([1.0 - share, share])
+    stationary = np.array([1.0 - _SHARE, _SHARE])
     forward, backward = np.empty((len(log_odds), 2)), np.ones((len(log_odds), 2))
     before = stationary
     for k in range(len(log_odds)):
@@ -94,23 +88,9 @@ def posterior(log_odds: Floats, duration: Floats, every: float = EVERY) -> SlipC
     # From either state of the step before to a slip, and from a slip to either state of the step after.
     into = np.concatenate([stationary[None], forward])[:-1] * steps[:, :, 1]
     out = (steps[:, 1] * likelihood * backward)[1:]
-    after = np.append(out[:, 1] / out.sum(axis=1), 1.0 - share)[: len(log_odds)]
+    after = np.append(out[:, 1] / out.sum(axis=1), 1.0 - _SHARE)[: len(log_odds)]
     both = forward * backward
     return SlipChain(*(np.asarray(each) for each in (both[:, 1] / both.sum(axis=1), into[:, 1] / into.sum(axis=1), after)))
-
-
-def unseen_variance(log_odds: Floats, duration: Floats) -> Floats:
-    """Return the variance (e, 3) of the motion over each step by slips that nothing measured, m^2, m^2, rad^2; see posterior.
-
-    They are as frequent as the others in the same recording, by their expected number and one in the usual time. Where nearly
-    all such recordings have none, they are in no variance.
-    """
-    every = (EVERY + float(duration.sum())) / (1.0 + float(posterior(log_odds, duration).begins.sum()))
-    chain = posterior(log_odds, duration, every)
-    begins = np.where(chain.probability < 0.5, chain.begins, 0.0)
-    if begins.sum() < 1.0 - MOST:
-        begins[:] = 0.0
-    return begins[:, None] * np.square(LASTS * np.array([SPEED, SPEED, TURN_RATE]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,17 +177,12 @@ def _of_either(wheels: OdometryEdges, graph: Graph) -> tuple[Floats, Floats]:
     return sound, slipping
 
 
-def with_slips(wheels: OdometryEdges, probability: Floats, unseen: float | Floats = 0.0) -> OdometryEdges:
-    """Return the odometry with the expected information of each step, which slips with a probability (e,).
-
-    Parameters
-    ----------
-    unseen : (e, 3) variance of the motion by slips that nothing measured; added.
-    """
+def with_slips(wheels: OdometryEdges, probability: Floats) -> OdometryEdges:
+    """Return the odometry with the expected information of each step, which slips with a probability (e,)."""
     sound = np.einsum("eii->ei", wheels.sqrt_information) ** 2
     slips = 1.0 / (slip_sigma(wheels) ** 2 + 1.0 / sound)
-    information = (1.0 - probability[:, None]) * sound + probability[:, None] * slips
-    return replace(wheels, sqrt_information=_diagonal((1.0 / information + unseen) ** -0.5), slips=None)
+    diagonal = np.sqrt((1.0 - probability[:, None]) * sound + probability[:, None] * slips)
+    return replace(wheels, sqrt_information=_diagonal(diagonal), slips=None)
 
 
 def expected(wheels: OdometryEdges) -> OdometryEdges:
