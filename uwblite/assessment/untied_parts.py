@@ -181,8 +181,9 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     """Return the steps (s,) of the odometry that slipped, or that the map contradicts, and whose sides nothing else connects.
 
-    Their noise is enlarged by as much as the map contradicts them, to that of slip at most. Those with hardly any keyframes
-    between them are one run; a few keyframes at an end of a recording are no part.
+    Their noise is enlarged by as much as the map contradicts them, to that of a slip at most; without ranges that of known
+    slips, which the map follows, by their own noise. Those with hardly any keyframes between them are one run; a few keyframes
+    at an end of a recording are no part.
     """
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))

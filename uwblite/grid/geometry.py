@@ -12,6 +12,7 @@ from ..errors import ConfigError
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 MEGA = 1e6
+"""Bytes in a megabyte."""
 _STRIP = 64
 """Rows of a map that are processed at a time."""
 _OUTER = 0.01

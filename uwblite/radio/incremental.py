@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import BEYOND_NOISE, ENOUGH, OUTLIER, Bools, Ints
+from ..arrays import BEYOND_NOISE, ENOUGH, Bools, Ints
 from ..graph.graph import Edges, Graph
 from ..graph.problem_checks import check, given_anchors
 from ..graph.range_edges import RangeEdges
@@ -42,7 +42,7 @@ class IncrementalPolicy:
     position_sigma: ClassVar[float] = 0.5
     drift: ClassVar[float] = 0.1
     """An anchor less certain than this is not added yet, m; assumed error of the path that it is searched from, m."""
-    outlier: ClassVar[float] = OUTLIER + 1.0
+    outlier: ClassVar[float] = 4.0
     outlier_share: ClassVar[float] = 0.3
     """Standard deviations beyond which a range is an outlier where optima are rough, and the share of these with which an
     anchor is removed."""

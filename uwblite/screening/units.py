@@ -35,6 +35,8 @@ _PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, IMPOSSIBLE)
 """Times between readings, s, and highest usual speeds, m/s, of a robot: what the right unit of time gives."""
 _AGREEMENT = 0.7
 """Agreement of heading and direction of motion below which the heading is not the path's."""
+_STRAIGHT = 0.9
+"""Agreement of the directions of motion from which on a path shows one heading only."""
 CLEARLY = 0.2
 """Another interpretation of the heading must agree better by so much."""
 
@@ -198,7 +200,7 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     along = se2.as_complex(move) ** 2 / np.maximum(np.hypot(*move.T), np.finfo(float).tiny)
     weight, half = float(np.abs(along).sum()), 0.5 * (heading[apart[1:]] + heading[apart[:-1]])
     turned = along * se2.unit_complex(-2.0 * factor * half)
-    return float(np.abs(turned.sum())) / weight, bool(np.abs(along.sum()) < MOST * weight)
+    return float(np.abs(turned.sum())) / weight, bool(np.abs(along.sum()) < _STRAIGHT * weight)
 
 
 class HeadingReading(NamedTuple):
