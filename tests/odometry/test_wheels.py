@@ -28,6 +28,7 @@ from uwblite.odometry.wheels import (
     redundancy,
     reestimate_wheel_noise,
     sideways_priors,
+    stamp_jitter,
     turn_scales,
     variance_factors,
     wheel_edges,
@@ -170,6 +171,21 @@ def test_errors_that_telescope_are_not_the_wheels():
     # Of the sum over eight steps, two of 4 sigma are left of the clouds: a variance of 8 + 32 for 8.
     ratio = np.divide(*np.mean(factors, axis=0))
     assert ratio == pytest.approx([1.0, 1.0, np.sqrt(5.0)], rel=0.2)
+
+
+@pytest.mark.parametrize(("jitter", "outliers"), [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1)])
+def test_jitter_of_stamps_shows_in_the_turns(jitter, outliers):
+    """Scans at a slow rate in curves, some steps with a slip; without jitter the noise of the wheels shows hardly any."""
+    rng = np.random.default_rng(7)
+    stamps, truth = drive([(0.3, 0.0, 0.6), (0.3, 0.0, -0.6)] * 15, [10.0] * 30)
+    wheels = wheel_edges(select(Odometry(stamps, truth), KeyframeConfig(distance=0.15)), NOISE, Calibration())
+    rate = wheels.motion[:, 2] / wheels.duration
+    late = rng.standard_normal(len(wheels) + 1) * jitter
+    turned = np.append(rate, rate[-1]) * late
+    noise = rng.standard_normal(len(wheels)) * 0.01 + (rng.random(len(wheels)) < outliers) * rng.standard_normal(len(wheels))
+    measured = wheels.motion + np.column_stack([np.zeros((len(wheels), 2)), np.diff(turned) + noise])
+    steps = RelativePoseEdges(wheels.i, wheels.j, measured, 10.0 * wheels.end_sqrt_information)
+    assert stamp_jitter(wheels, steps, Graph(np.zeros((len(wheels) + 1, 3)))) == pytest.approx(jitter, rel=0.2, abs=0.01)
 
 
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():

@@ -127,6 +127,28 @@ _SUMS = (2, 4, 8)
 """Numbers of following steps whose differences are summed: up to two metres, over which errors of the floor are alike."""
 
 
+def stamp_jitter(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> float:
+    """Return the standard deviation of the scans' stamps, s, by what they add to one step and take from the next.
+
+    A stamp late by t between two steps, at a turn rate w, changes the turns by the wheels over them by w t and -w t. So the
+    residuals r and s of steps that turn alike have var((r - s) / w) - var((r + s) / w) = 4 var(t).
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses. steps : steps between neighbouring poses that the lidar measured.
+    """
+    own = np.searchsorted(wheels.i, steps.i)
+    turn = wheels.corrected(graph)[own, 2]
+    off, rate = se2.wrap_angle(steps.T_i_j[:, 2] - turn), turn / np.maximum(wheels.duration[own], TINY)
+    alike = np.minimum(turn[1:] * turn[:-1], np.minimum(turn[1:] ** 2, turn[:-1] ** 2)) > _TURNING**2
+    first = np.flatnonzero(alike & (np.diff(steps.i) == 1))
+    if len(first) < _ENOUGH // 2:
+        return 0.0
+    mean = 0.5 * (rate[first] + rate[first + 1])
+    apart, together = (spread((off[first] + sign * off[first + 1]) / mean) for sign in (-1.0, 1.0))
+    return float(0.5 * np.sqrt(max(apart**2 - together**2, 0.0)))
+
+
 def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> OdometryEdges:
     """Return the wheels with the noise that their residuals show at poses that a lidar determines.
 
