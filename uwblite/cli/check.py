@@ -9,7 +9,7 @@ from ..assessment.recording import Diagnosis, diagnose, screened
 from ..errors import UwbliteError
 from ..findings import folded
 from ..pipeline.expected_cost import SECONDS_AT_LEAST, expected_cost
-from ..report.printable import calibration_text, duration, signed
+from ..report.printable import calibration_text, duration, percent, signed
 from ..sensor_log import SensorLog
 from . import console
 from .inputs import recording
@@ -101,7 +101,7 @@ def _counts(figures: dict[str, Any]) -> str:
         lidar = figures["lidar"]
         parts.append(
             f"{lidar['count']} scans of {lidar['beams']} beams over {lidar['field of view deg']:.0f} deg"
-            f" ({lidar['rate Hz']:.1f} Hz, {100 * lidar['share of beams that hit']:.0f} % hit)"
+            f" ({lidar['rate Hz']:.1f} Hz, {percent(lidar['share of beams that hit'])} hit)"
         )
     return ", ".join(parts)
 
@@ -120,5 +120,5 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
             line += f", bias guess {signed(guesses[anchor_id]['bias'], plus=True)} \u00b1{guesses[anchor_id]['sigma']:.2f} m"
         lines.append(line)
     if coverage := figures.get("uwb", {}).get("coverage"):
-        lines.append("anchors in reach: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
+        lines.append("anchors in reach: " + ", ".join(f"{name} {percent(share)}" for name, share in coverage.items()))
     return lines

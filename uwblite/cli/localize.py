@@ -19,7 +19,7 @@ from ..localization.known_map import from_result
 from ..localization.localize import Localization, localize
 from ..report.drawn_map import DrawnAnchor, DrawnMap
 from ..report.picture import draw_map
-from ..report.printable import signed
+from ..report.printable import percent, signed
 from . import console
 from .inputs import effective_config, recording
 from .live import run_live, tell_doubts
@@ -110,10 +110,10 @@ def _summary(localization: Localization, files: list[str]) -> dict[str, Any]:
 def _lines(localization: Localization, files: list[str]) -> list[str]:
     start = localization.trajectory[0]
     sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in localization.covariances)[len(localization.covariances) // 2]
-    walls = f"{100 * localization.overlap:.0f} % of the lidar's points in known space lie on walls of the map"
+    walls = f"{percent(localization.overlap)} of the lidar's points in known space lie on walls of the map"
     return [
         f"{len(localization.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m",
-        f"{100 * localization.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m",
+        f"{percent(localization.localized)} of the recording is localized, typically to ±{sigma:.2f} m",
         walls if localization.overlap == localization.overlap else "no walls to compare: the position rests on the anchors",
         *(f"warning: {text}" for text in localization.warnings),
         *(f"DOUBT: {text}" for text in localization.doubts),

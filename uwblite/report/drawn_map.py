@@ -12,7 +12,7 @@ from ..arrays import Floats, Ints
 from ..grid.geometry import central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import MapResult
-from .printable import anchor_line
+from .printable import anchor_line, percent
 
 MOST_SHOWN = 1500
 """Rejected closures, and residuals of one anchor, that are shown at most; accepted closures all are."""
@@ -106,7 +106,7 @@ def drawn_map(result: MapResult) -> DrawnMap:
         DrawnClosure(
             places[[c.i, c.j]],
             c.accepted,
-            f"{c.i}\u2013{c.j}: {c.reason} (fitness {c.fitness:.3f} m, overlap {100 * c.overlap:.0f} %)",
+            f"{c.i}\u2013{c.j}: {c.reason} (fitness {c.fitness:.3f} m, overlap {percent(c.overlap)})",
         )
         for c in result.closures
     ]

@@ -18,7 +18,7 @@ from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResul
 from .canvas import PATHS
 from .drawn_map import MOST_SHOWN, drawn_map, shown_closures, thin
 from .page import SCALED, ZOOM, document, key
-from .printable import duration, escape, sigma_text, sigmas, signed
+from .printable import DECIMALS, duration, escape, percent, readable, sigma_text, sigmas, signed
 from .svg_map import map_svg
 
 _USUAL, _LEAST_LIMIT = 0.99, 0.1
@@ -166,12 +166,12 @@ def _cell(text: str, name: str) -> str:
     return f"<td{words}{named}>{escape(text)}</td>"
 
 
-def _number(value: float, digits: int = 3, sign: bool = False) -> str:
+def _number(value: float, digits: int = DECIMALS, sign: bool = False) -> str:
     """Return a number with a true minus sign; a dash where it is not finite."""
     return signed(value, digits, plus=sign).replace("-", "\u2212") if np.isfinite(value) else "\u2013"
 
 
-def _with_sigma(value: float, sigma: float, digits: int = 3, sign: bool = False) -> str:
+def _with_sigma(value: float, sigma: float, digits: int = DECIMALS, sign: bool = False) -> str:
     return f"{_number(value, digits, sign)} \u00b1{sigma_text(sigma, digits)}" if np.isfinite(value) else _number(value)
 
 
@@ -184,7 +184,7 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
             *map(_with_sigma, a.position.tolist(), sigmas(a)),
             _with_sigma(a.bias, a.bias_sigma, sign=True),
             str(a.ranges),
-            f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
+            percent(1.0 - a.used_share) if np.isfinite(a.used_share) else "\u2013",
             _number(a.residual_rms),
         )
         for a in anchors
@@ -208,8 +208,8 @@ def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
     if value.is_height:
         height, most = np.sqrt(np.maximum([value.value, value.value + 2.0 * value.sigma], 0.0)).tolist()
         return f"height of anchor {value.key.anchor} above or below the tag", f"{height:.2f} m, below {most:.2f} m", value.name
-    scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
-    return value.meaning, f"{_with_sigma(scale * value.value, scale * value.sigma, digits, True)} {unit}", value.name
+    mean, sigma, unit, digits = readable(value.value, value.sigma, value.unit)
+    return value.meaning, f"{_with_sigma(mean, sigma, digits, True)} {unit}", value.name
 
 
 def _closure_table(result: MapResult) -> str:
@@ -224,7 +224,7 @@ def _closure_table(result: MapResult) -> str:
             f"{c.i}\u2013{c.j}",
             "accepted" if c.accepted else "rejected",
             f"{c.fitness:.3f}",
-            f"{100 * c.overlap:.0f} %",
+            percent(c.overlap),
             c.reason,
         )
         for c in shown
@@ -265,7 +265,7 @@ def _residual_plot(name: str, table: dict[str, Floats], which: Ints, ends: tuple
     )
     scale = "".join(f"<span>{_number(value, 2, True)} m</span>" for value in (limit, -limit))
     return (
-        f"<figure><figcaption>{name} <span class=hint>{100 * float(np.mean(~good)):.0f} % marked</span></figcaption>"
+        f"<figure><figcaption>{name} <span class=hint>{percent(float(np.mean(~good)))} marked</span></figcaption>"
         f'<div class=plot><div class=scale>{scale}</div><svg class="residuals" viewBox="0 -5 {width} {2 * middle + 10}"'
         f' preserveAspectRatio="none" role="img" aria-label="residuals of {name}"><path class="axis" d="M0 {middle}H{width}"/>'
         f"{dots}</svg></div><div class=ends>{''.join(f'<span>{end}</span>' for end in ends)}</div></figure>"

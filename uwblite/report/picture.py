@@ -42,7 +42,7 @@ _FAINT, _CLEAR = 0.15, 0.6
 """Opacities: areas, doubted stretches."""
 _TURN = np.linspace(0.0, 2.0 * np.pi, 73)
 """rad; corners of an ellipse."""
-_TRIANGLE = np.stack([np.sin(_TURN[:-1:24]), -np.cos(_TURN[:-1:24])], axis=1)
+_TRIANGLE = np.stack([np.sin(_TURN), -np.cos(_TURN)], axis=1)[:-1:24]
 
 _LEVELS = 250
 """Shades of a cell, by its probability; the middle one is that of a cell that nobody saw."""
@@ -285,7 +285,7 @@ def _draw_key(canvas: Canvas, place: Floats, key: Key) -> None:
         canvas.lines(ends, _THICK, key.colour)
     if key.mark == "bar":
         stroke = np.array([0.0, _TICK, 0.0, -_TICK])
-        canvas.lines(np.concatenate([ends[:, [0, 1, 0, 1]], ends[:, [2, 3, 2, 3]]]) + stroke, _THICK, key.colour)
+        canvas.lines(np.tile(ends.reshape(2, 2), 2) + stroke, _THICK, key.colour)
     elif key.mark == "triangle":
         canvas.polygon(middle + _GAP * _TRIANGLE, key.colour)
     elif key.mark == "square":

@@ -10,6 +10,11 @@ if TYPE_CHECKING:
     from ..map_result import AnchorEstimate, CalibrationEstimate
 
 _MOST_DIGITS = 9
+DECIMALS = 3
+"""Of lengths and times whose sigma says how many of them mean something."""
+_PERCENT = 100
+_SIXTY = 60
+"""Seconds of a minute, minutes of an hour."""
 _WORTH_SAYING = 0.005
 """Share of an anchor's ranges that do not agree with the map."""
 
@@ -66,11 +71,16 @@ def _code(character: str) -> str:
 
 def duration(seconds: float) -> str:
     """Return a time span in words, such as 3.2 s, 4 min 05 s or 1 h 02 min."""
-    if round(seconds, 1) < 60:
+    if round(seconds, 1) < _SIXTY:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, left = divmod(minutes, 60)
+    minutes, rest = divmod(round(seconds), _SIXTY)
+    hours, left = divmod(minutes, _SIXTY)
     return f"{hours} h {left:02d} min" if hours else f"{minutes} min {rest:02d} s"
+
+
+def percent(share: float) -> str:
+    """Return a share in whole per cent, such as 6 %."""
+    return f"{_PERCENT * share:.0f} %"
 
 
 def sigma_text(sigma: float, digits: int) -> str:
@@ -95,7 +105,7 @@ def anchor_line(anchor: "AnchorEstimate") -> str:
         parts.append(f"bias {signed(anchor.bias, plus=True)} \u00b1{sigma_text(anchor.bias_sigma, 2)} m")
     parts.append(f"{anchor.ranges} ranges")
     if 1.0 - anchor.used_share >= _WORTH_SAYING:
-        parts.append(f"{100 * (1.0 - anchor.used_share):.0f} % down-weighted (NLOS?)")
+        parts.append(f"{percent(1.0 - anchor.used_share)} down-weighted (NLOS?)")
     if anchor.status != "ok":
         parts.append(f"{anchor.status.upper()}: {anchor.reason}" if anchor.reason else anchor.status.upper())
     if anchor.alternative is not None:
@@ -117,9 +127,15 @@ def calibration_line(value: "CalibrationEstimate") -> str:
 
 def calibration_text(name: str, value: float, sigma: float, unit: str, meaning: str) -> str:
     """Return the same of its fields."""
-    value, sigma, unit, digits = (100 * value, 100 * sigma, "%", 2) if unit == "1" else (value, sigma, unit, 3)
-    digits = 4 if unit.startswith("rad") else digits
+    value, sigma, unit, digits = readable(value, sigma, unit)
     return f"{meaning}: {signed(value, digits, plus=True)} \u00b1{sigma_text(sigma, digits)} {unit} ({name})"
+
+
+def readable(value: float, sigma: float, unit: str) -> tuple[float, float, str, int]:
+    """Return a calibration value, its standard deviation and unit, ratios in per cent, and how many decimals are shown."""
+    if unit == "1":
+        return _PERCENT * value, _PERCENT * sigma, "%", 2
+    return value, sigma, unit, DECIMALS + 1 if unit.startswith("rad") else DECIMALS
 
 
 def signed(value: float, digits: int = 2, *, plus: bool = False) -> str:
