@@ -157,12 +157,17 @@ def spread_about_median(values: Floats) -> float:
     return spread(values - np.median(values))
 
 
-def white_noise(values: Floats) -> float:
-    """Return the robust standard deviation of the noise of a smooth series (m,), m > 2, by its second differences.
+def bends(values: Floats) -> Floats:
+    """Return the second differences (m - 2,) of a series (m,), m > 1, scaled: those of white noise have its standard deviation.
 
-    With half of the neighbours taken off, those of white noise have 3/2 of its variance.
+    With half of the neighbours taken off, they have 3/2 of its variance.
     """
-    return spread(values[1:-1] - 0.5 * (values[:-2] + values[2:])) / float(np.sqrt(1.5))
+    return np.asarray((values[1:-1] - 0.5 * (values[:-2] + values[2:])) / np.sqrt(1.5))
+
+
+def white_noise(values: Floats) -> float:
+    """Return the robust standard deviation of the noise of a smooth series (m,), m > 2, by its second differences."""
+    return spread(bends(values))
 
 
 def row_medians(values: Floats) -> Floats:

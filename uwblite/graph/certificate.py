@@ -195,7 +195,7 @@ class CertificatePolicy:
     """Share of chi2, and chi2 itself, by which a global minimum may be above its bound."""
     rounding: ClassVar[float] = 1e-15
     """Error of a factor's pivots as a share of the largest of them."""
-    polished: ClassVar[SolverConfig] = SolverConfig(relative_decrease=1e-15, max_iterations=30)
+    polished: ClassVar[SolverConfig] = SolverConfig(relative_decrease=rounding, max_iterations=30)
     """The bound is as good as the gradient is small."""
     halvings: ClassVar[int] = 12
     """Of the logarithm of eta between negligible and worthless, ten decimal powers: the last is a step of 0.6 %."""

@@ -30,8 +30,8 @@ class MarginalsPolicy:
 
     dependent: ClassVar[float] = 1e-13
     """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
-    open: ClassVar[float] = 1e12
-    """m^2; variance of an anchor that no edge touches."""
+    open: ClassVar[float] = 1.0 / TRACE
+    """m^2; variance of an anchor that no edge touches, that of a direction with a trace of damping."""
     variances: ClassVar[Floats] = np.geomspace(1e-4, 4.0, 12)[:, None]
     """Of common errors, from a hundredth to twice the size that is expected."""
     columns_at_once: ClassVar[int] = 16

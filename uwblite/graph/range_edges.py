@@ -82,7 +82,8 @@ class RangeEdges(Edges):
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""
         padded = np.append(graph.calibration.values, 0.0)
         cal = padded[self.calibration.T if len(padded) > 1 else np.full((len(RANGING), 1), -1)]
-        (tx, ty), delay = self.tag[:, None] + cal[-3:-1], cal[-1]
+        *_, x, y, delay = cal
+        tx, ty = self.tag[0] + x, self.tag[1] + y
         c, s = se2.cos_sin(self.turn)
         ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * delay
         uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * delay

@@ -10,6 +10,7 @@ computed by FFT of its two components, or for few shifts one by one, as in Olson
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -30,7 +31,7 @@ Window = tuple[float, float, float]
 """Half widths of a grid of poses in x and y, m, and heading, rad."""
 
 _CELLS_PER_REACH = 4
-_NEIGHBOURS = np.array([offset for offset in np.ndindex(3, 3, 3) if offset != (1, 1, 1)])
+_NEIGHBOURS = np.array([offset for offset in product((0, 1, 2), repeat=3) if offset != (1, 1, 1)])
 """(26, 3) of a cell in the middle of three by three by three."""
 _TRANSFORM = 6
 """Scores of single points that take as long as the transforms of one cell of an image."""

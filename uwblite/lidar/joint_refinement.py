@@ -23,6 +23,7 @@ from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from .cloud_rasters import ScanClouds
 from .clouds import CLOUDS_AT_ONCE, Clouds
 from .scan_matching import CloudPairs, PairFactors, match, measured, pairs_of
+from .scan_to_scan import TrackingConfig
 from .visibility import surface_cells
 
 
@@ -67,7 +68,7 @@ class RefinementConfig:
     """Pairs with fewer matches do not count."""
     min_share: ClassVar[float] = 0.3
     """Pairs that match a smaller share of the points looked up do not count."""
-    sigma: float = setting(0.02, advanced=True)
+    sigma: float = setting(TrackingConfig.sigma, advanced=True)
     """Standard deviation of a point-to-line distance before it is learnt, m."""
     quietest: ClassVar[float] = 0.25
     """Least learnt one as a share of it."""

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from .. import se2
-from ..arrays import Floats, Ints, concatenated
+from ..arrays import OUTLIER, Floats, Ints, concatenated
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy, condensed, correspondences
@@ -30,7 +30,7 @@ from .visibility import free_space, in_free_space, nearest_by_bearing
 class ObjectPolicy:
     """Likelihood of surfaces."""
 
-    outlier: ClassVar[float] = 9.0
+    outlier: ClassVar[float] = OUTLIER**2
     """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
     gap: ClassVar[float] = 0.4
     """Distance between neighbouring points that ends an object, m, and along both axes to where none belongs."""

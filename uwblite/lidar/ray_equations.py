@@ -39,7 +39,8 @@ class RayPolicy:
     """Least number of places of a surface from which the correlation of its residuals is learnt."""
 
 
-_POSE, _SURFACE = slice(0, 3), slice(3, 7)
+_POSE = slice(0, *se2.POSE)
+_SURFACE = slice(_POSE.stop, _POSE.stop + 4)
 """Derivatives among those of a ray: by x, y, theta of the keyframe, and by the step of Surfaces.moved; last, the residual."""
 
 

@@ -71,7 +71,8 @@ class Prior(Table):
     def about(cls, mean: Floats, sound: Floats, slip: Floats, loss: Floats) -> "Prior":
         """Return that of wheels that count motions (e, 3) with covariances (e, 3, 3), and standard deviations (e, 3) of what
         they do not count while they slip, or messages are lost, m, m, rad."""
-        return cls(*(Gaussian(mean, sound + more[:, :, None] ** 2 * np.eye(3)) for more in (np.zeros_like(slip), slip, loss)))
+        each = np.eye(mean.shape[1])
+        return cls(*(Gaussian(mean, sound + more[:, :, None] ** 2 * each) for more in (np.zeros_like(slip), slip, loss)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -56,7 +56,6 @@ class PairPolicy:
 _LEAST = float(np.finfo(np.float32).tiny)
 SINGULAR = TINY
 """Share of the largest information below which a direction has none."""
-_ONE = np.eye(3)
 _FLOOR = SINGULAR * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 """N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
 and y, whatever the frame."""
@@ -249,7 +248,7 @@ def _relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floa
 def _floored(information: Floats, spurious: Floats) -> Floats:
     """Return spurious information (..., 3, 3) that does not vanish."""
     floor = np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _LEAST
-    return np.asarray(spurious + floor[..., None] * _ONE)
+    return np.asarray(spurious + floor[..., None] * np.eye(information.shape[-1]))
 
 
 def _inverse(lower: Floats) -> Floats:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, chunks, rms_length
+from ..arrays import OUTLIER, Floats, Ints, chunks, rms_length
 from ..config import setting
 from .clouds import Clouds, joined
 from .point_cloud import cell_number, mean_by_key, radius_outlier_filter, statistical_outlier_filter
@@ -30,7 +30,7 @@ class SubmapConfig:
     """Cell over which points are averaged, m."""
     neighbours: ClassVar[int] = 8
     """Statistical filter: number of nearest neighbours."""
-    std_ratio: float = setting(3.0, advanced=True)
+    std_ratio: float = setting(OUTLIER, advanced=True)
     """Statistical filter: a point is removed whose neighbours lie farther than the mean by so many standard deviations."""
     radius: ClassVar[float] = 0.25
     """Radius filter: m."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import TINY, WIDE, Bools, Floats, Ints, Table, chunks, dots, run_starts
 from ..odometry.attached import ScanPoints
+from .joint_refinement import RefinementConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +45,8 @@ class ShapePolicy:
     """Least noise of rays, as a share of that by data sheets."""
     around: ClassVar[float] = 0.3
     """Distance from a column's rim up to which rays are its surroundings, m."""
-    alike: ClassVar[float] = 4.0
-    """Design effect of rays until one is learnt (as of matches of clouds: RefinementConfig.correlation)."""
-
-
-_MOST_RAYS = 1 << 14
-"""Most rays of a scan."""
+    alike: ClassVar[float] = RefinementConfig().correlation
+    """Design effect of rays until one is learnt: that of matches of clouds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +160,8 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     """Return rays of which it is not known yet on which surface they end."""
     way = rays.points - rays.origins
     reach = np.maximum(np.hypot(*way.T), TINY)
-    bundle = (rays.scan * _MOST_RAYS + rays.ray) // ShapePolicy.bundle
+    within = rays.ray // ShapePolicy.bundle
+    bundle = rays.scan * (within.max(initial=0) + 1) + within
     return SurfaceRays(rays.keyframe, np.full(len(reach), -1), rays.points, way / reach[:, None], range_sigma(reach), bundle)
 
 

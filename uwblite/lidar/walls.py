@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import TINY, Bools, Floats, Ints, Table, chunks, connected, dots, spread, unique_rows
+from ..arrays import TINY, Bools, Floats, Ints, Table, bends, chunks, connected, dots, spread, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
 from .columns import surroundings
@@ -127,9 +127,7 @@ def _noise(reach: Floats, sigma: Floats, begins: Bools) -> float:
     inside = ~begins[1:-1] & ~begins[2:]
     if not inside.any():
         return 1.0
-    # Those of white noise have six times its variance.
-    bend = np.diff(reach, 2)[inside] / (np.sqrt(6.0) * sigma[1:-1][inside])
-    return float(np.clip(spread(bend), ShapePolicy.quietest, 1.0))
+    return float(np.clip(spread((bends(reach) / sigma[1:-1])[inside]), ShapePolicy.quietest, 1.0))
 
 
 def _straight(moments: _Moments, begins: Bools) -> tuple[Ints, Ints]:

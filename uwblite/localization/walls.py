@@ -18,6 +18,7 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid
 from ..lidar.object_likelihood import ObjectPolicy
 from ..lidar.point_cloud import Lines, estimate_normals, make_tree
+from ..lidar.visibility import VisibilityPolicy
 
 _Cell = TypeVar("_Cell", np.int8, np.signedinteger[Any])
 
@@ -46,7 +47,7 @@ ELSEWHERE = -0.35
 """Log-likelihood of a ray at the best place of a building that is not the map's: rooms are alike in part."""
 INDEPENDENT_RAYS = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
-_LOOKS, _BEFORE = np.linspace(0.0, 1.0, 11)[1:], 0.3
+_LOOKS, _BEFORE = np.linspace(0.0, 1.0, 11)[1:], VisibilityPolicy.margin
 """Places along a ray, as shares of its length, at which it is tested for passing a wall, up to so far before its end, m: beyond
 that it may be the wall on which the ray ends."""
 

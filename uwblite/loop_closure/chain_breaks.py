@@ -13,6 +13,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from ..lidar.visibility import VisibilityPolicy
 from .closures import LoopClosureConfig
 
 
@@ -22,7 +23,7 @@ class TiePolicy:
 
     near: ClassVar[int] = 4
     """Most keyframes that a scan edge of the same visit spans."""
-    another_visit: ClassVar[float] = 10.0
+    another_visit: ClassVar[float] = VisibilityPolicy.apart
     """Travelled distance between two visits, m."""
     clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
     """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""

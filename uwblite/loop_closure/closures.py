@@ -10,6 +10,7 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..config import setting
 from ..graph.pose_edges import RelativePoseEdges
+from ..lidar.scan_matching import PairPolicy
 from ..lidar.scan_to_scan import TrackingConfig
 from ..map_result import LoopClosure
 
@@ -33,7 +34,7 @@ class LoopClosureConfig:
     """Largest half-width of a search among sub-maps, m. Where a pair is less certain, long stretches are compared first."""
     search_angle: ClassVar[float] = 0.7
     """Largest half-width of a search, rad."""
-    gate: float = 0.15
+    gate: float = PairPolicy.gate
     """Outlier distance d of the final matching, m (the paper uses 0.1)."""
     sigma: float = 0.05
     """Fitness: greatest root mean square distance of matched points, m."""

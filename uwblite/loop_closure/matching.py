@@ -15,9 +15,9 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from ..graph.work import Work
 from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import Clouds
+from ..lidar.clouds import CloudConfig, Clouds
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.scan_matching import Aligned, align_pairs, match, pairs_of
+from ..lidar.scan_matching import Aligned, PairPolicy, align_pairs, match, pairs_of
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import FreeSpace, net_overlap, violates_free_space
 from .candidates import CandidatePolicy, Candidates
@@ -29,9 +29,6 @@ from .parallel import batches, in_order
 class MatchingPolicy:
     """Search for the places of candidates."""
 
-    cell: ClassVar[float] = 0.1
-    reach: ClassVar[float] = 0.5
-    """m, of the rasters in which nearest points are looked up."""
     least_turn: ClassVar[float] = 0.1
     """Least half-width of a search, rad."""
     many_places: ClassVar[int] = 20
@@ -103,11 +100,11 @@ def fit(
 def _fit(batch: _Batch) -> tuple[ClosureMatches, Work]:
     """Fit one batch, and return the work of that; runs in a worker."""
     candidates, clouds, config = batch.candidates, batch.clouds, batch.config
-    rules, gate = MatchingPolicy, config.gate
-    raster = rasterize(clouds, rules.cell, rules.reach)
+    gate = config.gate
+    raster = rasterize(clouds, CloudConfig.raster, PairPolicy.reach)
     row, guess = _guesses(batch)
     target, source = candidates.target[row], candidates.source[row]
-    tries = align_pairs(raster, pairs_of(clouds, target, source, config.points), guess, rules.reach, gate)
+    tries = align_pairs(raster, pairs_of(clouds, target, source, config.points), guess, PairPolicy.reach, gate)
     score = tries.share
     if candidates.long:
         score = batch.spacing * net_overlap(raster, batch.free, target, source, tries.pose, gate)
