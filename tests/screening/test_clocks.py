@@ -215,7 +215,7 @@ def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():
     assert np.flatnonzero(displaced(off)).tolist() == [40]
 
 
-@pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (3, 5, False), (4, 4, False), (7, 30, True)])
+@pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (1, 5, False), (4, 4, False), (7, 30, True)])
 def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spread):
     """The last of each keeps its stamp; after a pause they are spread over the usual time."""
     at = 10.0 + np.arange(bursts) * 2.0 + 30.0 * (np.arange(bursts) >= 3)
@@ -226,6 +226,18 @@ def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spre
         stamps, usual, between = found
         assert (usual, between) == (size, 2.0)
         np.testing.assert_allclose(stamps, (at[:, None] - 2.0 + 2.0 * np.arange(1, size + 1) / size).ravel())
+
+
+def test_two_or_three_readings_of_a_coarse_clock_lie_about_their_stamp():
+    """Whole seconds of readings that a robot gives by its way; where a clock stands still, stamps are no times."""
+    true = np.cumsum(np.random.default_rng(3).uniform(0.4, 1.6, 300))
+    stamps, usual, between = clocks._spread(np.floor(true))
+    assert (usual, between) == (1.0, 1.0)
+    assert np.diff(stamps).min() > 0.0
+    assert np.abs(stamps - np.floor(true)).max() < 0.5
+    assert np.abs(np.diff(stamps) - np.diff(true)).mean() < np.abs(np.diff(np.floor(true)) - np.diff(true)).mean()
+    still = np.concatenate([np.arange(10.0), np.full(50, 9.0), np.arange(10.0, 100.0)])
+    assert clocks._spread(still)[0].tolist() == still.tolist()
 
 
 def test_bursts_of_both_sensors_are_named_and_single_stamps_stay():

@@ -69,21 +69,27 @@ def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     for name, what, sensor in (("odometry", "odometry readings", log.odometry), ("scans", "scans", log.scans)):
         if sensor is not None and (spread := _spread(sensor.stamps)) is not None:
             log = replace(log, **{name: replace(sensor, stamps=spread[0])})  # type: ignore[arg-type]
-            facts.append(Fact.of("stamps-in-bursts", readings=what, size=spread[1], period=spread[2]))
+            if spread[1] >= _BURST:
+                facts.append(Fact.of("stamps-in-bursts", readings=what, size=spread[1], period=spread[2]))
     return log, facts
 
 
 def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
-    """Return stamps (n,) with bursts spread, s, usual size of a burst and time between two; None without bursts."""
+    """Return stamps (n,) that differ, s, the usual number of readings with one stamp and time between two; None if they do.
+
+    Two or three readings of a coarse clock are spread about their stamp, so that each keeps what was read with it.
+    """
     distinct, group, size = np.unique(stamps, return_inverse=True, return_counts=True)
-    usual = float(np.median(size[group])) if len(stamps) else 0.0
-    if len(distinct) < _LEAST_BURSTS or usual < _BURST:
+    if len(distinct) < _LEAST_BURSTS or len(distinct) == len(stamps):
         return None
-    gap = np.diff(distinct)
+    usual, gap = float(np.median(size[group])), np.diff(distinct)
     between = float(np.median(gap))
-    gap = np.minimum(np.concatenate([[between], gap]), between)
     place = np.arange(len(stamps)) - np.searchsorted(stamps, distinct)[group]
-    return stamps - gap[group] * (1.0 - (place + 1.0) / size[group]), usual, between
+    before = np.minimum(np.append(between, gap), between)
+    if usual >= _BURST:
+        return stamps - before[group] * (1.0 - (place + 1.0) / size[group]), usual, between
+    about = np.where(size < _BURST, np.minimum(before, np.append(before[1:], between)), 0.0)
+    return stamps + about[group] * ((place + 0.5) / size[group] - 0.5), usual, between
 
 
 def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Fact]]:

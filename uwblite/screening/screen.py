@@ -39,15 +39,16 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, outside = clocks.within_odometry(log)
     units.refuse_wrong_lengths(log)
     odometry, repeated = odometry_chain.without_repeats(log.odometry)
-    log, spread = clocks.without_bursts(replace(log, odometry=odometry))
+    # What is written twice is one reading; what differs was read at different times.
+    log, stuck = repeats.without_repeated_scans(replace(log, odometry=odometry))
+    log, spread = clocks.without_bursts(log)
     bursts, times = clocks.in_bursts(log)
     odometry, glitches = odometry_chain.without_glitches(log.odometry)
     units.refuse_degrees(odometry)
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
-    facts += [*set_right, *outside, *repeated, *spread, *times, *glitches, *broken, *turned]
-    repairs = [repeats.without_repeated_scans, repeats.without_lidar_marks, repeats.without_own_body]
-    repairs += [repeats.without_marks, repeats.without_repeated_ranges]
+    facts += [*set_right, *outside, *repeated, *stuck, *spread, *times, *glitches, *broken, *turned]
+    repairs = [repeats.without_lidar_marks, repeats.without_own_body, repeats.without_marks, repeats.without_repeated_ranges]
     repairs += [explained_by_ranges, directions.heading_with_the_path]
     for repair in repairs:
         log, more = repair(log)
