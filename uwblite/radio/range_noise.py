@@ -33,8 +33,8 @@ class RangeNoiseConfig:
     """Assumed share of the variance that is slow."""
     correlation_length: float = setting(1.5, above=0.0, advanced=True)
     """Correlation length of the slow part, m, before it is learnt."""
-    min_sigma: float = setting(0.03, advanced=True)
-    """Smallest standard deviation that is learnt, m."""
+    min_sigma: float = setting(0.03, above=0.0, advanced=True)
+    """Smallest standard deviation that is learnt, m: few ranges fit exactly, and noise is compared by its ratio."""
     steady: float = 0.06
     """Standard deviation of the error that all ranges to an anchor from one direction and distance have in common, m.
     Radiation pattern and received power alone cause as much. Residuals do not show it: a shifted anchor explains it as well."""
