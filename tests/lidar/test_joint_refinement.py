@@ -10,13 +10,13 @@ from helpers.planted import aligned_error, box
 from scipy import sparse
 
 from uwblite import se2
-from uwblite.arrays import chunks, rms_length
+from uwblite.arrays import rms_length
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.lidar import joint_refinement, scan_matching, visibility
+from uwblite.lidar import joint_refinement
 from uwblite.lidar.cloud_rasters import ScanClouds, rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
@@ -28,7 +28,7 @@ from uwblite.lidar.joint_refinement import (
     unmeasured,
     with_fewer_pairs,
 )
-from uwblite.lidar.scan_matching import PairFactors, match, measured
+from uwblite.lidar.scan_matching import PairFactors, match, measured, pairs_of
 from uwblite.lidar.visibility import surface_cells
 
 CONFIG = RefinementConfig()
@@ -179,18 +179,16 @@ def test_neighbours_are_of_one_recording():
     assert np.all(recording[i] == recording[j])
 
 
-def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
+def test_surface_cells_and_listed_points_do_not_depend_on_how_many_others_there_are():
     truth, _, clouds = room(4)
-    j = np.arange(len(clouds))[::-1]
-    whole, listed = visibility.surface_cells(clouds, truth), scan_matching.pairs_of(clouds, j, j, 7).points
-    monkeypatch.setattr(visibility, "chunks", lambda rows: chunks(rows, 37))
-    monkeypatch.setattr(scan_matching, "chunks", lambda rows, *_: chunks(rows, 3))
-    parts = visibility.surface_cells(clouds, truth)
-    assert len(clouds.points) > 200
-    assert parts.shape == whole.shape
-    assert (parts != whole).nnz == 0
-    assert parts.nnz == whole.nnz == whole.sum()
-    np.testing.assert_array_equal(scan_matching.pairs_of(clouds, j, j, 7).points, listed)
+    own, times = np.arange(len(clouds)), 50_000 // len(clouds.points)
+    few, many = surface_cells(clouds, truth), surface_cells(clouds.chosen(np.tile(own, times)), np.tile(truth, (times, 1)))
+    assert few.nnz == few.sum() > 200
+    assert (many != sparse.vstack([few] * times)).nnz == 0
+    j = np.tile(own[::-1], 1000)
+    listed = pairs_of(clouds, j, j, 7).points
+    assert len(listed) > 20_000
+    np.testing.assert_array_equal(listed, np.tile(pairs_of(clouds, own[::-1], own[::-1], 7).points, (1000, 1)))
 
 
 def test_surface_cells_distinguish_the_sides_of_a_wall():

@@ -7,7 +7,6 @@ import pytest
 from helpers.planted_rays import POSES, SURFACES, linearized, rays_that_end
 
 from uwblite import se2
-from uwblite.arrays import chunks
 from uwblite.lidar.ray_equations import noise_of, weighted_sums
 from uwblite.lidar.surface_rays import MeasuredSurfaces, RayNoise, SurfaceRays, Surfaces
 
@@ -101,16 +100,19 @@ def test_sums_are_those_of_single_rays():
         np.testing.assert_allclose(across, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
-def test_rays_some_at_a_time_say_what_they_say_at_once(monkeypatch):
+def test_a_thousand_times_the_rays_say_a_thousand_times_as_much():
+    """So many that they are summed in parts, some of which end among the rays of one keyframe on one surface."""
     rays = rays_that_end(0.01).by_keyframe(SURFACES)
-    found = MeasuredSurfaces(SURFACES, rays, RayNoise(1.0, np.ones(2)))
-    whole, noise = weighted_sums(found, POSES, POSES, 3.0), noise_of(rays, SURFACES, POSES, POSES)
-    monkeypatch.setattr("uwblite.lidar.surface_rays.chunks", lambda rows: chunks(rows, 7))
-    parts = weighted_sums(found, POSES, POSES, 3.0)
-    assert len(parts.keyframe) > len(whole.keyframe)
+    many = rays.rows(np.tile(np.arange(len(rays.keyframe)), 2001)).by_keyframe(SURFACES)
+    few, all_ = (
+        weighted_sums(MeasuredSurfaces(SURFACES, each, RayNoise(1.0, np.ones(2))), POSES, POSES, 3.0) for each in (rays, many)
+    )
+    assert len(all_.keyframe) > len(few.keyframe)
     for name in ("poses", "pose_slope", "surfaces", "surface_slope", "across"):
-        one, other = (getattr(sums, name) for sums in (parts, whole))
+        one, other = getattr(all_, name), 2001 * getattr(few, name)
         if name == "across":
             one, other = one.sum(axis=0), other.sum(axis=0)
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12 * np.abs(other).max())
-    assert noise_of(rays, SURFACES, POSES, POSES).ratio == noise.ratio
+    part = many.rows(slice(None, None, 4))
+    ratio, other = (noise_of(each, SURFACES, POSES, POSES).ratio for each in (many, part))
+    assert ratio == pytest.approx(other, rel=1e-3)

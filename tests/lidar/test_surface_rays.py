@@ -8,8 +8,9 @@ from helpers.planted_rays import POSES, rays_that_end
 from helpers.wall_rays import seen
 
 from uwblite import se2
+from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.columns import around_columns, on_columns, surroundings
-from uwblite.lidar.surface_rays import UNLEARNT, MeasuredSurfaces, ShapePolicy, as_rays, surfaces_of
+from uwblite.lidar.surface_rays import UNLEARNT, MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, surfaces_of
 from uwblite.lidar.walls import find_walls, points_on, straight_pieces
 from uwblite.odometry.attached import ScanPoints
 
@@ -38,6 +39,18 @@ def test_points_of_clouds_are_told_walls_columns_and_the_rest():
     assert np.all(kind[(np.abs(at[:, 1] + 1.0) < 0.02) & (np.abs(at[:, 0] - 1.6) < 0.1)] == -1)
     flat = (np.abs(at[:, 1] + 2.0) < 0.02) & (np.abs(at[:, 0]) < 2.0)
     assert np.mean(kind[flat] == 0) > 0.9
+
+
+def test_every_place_where_a_ray_ends_on_a_wall_is_on_it_and_none_beyond():
+    """Single rays a metre apart on a wall along x; beside where they end nothing shows it."""
+    x = np.arange(200.0) + 0.06 * np.random.default_rng(0).random(200)
+    at, zero = np.column_stack([x, np.zeros(200)]), np.zeros(200, dtype=np.intp)
+    wall = surfaces_of(np.zeros((1, 2)), np.array([[0.0, 1.0]]), np.zeros((0, 3)))
+    rays = SurfaceRays(zero, zero, at, np.tile([0.0, -1.0], (200, 1)), np.full(200, 0.01), np.arange(200))
+    points = np.concatenate([at, at + np.array([0.5, 0.0]), at + np.array([0.0, 0.1])])
+    clouds = Clouds(np.array([0, 600]), points, 0.0 * points, np.zeros(600, dtype=np.intp), np.ones(600))
+    kind = points_on(clouds, MeasuredSurfaces(wall, rays, UNLEARNT), np.zeros((1, 3)))
+    assert kind.tolist() == [0] * 200 + [-1] * 400
 
 
 def test_only_rays_that_face_a_column_count():

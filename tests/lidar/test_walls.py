@@ -5,9 +5,7 @@ import pytest
 from helpers.wall_rays import seen
 
 from uwblite import se2
-from uwblite.arrays import chunks
-from uwblite.lidar import walls as walls_module
-from uwblite.lidar.walls import WallPolicy, find_walls, straight_pieces
+from uwblite.lidar.walls import Pieces, WallPolicy, find_walls, straight_pieces
 
 ALONG = np.column_stack([np.arange(0.0, 6.0, 0.4), np.zeros(15), np.zeros(15)])
 
@@ -118,18 +116,16 @@ def test_a_wall_that_poses_bend_is_found_in_straight_parts():
     assert np.abs(off).max() < 0.3
 
 
-def test_walls_found_strip_by_strip_are_those_found_at_once(monkeypatch):
-    """Strips of a few places each, of a hall with a column row between its long walls, seen from two aisles."""
-    across = np.column_stack([np.arange(0.0, 6.0, 0.4), np.full(15, 2.5), np.full(15, 0.2)])
-    poses = np.concatenate([ALONG, across])
-    room = [[-3.0, -1.0, 9.0, -1.0], [9.0, -1.0, 9.0, 4.0], [9.0, 4.0, -3.0, 4.0], [-3.0, 4.0, -3.0, -1.0]]
-    room += [[x, 1.0, x + 1.0, 1.0] for x in (0.0, 3.0, 6.0)] + [[x + 1.0, 1.3, x, 1.3] for x in (0.0, 3.0, 6.0)]
-    whole = walls_from(poses, room)[0]
-    monkeypatch.setattr(walls_module, "chunks", lambda rows: chunks(rows, 7))
-    parts = walls_from(poses, room)[0]
-    assert len(whole.centre) >= 6
-    for name in ("of_piece", "centre", "normal"):
-        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+def test_of_a_thousand_walls_in_a_row_none_is_cut_or_joined():
+    """Of 3 m each, 2 m apart: so many places that they are compared strip by strip, which end within walls."""
+    views, count = 6, 1000
+    keyframe, wall = np.divmod(np.arange(views * count), count)
+    centre = np.column_stack([5.0 * wall + 0.013 * keyframe, np.zeros(len(wall))])
+    pieces = Pieces(keyframe, centre, np.tile([0.0, 1.0], (len(wall), 1)), np.full(len(wall), 3.0), np.full(len(wall), 0.01))
+    found = find_walls(pieces, np.zeros((views, 3)), np.ones(len(wall), dtype=bool))
+    assert len(found.centre) == count
+    assert all(len(set(of.tolist())) == 1 for of in found.of_piece.reshape(views, count).T)
+    np.testing.assert_allclose(found.normal, np.tile([0.0, 1.0], (count, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
