@@ -27,11 +27,11 @@ Complexes = NDArray[np.complex128]
 CHUNK = 1 << 14
 """Rows that are processed together, so that they stay in the processor's cache; bounds the memory, too."""
 TINY = 1e-9
-"""Length, m, or share below which a value is rounding error."""
+"""Length, m, time, s, or share below which a value is rounding error."""
 MOST = 0.9
-"""Share of values that is nearly all of them, also as a quantile."""
+"""Share that is nearly all: of values, also as a quantile, of the points of a scan, of a direction that is measured."""
 ENOUGH = 20
-"""Values whose median or share is a figure, and that are not alike by chance."""
+"""Number of values whose median, quantile or share is a figure, and that are neither alike nor odd by chance."""
 BEYOND_NOISE = 5.0
 """Standard deviations that noise does not exceed."""
 MAD_TO_SIGMA = 1.4826

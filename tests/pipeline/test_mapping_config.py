@@ -17,7 +17,10 @@ from uwblite.pipeline.mapping_config import PRESETS, preset
 
 @pytest.mark.parametrize(
     "name",
-    ["ranges.correlation_length", "ranges.min_sigma", "trilateration.raster", "trilateration.bias_sigma", "refinement.first_gate"],
+    [
+        "ranges.correlation_length", "ranges.min_sigma", "trilateration.raster", "trilateration.bias_sigma",
+        "refinement.first_gate",
+    ],
 )
 def test_what_is_divided_by_is_not_zero(name):
     for value in ("0", "-0.0" if not name.endswith("raster") else "-1"):
