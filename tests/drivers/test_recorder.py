@@ -362,3 +362,11 @@ def test_nothing_that_a_port_does_ends_a_recording(tmp_path, name):
 def test_a_bridge_that_is_not_there_is_one_clear_error():
     with pytest.raises(DeviceError, match="cannot open"):
         open_port("socket://127.0.0.1:1", 115200)
+
+
+@pytest.mark.parametrize(("lost", "silent", "said"), [(5, 0.0, 0), (11, 0.0, 1), (5, 7.0, 1), (5, 5.0, 0)])
+def test_a_tenth_of_the_messages_or_of_the_time_may_be_missing(lost, silent, said):
+    """Of a hundred messages within a minute."""
+    link = Link("lidar", "", None)
+    link.counts = link_module.Counts(messages=100 - lost, lost=lost, silent_time=silent)
+    assert len(link_module.doubts([link], 0.0, 60.0)) == said

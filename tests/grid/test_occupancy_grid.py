@@ -359,6 +359,9 @@ def test_scans_that_did_not_move_are_not_traced_again():
     np.testing.assert_array_equal(moved_scans(poses, 0.1, 0.1), [0, 2, 4])
     np.testing.assert_array_equal(moved_scans(poses[:, [1, 0, 2]] + [0.0, 5.0, 0.0], 0.1, 0.1), [0, 2, 4])
     assert len(moved_scans(poses[:0], 0.1, 0.1)) == 0
+    # Just as far is far enough; eighths of a metre have no rounding errors.
+    eighths = np.column_stack([0.125 * np.arange(5.0), np.zeros((5, 2))])
+    np.testing.assert_array_equal(moved_scans(eighths, 0.25, 0.1), [0, 2, 4])
     np.testing.assert_array_equal(moved_scans(poses, 0.0, 0.1), np.arange(6))
     assert from_scans(poses, room_scans(poses), GridConfig()).scans_used == 3
 

@@ -14,7 +14,15 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import prior_selection
-from uwblite.radio.prior_selection import _mean_under, _units, is_uncalibrated, select_priors, with_calibrated_radio
+from uwblite.radio.prior_selection import (
+    UnitPolicy,
+    _common,
+    _mean_under,
+    _units,
+    is_uncalibrated,
+    select_priors,
+    with_calibrated_radio,
+)
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorMounting
@@ -218,6 +226,29 @@ def test_the_mean_under_other_priors_is_that_of_the_same_measurements():
     covariance = np.linalg.inv(a.T @ a + np.diag(before**-2.0))
     expected = np.linalg.solve(a.T @ a + np.diag(after**-2.0), a.T @ y)
     np.testing.assert_allclose(_mean_under(covariance @ a.T @ y, covariance, before, after), expected)
+
+
+def test_the_common_height_is_that_of_the_joint_normal_of_mean_and_heights():
+    """Mean and squared heights of three anchors as one vector, for each spread tried; spreads by their evidence."""
+    values, sigma = np.array([1.2, 2.5, 1.9]), np.full(3, 2.0)
+    information = np.diag([4.0, 0.5, 2.0]) + 0.3
+    covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
+    pulled, found = (information + np.diag(sigma**-2.0)) @ values, []
+    for spread in np.geomspace(UnitPolicy.least_heights, 2.0, UnitPolicy.widths):
+        prior = np.zeros((4, 4))
+        prior[0, 0] = (UnitPolicy.together * 2.0) ** -2.0 + 3.0 / spread**2
+        prior[0, 1:] = prior[1:, 0] = -1.0 / spread**2
+        prior[1:, 1:] = np.eye(3) / spread**2
+        joint = prior + np.pad(information, (1, 0))
+        right = np.append(0.0, pulled)
+        place = np.linalg.solve(joint, right)
+        log_evidence = 0.5 * (right @ place + np.linalg.slogdet(prior)[1] - np.linalg.slogdet(joint)[1])
+        found.append((log_evidence, place[0], np.linalg.inv(joint)[0, 0], spread))
+    likely, mean, variance, spread = np.array(found).T
+    weight = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
+    middle = weight @ mean
+    expected = np.sqrt(weight @ (variance + (mean - middle) ** 2) + np.exp(2.0 * weight @ np.log(spread)))
+    np.testing.assert_allclose(_common(values, covariance, sigma), (middle, expected), rtol=1e-9)
 
 
 def test_a_calibrated_radio_has_the_narrowest_priors_tried():

@@ -52,6 +52,12 @@ def test_readings_of_a_robot_that_stands_and_a_few_of_any_show_nothing():
     assert not in_bursts(np.zeros(100))
 
 
+def test_steps_of_a_robot_that_stands_are_none_of_a_burst():
+    """It drives for 2 s and stands for 4 s in turn, and is told of evenly."""
+    way = np.cumsum(np.where(np.arange(600) % 60 < 20, 0.05, 0.0))
+    assert not in_bursts(EVEN, way)
+
+
 def test_a_robot_that_jerks_has_times():
     """Steps of nothing and of four times the usual way, stamped evenly."""
     way = np.cumsum(np.where(np.random.default_rng(4).random(600) < 0.25, 0.2, 0.001))

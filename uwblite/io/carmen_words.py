@@ -173,7 +173,7 @@ class Params:
         """Return whether the place of a further tag, 2 to 9, was given."""
         return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
 
-    def mounting(self, T_base_laser: Floats | None, tags: int = 1, laser_is_base: bool = False) -> SensorMounting:
+    def mounting(self, T_base_laser: Floats | None, tags: int, laser_is_base: bool = False) -> SensorMounting:
         """Return the mounting; where the laser messages give no pose of the laser, CARMEN's robot_frontlaser_* count.
 
         Parameters
