@@ -30,7 +30,7 @@ RANGE, ADVANCED = "uwblite range", "uwblite advanced"
 
 
 def setting(default: Any, *, advanced: bool = False, **limits: float) -> Any:
-    """Return a dataclass field with a default and a permitted range: above < value, minimum <= value <= maximum.
+    """Return a dataclass field with a default and a permitted range: above < value < below, minimum <= value <= maximum.
 
     An advanced setting is for experiments and presets; lists for users leave it out where it has its default.
     """
@@ -185,7 +185,9 @@ def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
     return field.metadata.get(RANGE, {"minimum": 0.0} if quantity else {})
 
 
-_COMPARED = {"above": (">", operator.gt), "minimum": (">=", operator.ge), "maximum": ("<=", operator.le)}
+_COMPARED = {
+    "above": (">", operator.gt), "minimum": (">=", operator.ge), "maximum": ("<=", operator.le), "below": ("<", operator.lt),
+}  # fmt: skip
 
 
 def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]) -> Any:
@@ -193,6 +195,12 @@ def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]
         if v is not None and not all(_COMPARED[name][1](v, limit) for name, limit in limits.items()):
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; it must be {range_text(limits)}")
     return value
+
+
+def require_permitted(config: Any) -> None:
+    """Raise ConfigError where a field of settings is out of its range: for those that are made in Python."""
+    for field in dataclasses.fields(config):
+        _check_range(getattr(config, field.name), _limits(field), (field.name,))
 
 
 def range_text(limits: Mapping[str, float]) -> str:

@@ -33,8 +33,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..config import documented, setting
-from ..errors import ConfigError, SolverError
+from ..config import documented, require_permitted, setting
+from ..errors import SolverError
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, kernel_weights, linearize, linearized_cost
 from .normal_equations import NormalEquations
@@ -52,21 +52,17 @@ Progress = Callable[[int, int], None]
 class SolverConfig:
     """When the optimisation ends, and how small its first steps are."""
 
-    max_iterations: int = 100
+    max_iterations: int = setting(100, minimum=1)
     """Most iterations, each of which solves one linear system."""
-    relative_decrease: float = setting(1e-7, advanced=True)
+    relative_decrease: float = setting(1e-7, above=0.0, advanced=True)
     """Stop when chi2 is about to decrease by no more than this fraction of it."""
-    gradient_tolerance: float = setting(1e-9, advanced=True)
+    gradient_tolerance: float = setting(1e-9, above=0.0, advanced=True)
     """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
     initial_damping: ClassVar[float] = 1e-10
     """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 with a smaller one, for poor starting values."""
 
     def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise ConfigError(f"max_iterations must be at least 1, not {self.max_iterations}")
-        for name in ("relative_decrease", "gradient_tolerance"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+        require_permitted(self)
 
 
 @documented

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats
-from ..config import documented, setting
-from ..errors import ConfigError
+from ..config import documented, require_permitted, setting
 from .geometry import GridGeometry
 from .ray_counter import WEIGHT_UNIT, RayCounter
 
@@ -35,13 +34,13 @@ LEAST_CELL, LARGEST_CELL = 1e-4, 1e3
 class GridConfig:
     """How rays turn into a map."""
 
-    resolution: float = 0.05
+    resolution: float = setting(0.05, minimum=LEAST_CELL, maximum=LARGEST_CELL)
     """Edge of a cell, m. Halving it takes four times the memory and twice the time."""
-    p_hit: float = 0.6
-    """Probability that a cell in which a ray ended is occupied, 0.5..1. Lower: more scans needed to draw a wall."""
-    p_miss: float = 0.45
-    """Probability that a cell through which a ray passed is occupied, 0..0.5. Lower: moving things vanish sooner."""
-    clamp: float = setting(12.0, advanced=True)
+    p_hit: float = setting(0.6, above=0.5, below=1.0)
+    """Probability that a cell in which a ray ended is occupied. Lower: more scans needed to draw a wall."""
+    p_miss: float = setting(0.45, above=0.0, below=0.5)
+    """Probability that a cell through which a ray passed is occupied. Lower: moving things vanish sooner."""
+    clamp: float = setting(12.0, above=0.0, advanced=True)
     """Largest absolute log-odds of a cell."""
     max_range: float = 0.0
     """Longer readings are not used, m; 0 = up to what the scanner reaches."""
@@ -49,8 +48,8 @@ class GridConfig:
     """Beams that saw nothing clear space up to this distance or the first wall, m; 0 = they clear nothing."""
     clear_run: ClassVar[int] = 5
     """Least number of adjacent beams that saw nothing before they clear space."""
-    clear_weight: float = 0.5
-    """Weight of a beam that saw nothing against one that passed through to a hit, 0..1 (in steps of 1/16)."""
+    clear_weight: float = setting(0.5, minimum=0.0, maximum=1.0)
+    """Weight of a beam that saw nothing against one that passed through to a hit, in steps of 1/16."""
     move_distance: float = 0.1
     """A scan is traced when the laser has moved this far since the last traced one, m; of more than 8,000 of a recording, 8,000
     or a third, evenly spread; 0 = every scan, however many."""
@@ -59,19 +58,11 @@ class GridConfig:
     most_scans: ClassVar[int] = 8000
     """Scans of a recording that are traced, at most, if these are a third of all: a cell of a building of 60 x 40 m is seen in
     a hundred of so many, and a robot that drives 10 km sees more cells."""
-    max_cells: int = 40_000_000
+    max_cells: int = setting(40_000_000, minimum=1)
     """Largest grid, cells (12 bytes each while it is made); a larger map is drawn with larger cells."""
 
     def __post_init__(self) -> None:
-        if not LEAST_CELL <= self.resolution <= LARGEST_CELL:
-            raise ConfigError(f"grid.resolution must lie in {LEAST_CELL:g}..{LARGEST_CELL:g} m, not {self.resolution}")
-        if not 0.5 < self.p_hit < 1.0 or not 0.0 < self.p_miss < 0.5:
-            raise ConfigError(f"grid needs 0 < p_miss < 0.5 < p_hit < 1, not {self.p_miss} and {self.p_hit}")
-        if not 0.0 <= self.clear_weight <= 1.0:
-            raise ConfigError(f"grid.clear_weight must lie in 0..1, not {self.clear_weight}")
-        for name in ("clamp", "max_cells"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"grid.{name} must be positive, not {getattr(self, name)}")
+        require_permitted(self)
 
 
 @documented
