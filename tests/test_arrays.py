@@ -14,6 +14,8 @@ from uwblite.arrays import (
     array_fields,
     as_array,
     concatenated,
+    evenly,
+    numbered,
     renumbered,
     require_finite,
     require_index,
@@ -300,3 +302,20 @@ def test_the_noise_of_a_smooth_series_is_what_was_added_to_it():
     """20,000 values: the median absolute deviation of normal errors scatters by 1.2 / sqrt(n), neighbours counted twice."""
     rng, time = np.random.default_rng(0), np.linspace(0.0, 30.0, 20_000)
     assert white_noise(4.0 * np.sin(time) + 0.3 * rng.standard_normal(len(time))) == pytest.approx(0.3, rel=0.03)
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (3, 5), (5, 5), (6, 5), (1000, 7), (999, 500)])
+def test_an_even_choice_has_both_ends_and_gaps_that_differ_by_one(count, most):
+    chosen = evenly(count, most)
+    assert len(chosen) == min(count, most)
+    if count:
+        assert (chosen[0], chosen[-1]) == (0, count - 1)
+    if len(chosen) > 1:
+        assert 1 <= np.diff(chosen).min() >= np.diff(chosen).max() - 1
+
+
+def test_entries_of_groups_are_numbered_from_0_on():
+    group, number = numbered(np.array([2, 0, 3]))
+    assert group.tolist() == [0, 0, 2, 2, 2]
+    assert number.tolist() == [0, 1, 0, 1, 2]
+    assert [len(column) for column in numbered(np.zeros(0, dtype=np.intp))] == [0, 0]

@@ -79,6 +79,17 @@ def chunks(rows: int, size: int = CHUNK) -> Iterator[slice]:
         yield slice(first, min(first + size, rows))
 
 
+def evenly(count: int, most: int) -> Ints:
+    """Return at most so many of count indices, evenly spread, first and last among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+
+
+def numbered(counts: Ints) -> tuple[Ints, Ints]:
+    """Return, of so many entries (n,) of each group one after another, the group of each and its number within the group."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    return group, np.arange(len(group)) - (np.cumsum(counts) - counts)[group]
+
+
 def run_starts(*columns: NDArray[Any]) -> Ints:
     """Return the first row (r,) of each run of rows in which no column (n,) changes."""
     fresh = np.ones(len(columns[0]), dtype=bool)

@@ -16,7 +16,7 @@ from ..io.results import check_target
 from ..mapping import Stage
 from ..pipeline.expected_cost import expected_cost, together
 from ..pipeline.recordings import prepared
-from ..report.printable import anchor_line, calibration_line, duration
+from ..report.printable import anchor_line, calibration_text, duration
 from . import console
 from .inputs import name_recordings_once
 from .making import Made, Recordings, make, note_cost, peak_memory, read_logs, settings
@@ -142,7 +142,7 @@ def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
         lines[0] += f": {size}, {len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures"
     lines += [anchor_line(a) for a in result.anchors]
     shown = (c for c in result.calibration if c.state == "estimated" and c.key.anchor is None and abs(c.value) > 2.0 * c.sigma)
-    lines += [calibration_line(c) for c in shown]
+    lines += [calibration_text(c.name, c.value, c.sigma, c.unit, c.meaning) for c in shown]
     groups = sorted(folded(result.findings), key=lambda group: any(f.severity == DOUBT for f in (group[0], *group[1])))
     for cause, explains in groups:
         lines.append(f"{_LABELS[cause.severity]}: {cause}")

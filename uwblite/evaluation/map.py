@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, evenly
 from ..grid.columns import find_column
 
 REACH = 4.0
@@ -87,7 +87,7 @@ def landmark_errors_along(
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_OBSERVATIONS, len(seen))).astype(np.intp))]
+        seen = seen[evenly(len(seen), _OBSERVATIONS)]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))

@@ -13,8 +13,8 @@ BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 MEGA = 1e6
 """Bytes in a megabyte."""
-_STRIP = 64
-"""Rows of a map that are processed at a time."""
+STRIP = 64
+"""Rows of a map that are processed at a time, so that they stay in a processor's cache."""
 _OUTER = 0.01
 """Share of the points left out on each side of a box without outliers."""
 _LEAST_MARGIN = 10.0
@@ -68,7 +68,7 @@ class GridGeometry:
 
     def strips(self) -> Iterator[slice]:
         """Return the rows in strips, for computations that take many bytes per cell."""
-        return chunks(self.rows, _STRIP)
+        return chunks(self.rows, STRIP)
 
     def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":
         """Return the part of the grid whose first cell is (row, col)."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, chunks
+from ..arrays import Bools, Floats, Ints, chunks, evenly
 from ..errors import DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
@@ -156,7 +156,7 @@ def missing_share(recordings: Sequence[Sweeps], grid: OccupancyGrid, reach: floa
     met = lost = 0
     g = grid.geometry
     for sweeps in (each for each in recordings if len(each.first)):
-        chosen = np.unique(np.linspace(0, len(sweeps.first) - 1, min(_SAMPLED, len(sweeps.first))).astype(np.intp))
+        chosen = evenly(len(sweeps.first), _SAMPLED)
         far = np.zeros((len(chosen), sweeps.scans.ranges.shape[1]), dtype=np.float32)
         far[:, ::_EVERY] = reach
         readings, rays = sweeps.scans.ranges[chosen][:, ::_EVERY].reshape(-1), sweeps.rays(chosen, far)

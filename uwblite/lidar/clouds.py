@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated, dots
+from ..arrays import Bools, Floats, Ints, concatenated, dots, numbered
 from ..config import setting
 from ..graph.work import Work
 from ..odometry.attached import ScanPoints
@@ -188,9 +188,8 @@ def filled(rays: ScanPoints) -> ScanPoints:
         return rays
     step = rays.points[first + 1] - rays.points[first]
     parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / GapPolicy.spacing).astype(np.intp)
-    own = np.repeat(np.arange(len(first)), parts - 1)
-    number = np.arange(len(own)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
-    share = (number / parts[own])[:, None]
+    own, number = numbered(parts - 1)
+    share = ((number + 1) / parts[own])[:, None]
     rows = np.concatenate([np.arange(len(rays.ray)), first[own]])
     order = np.argsort(rows, kind="stable")
 

@@ -19,7 +19,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import WIDE, Bools, Floats, Ints, Wides, chunks
+from ..arrays import WIDE, Bools, Floats, Ints, Wides, chunks, evenly
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_of
@@ -147,7 +147,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
     nearest = nearest_by_bearing(clouds)
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
-        views = np.unique(np.linspace(first, last - 1, VisibilityPolicy.views).round().astype(np.intp))
+        views = first + evenly(last - first, VisibilityPolicy.views)
         free.append(free_space(se2.between(poses[reference], poses[views]), nearest[views]))
     return free
 
@@ -221,7 +221,7 @@ def _together(poses: Floats, path: Floats, recording: Ints, again: bool) -> tupl
     apart = (np.abs(path[other] - path[:, None]) > c.apart) | (recording[other] != recording[:, None])
     paired = (apart == again) & np.isfinite(distance) & (other != np.arange(len(poses))[:, None])
     i = np.flatnonzero(paired.any(axis=1))
-    i = i[np.unique(np.linspace(0, len(i) - 1, min(c.revisits, len(i))).round().astype(np.intp))]
+    i = i[evenly(len(i), c.revisits)]
     chosen = np.argmax(paired[i], axis=1) if again else len(nearest) - 1 - np.argmax(paired[i, ::-1], axis=1)
     return i, other[i, chosen].astype(np.intp)
 

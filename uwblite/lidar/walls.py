@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import TINY, Bools, Floats, Ints, Table, bends, chunks, connected, dots, spread, unique_rows
+from ..arrays import TINY, Bools, Floats, Ints, Table, bends, chunks, connected, dots, numbered, spread, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
 from .columns import surroundings
@@ -115,9 +115,8 @@ def straight_pieces(rays: ScanPoints) -> tuple[Pieces, SurfaceRays]:
     first, last = first[good], last[good]
     found = Pieces(rays.keyframe[first], middle[good], normal[good], length[good], deviation[good])
     # The outermost rays may hit two surfaces.
-    inner = last - first - 2
-    piece = np.repeat(np.arange(len(first)), inner)
-    on = np.arange(len(piece)) + (first + 1 - np.cumsum(inner) + inner)[piece]
+    piece, inner = numbered(last - first - 2)
+    on = first[piece] + 1 + inner
     oblique = -dots(ahead[on], found.normal[piece]) > c.incidence
     return found, replace(single.rows(on), surface=piece).rows(oblique).bundled()
 
@@ -191,8 +190,7 @@ class _Places(Table):
     @classmethod
     def on(cls, pieces: Pieces, poses: Floats) -> "_Places":
         many = np.maximum(np.ceil(pieces.length / WallPolicy.every).astype(np.intp), 2)
-        piece = np.repeat(np.arange(len(many)), many)
-        rank = np.arange(len(piece)) - (np.cumsum(many) - many)[piece]
+        piece, rank = numbered(many)
         along = ((rank + 0.5) / many[piece] - 0.5) * pieces.length[piece]
         normal, keyframe = pieces.normal[piece], pieces.keyframe[piece]
         at = pieces.centre[piece] + along[:, None] * np.stack([normal[:, 1], -normal[:, 0]], axis=1)

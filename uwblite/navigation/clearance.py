@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..arrays import TINY, Bools, Floats, Ints, chunks
-from ..grid.geometry import GridGeometry
+from ..grid.geometry import STRIP, GridGeometry
 from ..grid.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 COMFORT = 0.5
@@ -33,8 +33,6 @@ UNKNOWN_PRICE = 5.0
 """Cost of a metre through unknown space, in metres of open space, where it is not refused."""
 _SPECK = 0.015
 """m^2; islands of unknown cells that are smaller are noise of the map and no obstacle."""
-STRIP = 64
-"""Rows whose distances are found together, so that they stay in a processor's cache."""
 AT_ONCE = 300_000
 """Squares, samples or nodes looked at together."""
 
@@ -181,7 +179,7 @@ def _measured(obstacles: Bools, geometry: GridGeometry, radius: float) -> tuple[
     cut = (2 * reach) ** 2
     half = np.empty(obstacles.shape, dtype=np.uint16 if 2 * cut <= np.iinfo(np.uint16).max else np.uint32)
     tight = []
-    for rows in chunks(geometry.rows, STRIP):
+    for rows in geometry.strips():
         count = rows.stop - rows.start
         centres, edges = (squares.astype(half.dtype) for squares in _along_rows(_rows(obstacles, rows, reach), cut))
         stands = np.zeros((count + 1, geometry.cols + 1), dtype=np.bool_)

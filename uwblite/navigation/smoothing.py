@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
-from ..arrays import TINY, WIDE, Bools, Floats, Ints
+from ..arrays import TINY, WIDE, Bools, Floats, Ints, numbered
 from .clearance import AT_ONCE, COMFORT, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
@@ -81,10 +81,9 @@ def _parts(lines: Bools, lengths: Floats, step: float) -> Iterator[tuple[Ints, I
 
 def _samples(begin: Floats, end: Floats, pieces: Ints) -> tuple[Floats, Ints, Ints]:
     """Return the ends (k, 2) of so many equal pieces (n,) of lines, the line of each (k,), and the first of each line (n,)."""
-    first = np.cumsum(pieces + 1) - (pieces + 1)
-    owner = np.repeat(np.arange(len(pieces)), pieces + 1)
-    share = (np.arange(len(owner)) - first[owner]) / pieces[owner]
-    return begin[owner] + share[:, None] * (end - begin)[owner], owner, first
+    owner, number = numbered(pieces + 1)
+    share = (number / pieces[owner])[:, None]
+    return begin[owner] + share * (end - begin)[owner], owner, np.flatnonzero(number == 0)
 
 
 def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats, pieces: Ints) -> Lines:
@@ -160,8 +159,8 @@ def walk_back(before: Ints, first: int, last: int) -> Ints:
 def _cuts(line: Floats, step: float) -> tuple[Ints, Ints, Ints]:
     """Return, of all equal cuts (k,) of a line's pieces, the piece, the cut's number in it, and how many it is cut into."""
     cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - TINY), 1).astype(np.intp)
-    piece = np.repeat(np.arange(len(cuts)), cuts)
-    return piece, np.arange(len(piece)) - (np.cumsum(cuts) - cuts)[piece], cuts[piece]
+    piece, number = numbered(cuts)
+    return piece, number, cuts[piece]
 
 
 def _at(line: Floats, piece: Ints, share: Floats) -> Floats:

@@ -19,8 +19,9 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from ..arrays import Bools, Floats, Ints, chunks
-from .clearance import AT_ONCE, STRIP, ClearanceMap
+from ..arrays import Bools, Floats, Ints
+from ..grid.geometry import STRIP
+from .clearance import AT_ONCE, ClearanceMap
 from .smoothing import along_lines, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
@@ -107,7 +108,7 @@ class StepSearch:
             return
         reached = np.isfinite(dijkstra(self.regions.graph, indices=self._region(np.array([first]))[0]))
         count, grid = len(reached) - len(self.clearance.tight), self.clearance.geometry
-        for rows in chunks(grid.rows, STRIP):
+        for rows in grid.strips():
             label = self.regions.label[rows].ravel()
             yield np.flatnonzero(np.append(False, reached[:count])[label]) + rows.start * grid.cols
         yield np.flatnonzero(reached[count:]) + grid.cells
@@ -259,7 +260,7 @@ def regions_of(clearance: ClearanceMap, joins: csr_matrix) -> Regions:
     row, col = (n.ravel().astype(np.float64) for n in np.indices((STRIP, grid.cols)))
     sums: list[Floats] = []
     pairs: list[tuple[Ints, Ints]] = []
-    for rows in chunks(grid.rows, STRIP):
+    for rows in grid.strips():
         part, more = _parted(clearance.passable(rows))
         inner = part.ravel().astype(np.intp)
         values = (None, col[: len(inner)], row[: len(inner)] + rows.start, clearance.cell_cost(rows).ravel())

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, evenly
 from ..findings import Fact
 from ..radio.place_evidence import Explanation, MovePolicy, PlaceModel, Track, intervals_of
 from ..radio.place_intervals import explain
@@ -83,7 +83,7 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
         rows = rows[np.lexsort((ranges.stamps[rows], recording[rows]))]
         if not len(rows):
             continue
-        chosen = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_RANGES)).round().astype(np.intp))
+        chosen = evenly(len(rows), MOST_RANGES)
         sample = rows[chosen]
         unknown = ranges.calibration[sample[0], 2] >= 0
         height = float(np.sqrt(max(values[sample[0], 2], 0.0)))

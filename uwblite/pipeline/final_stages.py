@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import TINY, Floats
+from ..arrays import TINY, Floats, evenly
 from ..graph.calibration import HEIGHT, with_free
 from ..graph.graph import Graph
 from ..graph.marginals import Covariances, Marginals, marginals
@@ -64,8 +64,7 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
 
 def covariances_of(estimate: Estimate, task: Task) -> Covariances:
     """Return the covariances of a finished estimate, with the correlated errors of ranges in them."""
-    poses = len(estimate.graph.poses)
-    along = np.unique(np.linspace(0, poses - 1, FinalPolicy.along).round().astype(np.intp))
+    along = evenly(len(estimate.graph.poses), FinalPolicy.along)
     graph, surfaces = with_fewer_pairs(estimate.graph), estimate.surfaces
     graph, rays = (graph, None) if surfaces is None else for_covariances(surfaces, graph, task)
     result = marginals(graph, among=along, further=rays)

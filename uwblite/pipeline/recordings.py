@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import ENOUGH, Bools, Floats, Ints, require_type
+from ..arrays import ENOUGH, Bools, Floats, Ints, evenly, require_type
 from ..constraints import Clock, Constraints
 from ..errors import DataError
 from ..grid.occupancy_grid import GridConfig
@@ -221,7 +221,7 @@ def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
     """Return the stamps strictly between two others; an even selection where they are too many."""
     first, last = np.searchsorted(stamps, (begin + RecordingPolicy.same_moment, end - RecordingPolicy.same_moment))
     within = stamps[first:last]
-    return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.intp)[1:-1]]
+    return within if len(within) <= most else within[evenly(len(within), most + 2)[1:-1]]
 
 
 def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from ..arrays import OUTLIER, TINY, Bools, Floats, spread, spread_about_median
+from ..arrays import OUTLIER, TINY, Bools, Floats, evenly, spread, spread_about_median
 from ..graph.graph import Graph, edge_weights
 from ..graph.marginals import Covariances, Marginals, marginals
 from ..graph.range_edges import RangeEdges
@@ -159,7 +159,7 @@ def _scatter(
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.flatnonzero(weights > 0.0)
     most = OUTLIER * max(spread(residuals[alive]), config.steady)
-    some = alive[np.linspace(0, len(alive) - 1, min(len(alive), _SAMPLE)).round().astype(np.intp)]
+    some = alive[evenly(len(alive), _SAMPLE)]
     variance = edges.sigma**2 / np.maximum(weights, _NO_WEIGHT)
     jacobian = factors[some].multiply(variance[some, None]).toarray()
     moved = found.solve(jacobian.T)

@@ -6,7 +6,7 @@ no residual distinguishes the delay from another place of the anchor; the map do
 
 import numpy as np
 
-from ..arrays import CHUNK, Bools, Floats, Ints, chunks
+from ..arrays import CHUNK, Bools, Floats, Ints, chunks, numbered
 
 CELL = 0.2
 """Least side of a cell of the map, m; a wall is about as thick."""
@@ -40,8 +40,8 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats, least: int = _LEAST
     first = np.maximum(first, _NEAR_TAG)
     count = np.ceil(np.maximum(last - first, 0.0) / (0.5 * cell)).astype(np.intp)
     for part in np.array_split(np.arange(len(tags)), 1 + int(count.sum()) // CHUNK):
-        row = np.repeat(part, count[part])
-        step = np.arange(len(row)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
+        way_of, step = numbered(count[part])
+        row = part[way_of]
         along = (first.take(row) + 0.5 * cell * step) / length.take(row)
         places = [tag.take(row) + ahead.take(row) * along for tag, ahead in zip(tags.T, way.T, strict=True)]
         through[row[_look_up(np.stack(places), low, cell, occupied)]] = True

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, numbered
 
 WIDTH, HEIGHT = 5, 9
 """Pixels of one character; characters are set one pixel apart."""
@@ -106,8 +106,7 @@ class Canvas:
         length = np.minimum(np.hypot(*way.T), (2 * self.size).sum())
         # Points half a sub-pixel apart leave no gaps.
         count = np.ceil(length * 2 * _FINE).astype(np.intp) + 1
-        owner = np.repeat(np.arange(len(segments)), count)
-        step = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+        owner, step = numbered(count)
         fraction = step / np.maximum(count - 1, 1)[owner]
         self._dab(start[owner] + fraction[:, None] * way[owner], width / 2.0, colour, opacity)
 

@@ -7,7 +7,7 @@ from html import escape as escape_markup
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..map_result import AnchorEstimate, CalibrationEstimate
+    from ..map_result import AnchorEstimate
 
 _MOST_DIGITS = 9
 DECIMALS = 3
@@ -120,13 +120,8 @@ def sigmas(anchor: "AnchorEstimate") -> tuple[float, float]:
     return x, y
 
 
-def calibration_line(value: "CalibrationEstimate") -> str:
-    """Return one line about a calibration value; ratios in per cent."""
-    return calibration_text(value.name, value.value, value.sigma, value.unit, value.meaning)
-
-
 def calibration_text(name: str, value: float, sigma: float, unit: str, meaning: str) -> str:
-    """Return the same of its fields."""
+    """Return one line about a calibration value; ratios in per cent."""
     value, sigma, unit, digits = readable(value, sigma, unit)
     return f"{meaning}: {signed(value, digits, plus=True)} \u00b1{sigma_text(sigma, digits)} {unit} ({name})"
 
