@@ -1,11 +1,12 @@
 """Topics that may hold ranges and are not read are named, with a mapping that reads them when it is pasted."""
 
+import numpy as np
 import pytest
 from helpers.bags import odometry, stamped, write_bag_of
 from helpers.results import small_folder
 
 from uwblite.errors import ConfigError
-from uwblite.io.bag_topics import BagTopics, as_toml, plan_topics, suggested
+from uwblite.io.bag_topics import BagTopics, _is_ids, as_toml, plan_topics, suggested
 from uwblite.io.rosbag import plan_bag, read_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
 
@@ -159,3 +160,11 @@ def test_topics_of_what_is_no_bag_are_refused(tmp_path, capsys, verb, room_log):
     for option, why in (("--odometry-topic", "is no ROS bag"), ("--scan-topic", "scans are not read from '/scan'; choose")):
         assert main([verb, str(room_log), *words, option, "/scan"]) == 1
         assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("value", "ids"), [
+    (["A", "B"], True), (("A", "B"), True), (np.array([3, 4]), True), (["A"], False), ([1.5, 2.5], False), ("AB", False),
+    (np.array([1.5, 2.5]), False),
+])  # fmt: skip
+def test_ids_are_texts_or_whole_numbers_as_many_as_ranges(value, ids):
+    assert _is_ids(value, 2) is ids

@@ -121,6 +121,15 @@ def test_of_places_that_look_alike_the_one_that_the_ranges_fit_comes_first():
     np.testing.assert_allclose(found.poses[0], poses[17], atol=0.26)
 
 
+def test_a_range_that_is_too_long_tells_half_as_much_against_a_place():
+    """One range that fits a first place; by 0.15 m beyond all tolerance too long, or too short, for the others."""
+    anchor = np.array([[10.0, 0.0]])
+    one = ranges_at((0.0, 0.0, 0.0), anchor, (0.0, 0.0))
+    beyond = np.sqrt(0.5) * 0.1 + search.SURE * 0.15 + 0.15
+    centres = np.array([[0.0, 0.0], [beyond, 0.0], [-beyond, 0.0]])
+    assert finished(search._allowed(centres, 0.1, one)).tolist() == [True, True, False]
+
+
 def test_where_ranges_leave_too_many_places_no_place_is_tried():
     """One range of a hundred metres, wide as a house, in a field of a square kilometre."""
     one = ranges_at((0.0, 0.0, 0.0), np.array([[100.0, 0.0]]), (0.0, 0.0))

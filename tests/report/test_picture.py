@@ -43,6 +43,15 @@ def test_everything_is_on_it():
     np.testing.assert_array_equal(draw_map(drawn, caption="a room"), image)
 
 
+def test_a_path_ends_in_a_ring_that_is_open_for_half_of_its_width():
+    """A path of one place: the ring of its end lies on the disc of its start."""
+    image = draw_map(DrawnMap(room(), [np.array([[1.0, 3.0, 0.0]])]), size=600)
+    ring = np.abs(image[:-STRIP].astype(int) - PATHS[0]).max(axis=-1) < 12
+    rows, cols = np.flatnonzero(ring.any(axis=1)), np.flatnonzero(ring.any(axis=0))
+    hole = ~ring[(rows[0] + rows[-1]) // 2, cols[0] : cols[-1] + 1]
+    assert 0.4 < hole.mean() < 0.7
+
+
 def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
     grid = room()
     grid.log_odds[:40], grid.log_odds[40:] = -5.0, 5.0

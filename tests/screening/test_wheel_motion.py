@@ -7,6 +7,7 @@ from helpers.told import told
 from uwblite import se2
 from uwblite.screening import wheel_motion
 from uwblite.screening.wheel_motion import (
+    PairPolicy,
     Pairs,
     _chosen,
     _smooth_steps,
@@ -274,6 +275,12 @@ def test_a_robot_at_rest_whose_scans_differ_by_noise_stands(monkeypatch, moved, 
     by = iter([moved**2, rest**2])
     monkeypatch.setattr(wheel_motion, "misfits", lambda scans, mounting, first, second, motion: np.full(len(first), next(by)))
     assert len(wheel_motion.lost(log, compared)) == (not stands)
+
+
+def test_a_pair_matches_clearly_worse_at_twice_the_square_of_another_that_noise_allows():
+    least = PairPolicy.noise**2
+    one, other = least * np.array([2.1, 1.9, 21.0, 19.0, 1.1, 0.9]), least * np.array([1.0, 1.0, 10.0, 10.0, 0.0, 0.0])
+    assert wheel_motion._clearly_worse(one, other).tolist() == [True, False] * 3
 
 
 def test_the_factor_is_the_median_of_those_along_the_wheels_of_clear_motions():
