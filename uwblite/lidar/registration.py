@@ -21,7 +21,7 @@ from ..odometry.slips import FalseMotions
 from . import correlative_matching
 from .correlative_matching import CorrelativeConfig
 from .object_likelihood import ObjectLikelihood
-from .scan_matching import SINGULAR, CloudPairs, PairFactors, PairPolicy, limited, measured_part, nondegenerate_step
+from .scan_matching import SINGULAR, Aligned, CloudPairs, PairPolicy, limited, measured_part, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,24 +76,15 @@ class Prior(Table):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed(Table):
-    """Where descent ended, of e pairs."""
+class Placed(Aligned):
+    """Where descent ended, of e pairs; objects that move are left out of the factors."""
 
-    pose: Floats
-    """(e, 3) T_i_j."""
-    factors: PairFactors
-    """Of the matches there, objects that move left out."""
     information: Floats
     """(e, 3, 3) of the pose by the matches, without what the scatter of normals feigns."""
     likelihood: Floats
     """(e,) log likelihood of the source there, by that in unknown space."""
     most: Floats
     """(e,) the same where every point agreed."""
-
-    @property
-    def share(self) -> Floats:
-        """(e,) share of the points looked up that match, 0..1."""
-        return self.factors.share
 
     @property
     def shown(self) -> Bools:
