@@ -15,7 +15,7 @@ from uwblite.assessment.residual_tests import (
     check_range_scatter,
     check_support,
 )
-from uwblite.graph.calibration import scan_indices
+from uwblite.graph.calibration import LASER, indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.grid.geometry import GridGeometry
@@ -79,9 +79,8 @@ def judged(slip, scans=(), lidar=True, root=(100.0, 100.0, 1000.0), loop=False):
     pairs = [(k - span, k) for span in scans for k in range(20, 60)] + [(0, 79)] * loop
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     none = np.zeros((len(i), 3))
-    ties = ScanEdges(
-        i, j, se2.between(truth[i], truth[j]), np.tile(np.diag(root), (len(i), 1, 1)), none, none, scan_indices(Calibration())
-    )
+    information, names = np.tile(np.diag(root), (len(i), 1, 1)), indices(Calibration(), *LASER)
+    ties = ScanEdges(i, j, se2.between(truth[i], truth[j]), information, none, none, names)
     graph = Graph(truth, np.zeros((1, 2)), edges=(ties,) if len(i) else ())
     estimate = estimate_of(graph, odometry=wheels, placed=[not lidar])
     return list(check_odometry(estimate, task_of(recordings_of(truth, 50.0 + np.arange(80.0), lidar=lidar))))

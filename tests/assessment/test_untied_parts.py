@@ -10,7 +10,7 @@ from helpers.planted_tasks import estimate_of, recordings_of, task_of
 
 from uwblite import se2
 from uwblite.assessment.untied_parts import check_untied_parts, check_untied_recordings, untied_steps
-from uwblite.graph.calibration import scan_indices
+from uwblite.graph.calibration import LASER, indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.loop_closure.closures import no_closures
@@ -32,7 +32,7 @@ def measured(*spans):
 def scan_edge(i, j, root=(100.0, 100.0, 300.0)):
     none = np.zeros((1, 3))
     z = se2.between(POSES[[i]], POSES[[j]])
-    return ScanEdges(np.array([i]), np.array([j]), z, np.diag(root)[None], none, none, scan_indices(Calibration()))
+    return ScanEdges(np.array([i]), np.array([j]), z, np.diag(root)[None], none, none, indices(Calibration(), *LASER))
 
 
 def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from uwblite.graph.calibration import (
+    LASER,
     CalibrationConfig,
     block,
     indices,
     odometry_indices,
     prior_edges,
     range_indices,
-    scan_indices,
     unknowns,
     with_free,
 )
@@ -118,7 +118,7 @@ def test_tables_name_the_right_scalar_in_the_right_column():
             "sideways_per_metre",
             "ahead_per_sideways",
         ]
-    assert [calibration.keys[k].label for k in scan_indices(calibration)] == [
+    assert [calibration.keys[k].label for k in indices(calibration, *LASER)] == [
         "laser_x",
         "laser_y",
         "laser_theta",
@@ -133,7 +133,7 @@ def test_what_is_switched_off_has_index_minus_one():
     assert len(prior_edges(unknowns(nothing, IDS, GIVEN))) == 0
     assert np.all(range_indices(calibration, np.array([0, 1]), IDS) == -1)
     assert np.all(odometry_indices(calibration, 2) == -1)
-    assert np.all(scan_indices(calibration) == -1)
+    assert np.all(indices(calibration, *LASER) == -1)
     assert indices(calibration, "range_scale").tolist() == [-1]
 
 

@@ -25,3 +25,7 @@ def test_linked_are_poses_that_share_an_edge_with_the_next_one():
 def test_where_odometry_is_a_chain_only_its_links_count():
     """Two recordings, of three and two poses, and clouds matched within and across them."""
     assert linked(([0, 1, 3], [1, 2, 4]), ([2, 0, 1], [3, 4, 2])) == [True, True, False, True]
+
+
+def test_a_single_pose_is_linked_with_none():
+    assert linked_poses(1, []).shape == linked_poses(0, []).shape == (0,)

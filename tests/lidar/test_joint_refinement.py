@@ -11,7 +11,7 @@ from scipy import sparse
 
 from uwblite import se2
 from uwblite.arrays import rms_length
-from uwblite.graph.calibration import scan_indices
+from uwblite.graph.calibration import LASER, indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
@@ -310,7 +310,7 @@ def test_fewer_pairs_are_every_nth_from_the_middle_of_the_first_and_weigh_as_all
     far = [(k, k + 40) for k in range(30)]
     i, j = np.array(near + far).T
     still, root = np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1))
-    edges = ScanEdges(i, j, still, root, still, still, scan_indices(Calibration()))
+    edges = ScanEdges(i, j, still, root, still, still, indices(Calibration(), *LASER))
     (kept,) = with_fewer_pairs(Graph(np.zeros((80, 3)), edges=(edges,)), 8).edges
     gap = kept.j - kept.i
     assert kept.i[gap == 1].tolist() == list(range(10))
@@ -325,6 +325,6 @@ def test_a_single_step_or_none_weighs_as_all_pairs_near_it(steps):
     near = [(k, k + 3) for k in range(5)] + [(20, 21)] * steps
     i, j = np.array(near + [(k, k + 40) for k in range(30)]).T
     still, root = np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1))
-    edges = ScanEdges(i, j, still, root, still, still, scan_indices(Calibration()))
+    edges = ScanEdges(i, j, still, root, still, still, indices(Calibration(), *LASER))
     (kept,) = with_fewer_pairs(Graph(np.zeros((80, 3)), edges=(edges,)), 8).edges
     assert kept.own_weights[kept.j - kept.i == 1].tolist() == [6.0] * steps

@@ -5,7 +5,7 @@ import pytest
 from helpers.laser_walks import chained
 
 from uwblite import se2
-from uwblite.graph.calibration import scan_indices
+from uwblite.graph.calibration import LASER, indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.solver import SolverConfig
@@ -41,7 +41,7 @@ def scans(i, truth, along):
     """Return scan edges from keyframes i to the next with a standard deviation along the corridor, m; inf: none."""
     none, i = np.zeros((len(i), 3)), np.array(i)
     root = np.zeros((len(i), 3, 3)) + np.diag([1.0 / along, 50.0, 500.0])
-    return ScanEdges(i, i + 1, se2.between(truth[i], truth[i + 1]), root, none, none, scan_indices(Calibration()))
+    return ScanEdges(i, i + 1, se2.between(truth[i], truth[i + 1]), root, none, none, indices(Calibration(), *LASER))
 
 
 def moved(first, last):
@@ -146,7 +146,7 @@ def test_what_scan_edges_fix_is_told_step_by_step(seed):
     T = se2.between(truth[i], truth[j])
     T[:, 0] += off / root[:, 0, 0]
     none = np.zeros((size, 3))
-    edges = ScanEdges(i, j, T, root, none, none, scan_indices(Calibration()))
+    edges = ScanEdges(i, j, T, root, none, none, indices(Calibration(), *LASER))
     graph = Graph(truth, edges=(wheels, edges))
     agrees = np.abs(edges.residuals(graph)).max(axis=1) < LoopClosureConfig.agrees
     fixing = agrees & ~wide.any(axis=1)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
+from uwblite.graph.calibration import LASER, CalibrationConfig, block, indices, odometry_indices, unknowns
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
@@ -307,7 +307,7 @@ def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1
     if turned_round:
         i, j = np.where(i % 2, j, i), np.where(i % 2, i, j)
     none = np.zeros((STEPS, 3))
-    seen = ScanEdges(i, j, se2.between(truth[i], truth[j]), none[:, None] + np.eye(3), none, none, scan_indices(CALIBRATION))
+    seen = ScanEdges(i, j, se2.between(truth[i], truth[j]), none[:, None] + np.eye(3), none, none, indices(CALIBRATION, *LASER))
     return turn_scales(wheels, seen, Graph(truth, calibration=CALIBRATION))[INDEX]
 
 
@@ -340,7 +340,7 @@ def test_few_turns_show_nothing():
     truth = np.zeros((30, 3))
     wheels = chained(truth, np.full(3, NOISE_OF_TURNS))
     none = np.zeros((0, 3))
-    steps = ScanEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)), none, none, scan_indices(CALIBRATION))
+    steps = ScanEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)), none, none, indices(CALIBRATION, *LASER))
     assert turn_scales(wheels, steps, Graph(truth, calibration=CALIBRATION)) == {}
 
 
@@ -375,7 +375,7 @@ def test_drifts_by_way_and_time_are_no_scale():
     values[wheels.calibration[0, 2:4]] = 0.2, 0.05
     none = np.zeros((STEPS, 3))
     k = np.arange(STEPS)
-    seen = ScanEdges(k, k + 1, motion, none[:, None] + np.eye(3), none, none, scan_indices(CALIBRATION))
+    seen = ScanEdges(k, k + 1, motion, none[:, None] + np.eye(3), none, none, indices(CALIBRATION, *LASER))
     scale = turn_scales(wheels, seen, Graph(truth, calibration=replace(CALIBRATION, values=values)))[INDEX]
     assert scale.value == pytest.approx(0.1, abs=1e-9)
     assert scale.sigma < 1e-9

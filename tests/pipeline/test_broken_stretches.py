@@ -13,7 +13,7 @@ from helpers.told import told
 from uwblite import se2
 from uwblite.assessment.causes import explained
 from uwblite.constraints import Constraints
-from uwblite.graph.calibration import scan_indices
+from uwblite.graph.calibration import LASER, indices
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.scan_matching import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
@@ -83,7 +83,7 @@ def torn(estimate, task, by):
     one, none = np.array([k - 1]), np.zeros((1, 3))
     step = ScanEdges(
         one, one + 1, se2.between(poses[one], poses[one + 1]), np.diag([100.0, 100.0, 300.0])[None], none, none,
-        scan_indices(estimate.graph.calibration), kernel=joint.kernel,
+        indices(estimate.graph.calibration, *LASER), kernel=joint.kernel,
     )  # fmt: skip
     joint = joint.followed_by(step)
     graph = replace(estimate.graph, poses=poses)

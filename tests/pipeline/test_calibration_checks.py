@@ -12,12 +12,13 @@ from helpers.told import doubted, warned
 from uwblite import se2
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.calibration import (
+    LASER,
     OMNI,
     CalibrationConfig,
     block,
+    indices,
     odometry_indices,
     prior_edges,
-    scan_indices,
     unknowns,
     with_free,
 )
@@ -63,7 +64,7 @@ def judged(true, used):
     wheels.motion[:, 2] = wheels.motion[:, 2] / (1.0 + true) + 0.005 * rng.standard_normal(STEPS)
     i, none = np.arange(STEPS), np.zeros((STEPS, 3))
     root = np.zeros((STEPS, 3, 3)) + np.eye(3)
-    steps = ScanEdges(i, i + 1, se2.between(truth[:-1], truth[1:]), root, none, none, scan_indices(CALIBRATION))
+    steps = ScanEdges(i, i + 1, se2.between(truth[:-1], truth[1:]), root, none, none, indices(CALIBRATION, *LASER))
     values = CALIBRATION.values.copy()
     values[INDEX] = used
     free = np.zeros(len(values), dtype=bool)
@@ -110,7 +111,7 @@ def slipping(slip, mounted, given=True):
     object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
     i, none = np.arange(STEPS), np.zeros((STEPS, 3))
     seen = se2.between(lidar[:-1], lidar[1:]) + 0.003 * rng.standard_normal((STEPS, 3))
-    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, scan_indices(CALIBRATION))
+    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, indices(CALIBRATION, *LASER))
     graph = Graph(truth, edges=(prior_edges(listed),), calibration=CALIBRATION)
     graph = with_free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), "laser_x", "laser_y")
     estimate = Estimate(graph, wheels, None, (), steps=steps)
@@ -165,7 +166,7 @@ def test_wheels_that_go_crooked_to_the_side_do_not_turn_the_lidar(crooked):
     object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
     i, none = np.arange(STEPS), np.zeros((STEPS, 3))
     seen = se2.between(truth[:-1], truth[1:]) + 0.003 * rng.standard_normal((STEPS, 3))
-    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, scan_indices(CALIBRATION))
+    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, indices(CALIBRATION, *LASER))
     graph = Graph(truth, edges=(prior_edges(listed),), calibration=CALIBRATION)
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
     graph = with_free(graph, *OMNI, "laser_theta").with_edges(wheels, steps)
@@ -281,7 +282,7 @@ def walked(offsets, made_with=0.0, noise=0.002):
     i = np.arange(WALKED)
     steps = ScanEdges(
         i, i + 1, se2.between(seen[:-1], seen[1:]) + noise * rng.standard_normal((WALKED, 3)),
-        np.tile(np.eye(3) / noise, (WALKED, 1, 1)), velocity[:-1], velocity[1:], scan_indices(LISTED_BLOCK), made_with,
+        np.tile(np.eye(3) / noise, (WALKED, 1, 1)), velocity[:-1], velocity[1:], indices(LISTED_BLOCK, *LASER), made_with,
     )  # fmt: skip
     free = np.array([u.key.kind not in ("laser_delay", "heading_scale", "odometry_scale") for u in LISTED])
     graph = Graph(truth, edges=(prior_edges(LISTED),), calibration=LISTED_BLOCK, fixed_calibration=free)

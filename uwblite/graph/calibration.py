@@ -180,11 +180,6 @@ def odometry_indices(calibration: Calibration, edges: int) -> Ints:
     return np.broadcast_to(indices(calibration, *WHEELS), (edges, len(WHEELS)))
 
 
-def scan_indices(calibration: Calibration) -> Ints:
-    """Return the (4,) calibration indices of ScanEdges."""
-    return indices(calibration, *LASER)
-
-
 def with_free(graph: Graph, *kinds: str) -> Graph:
     """Return the graph with the calibration unknowns of these kinds set free."""
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))

@@ -15,7 +15,7 @@ from scipy import sparse
 from .. import se2
 from ..arrays import WIDE, Bools, Floats, Ints, chunks, run_starts
 from ..config import setting
-from ..graph.calibration import scan_indices
+from ..graph.calibration import LASER, indices
 from ..graph.graph import Graph
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
@@ -159,7 +159,7 @@ def unmeasured(graph: Graph, i: Ints, j: Ints, twist: Floats, delay: float) -> S
     # millimetre per pair, always to the same side. With every other pair exchanged, this averages out.
     turned = i % 2 == 1
     i, j = np.where(turned, j, i), np.where(turned, i, j)
-    none, names = np.broadcast_to(0.0, (len(i), *se2.POSE, *se2.POSE)), scan_indices(graph.calibration)
+    none, names = np.broadcast_to(0.0, (len(i), *se2.POSE, *se2.POSE)), indices(graph.calibration, *LASER)
     return ScanEdges(i, j, none[:, 0], none, twist[i], twist[j], names, delay, kernel=RefinementConfig.kernel)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools
-from ..graph.calibration import LASER, TURNING, scan_indices, with_free
+from ..graph.calibration import LASER, TURNING, indices, with_free
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
@@ -103,7 +103,7 @@ def _solved_with(steps: Steps, estimate: Estimate, task: Task) -> Estimate:
     """Return the optimum of odometry, weakly weighted ranges and the steps that descent from the odometry measured."""
     scans, twist = estimate.lidar, task.recordings.twist
     found = scan_to_scan.descended_edges(scans.raster, steps)
-    names = scan_indices(estimate.graph.calibration)
+    names = indices(estimate.graph.calibration, *LASER)
     i, j, kernel = found.i, found.j, estimate.odometry.kernel
     root = found.sqrt_information
     edges = ScanEdges(i, j, found.T_i_j, root, twist[i], twist[j], names, scans.delay, kernel=kernel)
