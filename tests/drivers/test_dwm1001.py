@@ -8,6 +8,7 @@ from emulators.dwm_device import BANNER, DwmDevice, DwmOptions
 from emulators.world import Epoch, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, good
 
+from uwblite.drivers.dwm1001_driver import Dwm1001Driver
 from uwblite.drivers.dwm1001_tlv import Answer, Distances, NodeConfig, Position, Status, TlvProtocol, UpdateRate, Value
 from uwblite.drivers.events import RangeReading
 
@@ -179,3 +180,13 @@ def test_emulator_repeats_the_last_command_on_an_empty_line(module):
     module.receive(b"\r\r", 2.0)
     first = module.receive(b"nmg\r", 3.0)
     assert module.receive(b"\r", 4.0)[2:] == first[5:]
+
+
+@pytest.mark.parametrize(("network", "shown", "said"), [(0, "0x0000", True), (0xBACA, "0xBACA", False), (None, None, False)])
+def test_a_network_without_an_id_is_an_error(network, shown, said):
+    driver = Dwm1001Driver()
+    if network is not None:
+        driver.values["pan_id"] = network
+    identity = driver.identity()
+    assert dict(identity.details).get("network") == shown
+    assert ("no-network-id" in {note.name for note in identity.findings}) is said

@@ -88,8 +88,8 @@ class Placed(Aligned):
 
     @property
     def shown(self) -> Bools:
-        """(e,) whether so many points match that a pose follows from them."""
-        return np.asarray(self.factors.matched >= RegistrationConfig.fewest)
+        """(e,) whether so many points match that a pose follows, and it is likelier than in space that nobody has seen."""
+        return np.asarray((self.factors.matched >= RegistrationConfig.fewest) & (self.likelihood > 0.0))
 
     def covariance(self, prior: Gaussian) -> Floats:
         """Return the covariance (e, 3, 3) of the poses by matches and prior."""

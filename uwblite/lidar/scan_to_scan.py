@@ -151,7 +151,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
     rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (~good | (alone < 0.0))
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
-    edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & _shown(mode) & ~rejected), variance))
+    edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & mode.shown & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
     miss = _miss(raster.clouds, noise)
     return ScanOdometry(
@@ -175,11 +175,6 @@ def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph)
 def _as_edges(first: Ints, placed: Placed, rows: Ints, variance: float) -> RelativePoseEdges:
     """Return some steps (r,) from keyframes first (e,) as what their matches measure."""
     return RelativePoseEdges(first[rows], first[rows] + 1, *placed.rows(rows).measured(variance))
-
-
-def _shown(placed: Placed) -> Bools:
-    """Return which clouds (e,) are likelier to lie there than in space that nobody has seen."""
-    return np.asarray(placed.shown & (placed.likelihood > 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +214,7 @@ def _decided(
         best = int(np.argmax(score.max(axis=0)))
         if score[:, best].max() > 0.0:
             moved[row], choice[row], chain[row] = True, own[best], some.pose[best]
-        tied[row] = _shown(found.candidates.rows(choice[row : row + 1]))[0]
+        tied[row] = found.candidates.rows(choice[row : row + 1]).shown[0]
     return found, _Choice(found.candidates.rows(choice), moved, log_odds)
 
 
