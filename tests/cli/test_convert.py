@@ -35,6 +35,7 @@ def test_a_log_goes_to_a_bag_and_back(short_log, tmp_path, capsys, storage):
     listed = capsys.readouterr().out
     assert "/scan" in listed
     assert "<- ranges" in listed
+    assert main(["convert", str(bag), "--list", "--json"]) == json.loads(capsys.readouterr().out)["exit_code"] == 0
     assert main(["convert", str(bag), str(back)]) == 0
     one, two = read_log(short_log), read_log(back)
     one = one.crop(end=one.odometry.stamps[0] + 15.0)

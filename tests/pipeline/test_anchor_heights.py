@@ -103,3 +103,14 @@ def test_recordings_refute_high_anchors_together_each_that_has_other_anchors(hei
     each = [replace(alone(height), anchor_ids=tuple(own)) for height, own in zip(heights, ids, strict=True)]
     assert range_alternatives._refuted(each, MappingConfig()) is refuted
     assert not range_alternatives._refuted([replace(own, ranges=None) for own in each], MappingConfig())
+
+
+def test_lengths_that_a_wrong_unit_stretched_are_scaled_back_where_anchors_are_raised():
+    graph = alone(0.0).problem
+    scales = graph.calibration.of_kinds("odometry_scale")
+    values = np.where(scales, 0.25, graph.calibration.values)
+    stretched = graph.updated(graph.poses * np.array([1.25, 1.25, 1.0]), 1.25 * graph.anchors, values)
+    raised = range_alternatives.raise_anchors(stretched, MappingConfig().calibration)
+    np.testing.assert_allclose(raised.poses, graph.poses, atol=1e-12)
+    np.testing.assert_allclose(raised.anchors, graph.anchors, atol=1e-12)
+    assert not raised.calibration.values[scales].any()
