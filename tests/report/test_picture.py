@@ -10,7 +10,7 @@ from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, rgb, text_mask
 from uwblite.report.drawn_map import DrawnAnchor, DrawnClosure, DrawnMap
-from uwblite.report.picture import FLOOR, INK, PAPER, WALL, Key, _paste, draw_errors, draw_map, rows_of
+from uwblite.report.picture import FLOOR, INK, PAPER, WALL, Key, _paste, draw_errors, draw_map, rows_of, side_by_side
 from uwblite.report.svg_map import round_length
 
 
@@ -264,3 +264,12 @@ def test_an_ellipse_is_of_two_standard_deviations_on_every_side_of_its_anchor():
     ink = np.argwhere(mark)[:, ::-1].mean(axis=0)
     assert extent[0] / extent[1] == pytest.approx(2.5, rel=0.1)
     np.testing.assert_allclose([(cols.min() + cols.max()) / 2, (rows.min() + rows.max()) / 2], ink, atol=0.1 * extent[1])
+
+
+def test_pictures_side_by_side_are_as_high_as_the_highest():
+    low, high = np.full((3, 4, 3), 7, np.uint8), np.full((5, 2, 3), 9, np.uint8)
+    both = side_by_side([low, high])
+    assert both.shape == (5, 6, 3)
+    np.testing.assert_array_equal(both[:3, :4], low)
+    np.testing.assert_array_equal(both[:, 4:], high)
+    assert np.all(both[3:, :4] == FLOOR)
