@@ -119,6 +119,25 @@ def _apart(columns: Floats, weight: Floats) -> Floats:
     return np.asarray(columns[~np.tril(within, -1).any(axis=1)])
 
 
+def nearest_rims(columns: Floats, at: Floats) -> tuple[Ints, Floats]:
+    """Return the column (p,) whose rim is nearest to each of points (p, 2), and the distance to it, m; negative within it.
+
+    Parameters
+    ----------
+    columns : (c, 3), c > 0, x, y, radius. Those of nearest centres are compared, until no wider one can be nearer.
+    """
+    tree, widest, compared = cKDTree(columns[:, :2]), float(columns[:, 2].max()), 1
+    which, away, left = np.zeros(len(at), dtype=np.intp), np.zeros(len(at)), np.arange(len(at))
+    while len(left):
+        compared = min(2 * compared, len(columns))
+        centre, near = tree.query(at.take(left, axis=0), np.arange(compared) + 1)
+        rim = centre - columns[near, 2]
+        best = rim.argmin(axis=1)[:, None]
+        which[left], away[left] = (np.take_along_axis(v, best, axis=1)[:, 0] for v in (near, rim))
+        left = left[(centre[:, -1] - widest < away[left]) & (compared < len(columns))]
+    return which, away
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
     """Columns and the squares of the map near them: few points of a map lie there, and only these are tested."""
@@ -133,7 +152,10 @@ class Surroundings:
     """(x, y) whether a square is near a column; the outermost ones are not."""
 
     def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
-        """Return the rows (n,) of points (p, 2) in squares near a column, the column of nearest centre, and its distance, m."""
+        """Return the rows (n,) of points (p, 2) in squares near a column, the column of nearest rim, and its distance, m.
+
+        It is negative within a column.
+        """
         x, y = (
             np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.intp)
             for k in range(2)
@@ -141,14 +163,13 @@ class Surroundings:
         rows = np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
         if not len(rows):
             return rows, rows, np.zeros(0)
-        away, which = cKDTree(self.columns[:, :2]).query(at.take(rows, axis=0))
-        return rows, which, away
+        return rows, *nearest_rims(self.columns, at.take(rows, axis=0))
 
     def on_rim(self, at: Floats, margin: float) -> Bools:
         """Return which points (p, 2) are nearer to a column's rim than a margin, m."""
-        rows, which, away = self.nearest(at)
+        rows, _, away = self.nearest(at)
         found = np.zeros(len(at), dtype=bool)
-        found[rows] = np.abs(away - self.columns[which, 2]) < margin
+        found[rows] = np.abs(away) < margin
         return found
 
 
@@ -167,8 +188,8 @@ def surroundings(columns: Floats, margin: float) -> Surroundings:
 
 def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> SurfaceRays:
     """Return the rays from poses (k, 3) that end near columns."""
-    rows, which, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
-    return rays.rows(rows[away < columns.columns[which, 2] + ShapePolicy.around])
+    rows, _, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
+    return rays.rows(rows[away < ShapePolicy.around])
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
@@ -176,7 +197,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     if not len(columns):
         return rays.rows(slice(0))
     c, (at, direction) = ColumnPolicy, rays.in_map(poses)
-    nearest = cKDTree(columns[:, :2]).query(at)[1]
+    nearest, _ = nearest_rims(columns, at)
     shift, _, incidence = to_circle(at - columns[:, :2].take(nearest, axis=0), direction, columns[:, 2].take(nearest))
     good = (incidence < -c.incidence) & (np.abs(shift) < c.gate * rays.sigma + ShapePolicy.uneven)
     return replace(rays, surface=nearest + first).rows(good)
@@ -187,7 +208,7 @@ def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
     if not len(columns):
         return columns
     c, (at, direction), sigma = ColumnPolicy, rays.in_map(poses), rays.sigma.astype(np.float64)
-    own, weight = cKDTree(columns[:, :2]).query(at)[1], 1.0 / sigma**2
+    own, weight = nearest_rims(columns, at)[0], 1.0 / sigma**2
     for turn in range(c.steps):
         centre, radius = columns[:, :2].take(own, axis=0), columns[:, 2].take(own)
         shift, normal, incidence = to_circle(at - centre, direction, radius)
