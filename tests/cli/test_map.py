@@ -1,6 +1,7 @@
 """`uwblite map` and `uwblite check` on the sample recording, end to end."""
 
 import contextlib
+import gzip
 import io
 import json
 import re
@@ -123,6 +124,14 @@ def test_a_corrected_log_is_refused_before_the_work_where_it_cannot_be_written(r
         assert main(["map", *words]) == 2
         assert why in capsys.readouterr().err
     assert not (tmp_path / "map").exists()
+
+
+def test_a_corrected_log_without_scans_is_said(short_log, tmp_path, capsys):
+    lines = gzip.decompress(short_log.read_bytes()).splitlines(keepends=True)
+    (tmp_path / "in.log").write_bytes(b"".join(line for line in lines if b"LASER" not in line))
+    words = [str(tmp_path / "in.log"), "--out", str(tmp_path / "map"), "--corrected-log", str(tmp_path / "out.log")]
+    assert main(["map", *words]) in (0, 3)
+    assert "out.log has no scans" in capsys.readouterr().err
 
 
 def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):

@@ -75,3 +75,17 @@ def test_poses_are_asked_in_the_middle_of_the_scan_at_the_lidars_clock():
     np.testing.assert_allclose(robot[0], robot_at(np.array([2.1]))[0], atol=1e-3)
     np.testing.assert_allclose(se2.between(robot[0], laser[0]), MOUNT, atol=1e-9)
     assert np.isnan(robot[1]).all()
+
+
+def test_raw_scans_become_scans_with_poses_where_the_log_has_no_others(tmp_path):
+    raw = "RAWLASER1 0 -1 2 1 8 0.01 0 3 1.0 2.0 3.0 1 7 {0} robot {0}\n"
+    lines = ["PARAM robot_frontlaser_offset 0.2 0 r 0\n", *(raw.format(k) for k in range(5)), "RAWLASER1 0 -1\n"]
+    (tmp_path / "in.log").write_text("".join(lines))
+    assert write_corrected_log(tmp_path / "out.log", str(tmp_path / "in.log"), poses_at) == (5, 1)
+    log = read_log(tmp_path / "out.log")
+    np.testing.assert_allclose(log.odometry.poses, robot_at(np.arange(5.0)), atol=1e-6)
+    np.testing.assert_allclose(log.mounting.T_base_laser, MOUNT, atol=3e-6)
+    np.testing.assert_allclose(log.scans.ranges, np.broadcast_to([1.0, 2.0, 3.0], (5, 3)))
+    (tmp_path / "in.log").write_text("".join([LINES, *lines]))
+    assert write_corrected_log(tmp_path / "out.log", str(tmp_path / "in.log"), poses_at) == (2, 2)
+    assert "RAWLASER1" not in (tmp_path / "out.log").read_text()

@@ -74,6 +74,8 @@ def _write_corrected_log(args: argparse.Namespace, made: Made) -> None:
             f"uwblite: {args.corrected_log} has {written} scans; {left_out} laser messages are broken or outside the "
             "trajectory's time and were left out"
         )
+    elif not written:
+        console.note(f"uwblite: {args.corrected_log} has no scans: the log has no FLASER, ROBOTLASER1 or RAWLASER1 messages")
 
 
 def _make_shown(args: argparse.Namespace, recordings: Recordings) -> Made:

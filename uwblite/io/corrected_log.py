@@ -22,7 +22,9 @@ from .stored_result import StoredResult
 PosesAt = Callable[[Floats], tuple[Floats, Floats]]
 """Returns the poses of laser and robot (n, 3) in the map at stamps (n,) of scans, s; nan where there is none."""
 
-_LASER = (b"FLASER", b"ROBOTLASER1")
+_POSED, _RAW = (b"FLASER ", b"ROBOTLASER1 "), (b"RAWLASER1 ",)
+_UNPOSED = [b"0"] * 11
+"""Words of ROBOTLASER1 that RAWLASER1 lacks: poses of laser and robot, speeds, safety distances, turn axis."""
 _KEPT = (b"PARAM", b"#")
 _ODOM_WITHOUT_IPC = 9
 """Words of an ODOM line that leaves out ipc_timestamp."""
@@ -32,7 +34,8 @@ def write_corrected_log(path: str | os.PathLike[str], source: str, poses_at: Pos
     """Write the laser messages of a CARMEN log with corrected poses; PARAM lines and comments stay, all else is left out.
 
     FLASER gets the corrected pose of the laser and keeps the odometry's pose behind it; ROBOTLASER1 gets those of laser and
-    robot, whose difference is the mounting. Readings and stamps stay as they are.
+    robot, whose difference is the mounting. Readings and stamps stay as they are. RAWLASER1, which has no poses, becomes
+    ROBOTLASER1 where the log has no other laser messages.
 
     Parameters
     ----------
@@ -42,14 +45,17 @@ def write_corrected_log(path: str | os.PathLike[str], source: str, poses_at: Pos
     -------
     Scans written, and laser messages left out: broken ones, and those at times at which the map knows no pose.
     """
-    written = left_out = 0
-    with replacing(path) as stream:
-        for part in parts_of(source)[0]:
-            with open_source(part) as text:
-                for lines, missing in _corrected(text.blocks(), poses_at):
-                    stream.write(b"".join(lines))
-                    written += sum(line.startswith(_LASER) for line in lines)
-                    left_out += missing
+    for kinds in (_POSED, _RAW):
+        written = left_out = 0
+        with replacing(path) as stream:
+            for part in parts_of(source)[0]:
+                with open_source(part) as text:
+                    for lines, missing in _corrected(text.blocks(), kinds, poses_at):
+                        stream.write(b"".join(lines))
+                        written += sum(line.startswith(_POSED) for line in lines)
+                        left_out += missing
+        if written or left_out:
+            break
     return written, left_out
 
 
@@ -74,8 +80,8 @@ def poses_of_scans(result: MapResult, log: SensorLog, stamps: Floats) -> tuple[F
     return se2.compose(robot, se2.compose(correction, log.mounting.T_base_laser)), robot
 
 
-def _corrected(blocks: Iterator[bytes], poses_at: PosesAt) -> Iterator[tuple[list[bytes], int]]:
-    """Yield the lines of each block as they are to be written, and how many laser messages are left out of it."""
+def _corrected(blocks: Iterator[bytes], kinds: tuple[bytes, ...], poses_at: PosesAt) -> Iterator[tuple[list[bytes], int]]:
+    """Yield the lines of each block as they are to be written, and how many laser messages of some kinds are left out."""
     ipc_left_out = False
     for block in blocks:
         kept: list[bytes | tuple[list[bytes], int]] = []
@@ -85,10 +91,12 @@ def _corrected(blocks: Iterator[bytes], poses_at: PosesAt) -> Iterator[tuple[lis
                 kept.append(line)
             elif line.startswith(b"ODOM "):
                 ipc_left_out = len(line.split()) == _ODOM_WITHOUT_IPC
-            elif line.startswith(tuple(name + b" " for name in _LASER)):
+            elif line.startswith(kinds):
                 try:
                     words = line.split()
                     place, stamp = _poses_in(words, ipc_left_out)
+                    if kinds == _RAW:
+                        words = [b"ROBOTLASER1", *words[1:place], *_UNPOSED, *words[place:]]
                     kept.append((words, place))
                     stamps.append(stamp)
                 except (ValueError, IndexError):
