@@ -63,6 +63,15 @@ def test_odometry_alone_is_enough_and_order_does_not_matter(tmp_path):
     assert log.scans is None
 
 
+def test_a_sensor_with_a_header_alone_was_not_there(tmp_path):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / "gyro.csv").write_text("stamp,heading\n")
+    (tmp_path / "ranges.csv").write_text("stamp,anchor,range\n")
+    log = read_csv_folder(tmp_path)
+    assert log.gyro is None
+    assert log.ranges is None
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

@@ -124,8 +124,8 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     ranges, scans, gyro = (path / f"{name}.csv" for name in ("ranges", "scans", "gyro"))
     radio = read.ranges(ranges) if ranges.exists() else None
     lidar = read.scans(scans, sensors.scans) if scans.exists() else None
-    turns = read.table(gyro, ("stamp", "heading"), "gyro") if gyro.exists() else None
-    heading = None if turns is None else Gyro(turns[:, 0].copy(), np.unwrap(turns[:, 1]))
+    turns = read.table(gyro, ("stamp", "heading"), "gyro", empty=True) if gyro.exists() else np.zeros((0, 2))
+    heading = Gyro(turns[:, 0].copy(), np.unwrap(turns[:, 1])) if len(turns) else None
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
     notes = LogNotes(source=os.fspath(folder), sha256=read.digest.hexdigest(), warnings=tuple(read.warnings))
