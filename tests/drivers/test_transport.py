@@ -21,6 +21,14 @@ def test_a_port_that_does_not_open_is_explained(tmp_path, url, error, words):
     assert _explain(url.format(own=own), error).startswith(words.format(own=own))
 
 
+@pytest.mark.parametrize("name", ["clock", "Permission", "configure port"])
+def test_words_of_a_ports_own_path_explain_nothing(tmp_path, name):
+    own = tmp_path / name
+    own.touch()
+    text = f"could not open port {own}: input/output error"
+    assert _explain(str(own), OSError(5, text)).startswith(f"{own}: cannot open ([Errno 5] could not open")
+
+
 def test_a_port_that_is_not_there_names_those_that_are(tmp_path, monkeypatch):
     monkeypatch.setattr(transport, "BY_ID", tmp_path / "none")
     assert _explain(f"{tmp_path}/ttyUSB7", OSError("no such file")).endswith("ttyUSB7: no such port; nothing is plugged in")

@@ -62,7 +62,7 @@ class Recorder:
                 now = self._now()
                 if until is not None and now >= until:
                     break
-                self._wait(now, next_look if until is None else min(next_look, until))
+                self._serve(now, next_look if until is None else min(next_look, until))
                 if now >= next_look:
                     self._housekeeping(now)
                     opening = any(link.opening for link in self.links)
@@ -74,8 +74,8 @@ class Recorder:
             self.end = self._now()
             self._finish()
 
-    def _wait(self, now: float, until: float) -> None:
-        """Wait for bytes or the next deadline, and serve whatever was due at time `now`, s.
+    def _serve(self, now: float, until: float) -> None:
+        """Read the devices when bytes come, at most until a time, s, and send what was due at time `now`, s.
 
         All that had come by then was read: where this computer stood still, no device was silent.
         """

@@ -231,15 +231,16 @@ def absent_port(url: str) -> str:
 def _explain(url: str, error: Exception) -> str:
     """Say how to mend a port that does not open."""
     path, text = Path(url), str(error)
+    why = text.replace(url, "")
     if absent := absent_port(url):
         return absent
     if "://" in url:
         return f"{url}: cannot open ({text})"
-    if "Permission" in text or getattr(error, "errno", None) == 13:
+    if "Permission" in why or getattr(error, "errno", None) == 13:
         return f"{url}: no permission; run `sudo usermod -aG dialout $USER`, log out and in again"
-    if "lock" in text or getattr(error, "errno", None) in (11, 16):
+    if "lock" in why or getattr(error, "errno", None) in (11, 16):
         return f"{url}: another program has it open (ModemManager, a terminal, another recorder); stop that first"
-    if path.is_char_device() and "configure port" in text:
+    if path.is_char_device() and "configure port" in why:
         return f"{url}: not a serial port"
     return f"{url}: cannot open ({text})"
 
