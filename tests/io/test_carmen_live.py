@@ -45,6 +45,16 @@ def test_measurements_come_in_the_order_in_which_they_were_complete():
     assert [m.order for m in found] == sorted(m.order for m in found)
 
 
+def test_what_follows_a_clock_that_was_set_back_comes_behind_what_was_written_before():
+    """One piece of a log that is followed holds both: sorted by time, the robot would drive back."""
+    earlier = TEXT
+    for stamp in (b"1.0", b"1.1", b"1.15", b"1.18", b"1.2", b"1.3", b"1.4"):
+        earlier = earlier.replace(stamp + b" h " + stamp + b"\n", b"0.%s h 0.%s\n" % (stamp[2:], stamp[2:]))
+    whole, (first, reader) = measured([TEXT])[0], measured([TEXT + b"\r\n\n" + earlier])
+    assert [m.order for m in first] == [m.order for m in whole] + [pytest.approx(m.order - 1.0) for m in whole]
+    assert reader.broken == 2
+
+
 def test_a_line_in_pieces_is_one_line():
     reader = LiveReader()
     reader.feed(b"x" * 5)

@@ -7,6 +7,7 @@ import os
 from array import array
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +54,7 @@ class LiveReader:
         return self._reader.params.mounting(self._T_base_laser, self._reader.tags)
 
     def feed(self, data: bytes) -> list[Measured]:
-        """Take a piece of text and return the measurements of its whole lines, sorted by time."""
+        """Take a piece of text and return the measurements of its whole lines, sorted by time as far as a clock goes on."""
         text = self._rest + data
         cut = text.rfind(b"\n") + 1
         self._rest = text[cut:]
@@ -68,9 +69,14 @@ class LiveReader:
         reader.handlers[b"PARAM"] = reader.params.take
         reader.laser.ipc_left_out = before.laser.ipc_left_out
         reader.feed(lines)
+        poses, turns = np.array(reader.odometry).reshape(-1, 5), np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
+        set_back = poses[1:, 4][np.diff(poses[:, 0]) < 0.0].astype(int) - 1
+        if len(set_back):
+            rows = lines.split(b"\n")[:-1]
+            parts = pairwise([0, *set_back.tolist(), len(rows)])
+            return [measured for a, b in parts for measured in self._taken(b"\n".join(rows[a:b]) + b"\n")]
         self._reader, self.broken = reader, self.broken + reader.broken
-        poses, turns = np.array(reader.odometry).reshape(-1, 5)[:, :4], np.array(reader.gyro).reshape(-1, 3)[:, :2].tolist()
-        measurements = [Measured("odometry", float(row[0]), float(row[0]), row[1:]) for row in poses]
+        measurements = [Measured("odometry", float(row[0]), float(row[0]), row[1:4]) for row in poses]
         measurements += [*self._ranges(reader), *self._scans(reader)]
         measurements += (Measured("gyro", t, t, heading) for t, heading in turns)
         return sorted(measurements, key=lambda measured: measured.order)
