@@ -31,8 +31,8 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
             metres = float(np.hypot(*(pose[:2] - place)))
             window.entries.append(WindowRange(a, metres, pose, np.zeros(2), 0.2 * k, 0.1 * k))
     places, driven = PlaceSearch(known), np.array([1.0, 0.3, 0.4])
-    nobody = hypotheses.none(4)
-    places.begin(window, path[-1], 4.0)
+    nobody, candidates = hypotheses.none(4), path[-1] + [[0.9, 0.7, 0.5]]
+    places.begin(window, path[-1], 4.0, candidates)
     now = se2.compose(path[-1], driven)
     found = None
     while not places.idle:
@@ -42,5 +42,8 @@ def test_a_search_that_was_driven_through_compares_in_the_present_frame():
     best = found.bank.poses[np.argmax(found.weight)]
     # Odometry and map have one frame here, and the ranges are exact.
     np.testing.assert_allclose(se2.between(now, best), 0.0, atol=0.05)
+    # One that was there before is refined as those that are found.
+    assert len(found.bank) > 1
+    assert not hypotheses.apart(best, found.bank.poses[-1])
     error = range_errors(best[None], found.ranges)[0]
     np.testing.assert_allclose(error, 0.0, atol=0.1)

@@ -78,10 +78,16 @@ class PlaceSearch:
         """Whether no search is under way."""
         return self._steps is None
 
-    def begin(self, window: Window, odom: Floats, way: float) -> None:
-        """Begin to search the whole map with the measurements of a window, at a pose (3,) and way, m, of the odometry."""
+    def begin(self, window: Window, odom: Floats, way: float, candidates: Floats) -> None:
+        """Begin to search the whole map with the measurements of a window, at a pose (3,) and way, m, of the odometry.
+
+        Parameters
+        ----------
+        candidates : (c, 3) poses that are compared beside those that the search finds, by the same measurements.
+        """
         self._odom = odom.copy()
-        self._steps = self._compared(window.ranges_since(self._anchors, odom, way), *window.seen(odom, way, LOOK_BACK))
+        ranges = window.ranges_since(self._anchors, odom, way)
+        self._steps = self._compared(ranges, *window.seen(odom, way, LOOK_BACK), candidates)
 
     def drop(self) -> None:
         """Cancel a running search."""
@@ -107,16 +113,17 @@ class PlaceSearch:
             return self._brought(end.value, bank, odom), done
         return None, done
 
-    def _compared(self, ranges: Ranges, rays: Rays, ago: Floats) -> Generator[int, None, Comparison]:
-        """Search for places and weight them, and the present hypotheses, by rays (p,) of so many metres ago.
+    def _compared(self, ranges: Ranges, rays: Rays, ago: Floats, candidates: Floats) -> Generator[int, None, Comparison]:
+        """Search for places and weight them, candidates (c, 3) and the present hypotheses, by rays (p,) of so many metres ago.
 
         In the bank of the comparison are the new places alone.
         """
         found = yield from search.places(self._field, rays, ranges, self._bounds)
         parts = []
         match = hypotheses.MATCHES * PER_FACTOR * min(len(rays.hit), TRACK_RAYS)
-        for part in search.units(max(len(found.poses), 1), match):
-            parts.append(self._started(found.poses[part], ranges, rays))
+        tried = np.concatenate([found.poses, candidates[hypotheses.apart(candidates[:, None], found.poses).all(axis=1)]])
+        for part in search.units(max(len(tried), 1), match):
+            parts.append(self._started(tried[part], ranges, rays))
             yield match * len(parts[-1])
         started = concatenated(parts)
         before, poses = len(self._present), np.concatenate([self._present, started.poses])

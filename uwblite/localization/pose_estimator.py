@@ -87,6 +87,9 @@ class PoseEstimator:
         """Whether one was tracked before."""
         self._odometer = odometer
         self._bank = hypotheses.none(len(anchors.ids))
+        self._anew = False
+        """Whether hypotheses begin anew with the running search, which scans determine: single ranges move a filter that began
+        with ten metres along a wall to a place that is none. By ranges alone they hold more than the window does."""
         self._places = PlaceSearch(known)
         self._searched_ranges = 0
         """Ranges that had come when the running search began."""
@@ -176,7 +179,7 @@ class PoseEstimator:
             self._places.drop()
             self._search_stamp = -np.inf
         if free and not self._places.idle:
-            compared, done = self._places.advance(self._bank, odom)
+            compared, done = self._places.advance(self._bank.rows(slice(0 if self._anew else None)), odom)
             self.work += done
             if compared is None:
                 return
@@ -191,7 +194,8 @@ class PoseEstimator:
             # wrong place by chance.
             window = self._window.since(self._running.matched) if self.tracks else self._window
             self._searched_ranges = len(window.ranges)
-            self._places.begin(window, odom, self._way)
+            self._anew = not self.tracks and bool(window.looks)
+            self._places.begin(window, odom, self._way, self._bank.poses if self._anew else self._bank.poses[:0])
 
     def state(self, wheels: Floats) -> LocalizerState:
         """Return the pose at the time of the last odometry, which is wheels (3,) in the odometry frame."""
