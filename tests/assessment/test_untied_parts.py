@@ -111,6 +111,20 @@ def test_steps_in_which_the_wheels_slip_are_tied_by_scans_that_leave_no_directio
     assert untied_steps(estimate_of(graph, odometry=wheels), recordings_of(POSES, STAMPS)).tolist() == found
 
 
+@pytest.mark.parametrize(("first", "last"), [((47, 51), (51, 55)), ((0, 20), (75, 95))])
+def test_directions_that_matches_leave_free_scatter_and_measure_no_slip(first, last):
+    """Of neighbours, and of 400 pairs of two visits along one wall."""
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(*first), np.arange(*last)))
+    wheels = chained(POSES, np.array([0.01, 0.01, 0.003]))
+    wheels.motion[50, 0] += 2.0
+    free, root = 0.02 * np.random.default_rng(1).standard_normal(len(i)), np.zeros((len(i), 3, 3))
+    root[:, 0, :2], root[:, 1, 2] = 100.0 * np.column_stack([np.sin(free), np.cos(free)]), 300.0
+    none = np.zeros((len(i), 3))
+    across = ScanEdges(i, j, se2.between(POSES[i], POSES[j]), root, none, none, indices(Calibration(), *LASER))
+    graph = Graph(POSES, edges=(*(scan_edge(k, k + 1) for k in range(99) if k != 50), across))
+    assert untied_steps(estimate_of(graph, odometry=wheels), recordings_of(POSES, STAMPS)).tolist() == [50]
+
+
 def test_a_robot_that_stands_needs_no_scans():
     assert untied(scans_at=WITHOUT, poses=0.01 * POSES) == []
 

@@ -143,21 +143,30 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     ]
 
 
-def _independent(edges: Edges, path: Floats) -> Edges:
-    """Return scan edges between neighbours and between visits, with the directions that they measure well.
+def _independent(edges: Edges, path: Floats, slid: Floats) -> Edges:
+    """Return scan edges between neighbours, and between visits those that measure all directions well.
 
-    Others of one visit were matched where the chain had put the clouds, and so were all of them in weak directions: many seem
-    to measure the way along a bare wall.
+    Others of one visit were matched where the chain had put the clouds, and so were all of them in weak directions. Nor is the
+    direction that an edge leaves free known exactly. A slip along a wall is seen aside by its size times the error of that
+    direction, which differs from edge to edge: hundreds of edges between two visits would measure the slip by that alone, and
+    those over one step count as one.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m. slid : (k,) variance of all slips up to each keyframe, m^2.
     """
     if not isinstance(edges, ScanEdges):
         return edges
-    again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
-    edges = edges.rows(np.flatnonzero(again | (np.abs(edges.i - edges.j) <= TiePolicy.near)))
-    unit = np.array(TiePolicy.clear)
+    unit, over_a_step = np.array(TiePolicy.clear), 0.5 * TiePolicy.near * (TiePolicy.near + 1)
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-    root = np.sqrt(np.where(values > 1.0, values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2) / unit
-    return replace(edges, sqrt_information=root)
+    values, free = np.maximum(values, 0.0), values[:, 0] < np.square(unit[0] / _SLIP[0])
+    aside = over_a_step * np.square(unit[2] / unit[0]) * np.abs(slid[edges.i] - slid[edges.j]) * free
+    root = np.sqrt(values / (1.0 + values * aside[:, None]))
+    again = np.abs(path[edges.i] - path[edges.j]) > TiePolicy.another_visit
+    kept = np.where(again, values[:, 0] > 1.0, np.abs(edges.i - edges.j) <= TiePolicy.near)
+    edges = replace(edges, sqrt_information=root[:, :, None] * np.swapaxes(vectors, 1, 2) / unit)
+    return edges.rows(np.flatnonzero(kept))
 
 
 def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> Bools:
@@ -167,11 +176,13 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
     ----------
     path : (k,) travelled distance, m.
     """
-    steps, root = np.flatnonzero(slips.any(axis=1)), estimate.odometry.sqrt_information.copy()
+    wheels, steps = estimate.odometry, np.flatnonzero(slips.any(axis=1))
+    root, slid = wheels.sqrt_information.copy(), np.zeros(len(path))
     covariance = np.linalg.inv(np.swapaxes(root[steps], 1, 2) @ root[steps]) + slips[steps, :, None] ** 2 * np.eye(3)
     root[steps] = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
-    others = [_independent(e, path) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
-    graph = replace(estimate.graph, edges=(*others, replace(estimate.odometry, sqrt_information=root)))
+    slid[wheels.j] = slips[:, 0] ** 2
+    others = [_independent(e, path, np.cumsum(slid)) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
+    graph = replace(estimate.graph, edges=(*others, replace(wheels, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
     extent = float(np.hypot(*np.ptp(graph.poses[:, :2], axis=0)))
     known = max(_KNOWN, _KNOWN_SHARE * extent / float(_SLIP[0]))
