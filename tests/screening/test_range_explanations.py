@@ -46,6 +46,15 @@ def test_a_radio_whose_clock_is_seconds_off_is_found_along_the_path(seed, late):
     np.testing.assert_allclose(moved.ranges.stamps, log.ranges.stamps - fact.figures["late"])
 
 
+@pytest.mark.parametrize(("seed", "late", "rate"), [(0, 0.0, 0.05), (1, 4.0, -0.08)])
+def test_a_radio_whose_clock_runs_fast_or_slow_is_set_right(seed, late, rate):
+    log, sound = late_by(late, seed), late_by(0.0, seed).ranges.stamps
+    log = replace(log, ranges=replace(log.ranges, stamps=sound + late + rate * sound))
+    moved, (fact,) = explained_by_ranges(log)
+    assert (fact.kind, fact.figures["grows"]) == ("late-ranges", pytest.approx(rate * np.ptp(sound), abs=1.5))
+    np.testing.assert_allclose(moved.ranges.stamps, sound, atol=1.0)
+
+
 def test_a_sound_recording_has_nothing_to_explain():
     log = late_by(0.0)
     assert explained_by_ranges(log) == (log, [])

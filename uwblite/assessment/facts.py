@@ -123,8 +123,8 @@ TEXTS: Mapping[str, Text] = {
         "{sensor}'s later stamps were moved by {moved:+.1f} s",
     ),
     "late-ranges": Text(
-        "the ranges are stamped about {late:.0f} s late for the odometry, whose path they fit then: their stamps were "
-        "corrected by that; use one clock",
+        "the ranges are stamped about {late:z.0f} s late for the odometry{grows:, and {grows:+.0f} s more at its end|}, whose "
+        "path they fit then: their stamps were corrected by that; use one clock",
         DOUBT,
         "radio",
     ),

@@ -103,7 +103,9 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         return log, []
     late, moments = _late(log, traces), _at_moments(log, traces)
     if late.log_odds > EvidencePolicy.very_strong and log.ranges is not None:
-        in_time = replace(log, ranges=replace(log.ranges, stamps=log.ranges.stamps - late.figures["late"]))
+        stamps, (first, last) = log.ranges.stamps, log.odometry.stamps[[0, -1]]
+        grown = late.figures["late"] + late.figures["grows"] * (stamps - first) / (last - first)
+        in_time = replace(log, ranges=replace(log.ranges, stamps=stamps - grown))
         left = _at_moments(in_time, _traces(in_time))
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
@@ -164,11 +166,12 @@ def _traces(log: SensorLog) -> list[Trace]:
 
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
-    """Return a radio's clock that is off throughout; its rivals are wheels with another scale throughout."""
-    offsets, factors = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors
-    count, length = len(factors), PathPolicy.stretch
+    """Return a radio's clock that is off throughout, by a constant or by one that grows evenly; its rivals are wheels with
+    another scale throughout."""
+    offsets, factors, slight = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors, 1.5
+    count, length, start, duration = len(factors), PathPolicy.stretch, log.odometry.stamps[0], np.ptp(log.odometry.stamps)
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    each = np.zeros((len(PathPolicy.noise), 0, count + len(offsets)))
+    each, shares = np.zeros((len(PathPolicy.noise), 0, count + len(offsets))), list[float]()
     for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
         for trace in (trace.between(begin, end) for trace in traces):
             if len(trace.ranges) < PathPolicy.fewest:
@@ -176,15 +179,22 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
             shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
             paths = np.concatenate([factors[:, None, None] * trace.places, shifted])
             each = np.concatenate([each, _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))[:, None]], axis=1)
-    usual, late = np.split(each.sum(axis=1), [count], axis=1)
-    far = np.abs(offsets) > 1.5
-    null = float(max(usual.max(), late[:, ~far].max()))
+            shares.append(float((trace.stamps.mean() - start) / duration))
+    first, last = (offset.ravel() for offset in np.meshgrid(offsets, offsets))
+    row = np.rint(PathPolicy.most_late + first[:, None] + (last - first)[:, None] * np.array(shares)).astype(np.intp)
+    late = each[:, np.arange(len(shares)), count + row].sum(axis=2)
+    steady, sound = first == last, np.maximum(np.abs(first), np.abs(last)) < slight
+    null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max()))
     # Turns that are wrong throughout look like an offset in each stretch, each another one.
     apart = float((each[:, :, count:].max(axis=2) - np.log(len(offsets))).sum(axis=1).max(initial=-np.inf))
-    late = late[np.argmax(late.max(axis=1)), far]
-    odds = float(np.logaddexp.reduce(late)) - np.log(len(late)) + np.log(PathPolicy.fault)
-    by = float(np.average(offsets[far], weights=np.exp(late - late.max())))
-    return Explanation(odds - max(null, apart), "late-ranges", {"late": -by})
+    rows = list[Explanation]()
+    for some in (np.flatnonzero(steady & ~sound), np.flatnonzero(np.abs(last - first) > slight)):
+        likely = late[np.argmax(late[:, some].max(axis=1)), some]
+        odds = float(np.logaddexp.reduce(likely)) - np.log(len(some)) + np.log(PathPolicy.fault)
+        weights = np.exp(likely - likely.max())
+        by, grows = (float(np.average(values[some], weights=weights)) for values in (first, last - first))
+        rows.append(Explanation(odds - max(null, apart), "late-ranges", {"late": -by, "grows": -grows}))
+    return max(rows, key=lambda row: row.log_odds)
 
 
 def _at_moments(log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None) -> list[Explanation]:
