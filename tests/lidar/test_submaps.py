@@ -21,7 +21,7 @@ def test_pieces_are_no_longer_than_epsilon_and_of_one_recording(seed, epsilon, n
     rng = np.random.default_rng(seed)
     path = 7.0 + np.cumsum(rng.uniform(0, 0.6, n))
     recording = np.sort(rng.integers(0, 3, n))
-    first, last = cut(path, recording, epsilon)
+    first, last, _ = cut(path, recording, epsilon)
     assert first[0] == 0
     assert last[-1] == n
     np.testing.assert_array_equal(first[1:], last[:-1])
@@ -34,7 +34,7 @@ def test_pieces_are_no_longer_than_epsilon_and_of_one_recording(seed, epsilon, n
 
 
 def test_epsilon_of_zero_makes_every_keyframe_a_sub_map():
-    first, last = cut(np.array([0.0, 0.0, 0.3, 5.0]), np.zeros(4, dtype=int), 0.0)
+    first, last, _ = cut(np.array([0.0, 0.0, 0.3, 5.0]), np.zeros(4, dtype=int), 0.0)
     assert first.tolist() == [0, 1, 2, 3]
     assert last.tolist() == [1, 2, 3, 4]
 

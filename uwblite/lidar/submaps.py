@@ -63,25 +63,19 @@ class Submaps:
         return rms_length((one - other)[:, :2])
 
 
-def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
+def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints, Ints]:
     """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording, and
-    return the first (s,) and one past the last keyframe (s,) of each."""
+    return the first (s,), one past the last (s,) and the reference keyframe (s,) of each: that in the middle."""
     piece = np.floor((path - path[0]) / epsilon).astype(np.intp) if epsilon > 0 else np.arange(len(path))
     change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(recording) != 0)])
     first = np.flatnonzero(change)
-    return first, np.append(first[1:], len(path))
+    last = np.append(first[1:], len(path))
+    return first, last, (first + last - 1) // 2
 
 
 def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig) -> Submaps:
     """Merge the clouds of each piece of the trajectory, with poses (k, 3) T_map_base, and filter them; see cut."""
-    first, last = cut(path, recording, config.epsilon)
-    return of_pieces(clouds, poses, first, last, references(path, recording, config.epsilon), config)
-
-
-def references(path: Floats, recording: Ints, epsilon: float) -> Ints:
-    """Return the reference keyframes (s,) of the sub-maps that are built of such pieces: those in the middle."""
-    first, last = cut(path, recording, epsilon)
-    return (first + last - 1) // 2
+    return of_pieces(clouds, poses, *cut(path, recording, config.epsilon), config)
 
 
 def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:

@@ -154,7 +154,7 @@ def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
     ----------
     path : (k,) travelled distance, m. recording : (k,).
     """
-    first, last = submaps.cut(path, recording, CandidatePolicy.length / 2.0)
+    first, last, _ = submaps.cut(path, recording, CandidatePolicy.length / 2.0)
     goes_on = recording[first[1:]] == recording[first[:-1]]
     last[:-1] = np.where(goes_on, last[1:], last[:-1])
     return first, last, (first + last - 1) // 2

@@ -41,7 +41,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     config, recordings, scans = task.config, task.recordings, estimate.lidar
     rules, of, with_ranges = config.loop_closure, recordings.of_keyframe, estimate.ranges is not None
     base, found = estimate.problem, closures.no_closures()
-    reference = submaps.references(recordings.path, of, config.submaps.epsilon)
+    reference = submaps.cut(recordings.path, of, config.submaps.epsilon)[2]
     first, some = JointCovariance(base, reference), reference[:: RoundPolicy.per_stretch]
     covariance: JointCovariance | None = first
     if closure_candidates.any_uncertain(base, first, some, of, rules):
