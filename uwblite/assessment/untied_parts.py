@@ -192,16 +192,17 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
 def untied_steps(estimate: Estimate, recordings: Recordings) -> Ints:
     """Return the steps (s,) of the odometry that slipped, or that the map contradicts, and whose sides nothing else connects.
 
-    Their noise is enlarged by as much as the map contradicts them, to that of a slip at most; without ranges that of known
-    slips, which the map follows, by their own noise. Those with hardly any keyframes between them are one run; a few keyframes
-    at an end of a recording are no part.
+    Their noise is that of a slip of the share that shows in some direction: wheels that slip forward may have turned as well.
+    Without ranges, known slips, which the map follows, have their own noise. Steps with hardly any keyframes between them are
+    one run; a few keyframes at an end of a recording are no part.
     """
     wheels = estimate.odometry
     noise = np.sqrt(np.diagonal(np.linalg.inv(np.swapaxes(wheels.sqrt_information, 1, 2) @ wheels.sqrt_information), 0, 1, 2))
-    off = np.abs(wheels.residuals(estimate.graph)).max(axis=1, initial=0.0)
+    off = np.abs(wheels.residuals(estimate.graph))
+    share = np.where(off > BEYOND_NOISE, off * noise / _SLIP, 0.0).max(axis=1, initial=0.0)
     # Ranges connect parts better than one pose with another: then known slips are in the map's own uncertainty.
-    larger = np.where(off > BEYOND_NOISE, off, estimate.slipped & (estimate.ranges is None))
-    slips = np.minimum(larger[:, None] * noise, _SLIP)
+    known = estimate.slipped[:, None] & (estimate.ranges is None)
+    slips = np.minimum(np.where(share[:, None] > 0.0, share[:, None] * _SLIP, known * noise), _SLIP)
     rows = np.array([(r.rows.start, r.rows.stop) for r in recordings.each])[recordings.of_keyframe[wheels.i]]
     sides = np.minimum(wheels.i + 1 - rows[:, 0], rows[:, 1] - wheels.j)
     steps = np.flatnonzero(slips.any(axis=1) & (sides >= _PART))
