@@ -157,6 +157,14 @@ def test_scans_and_closures_hold_an_end_as_ranges_do():
     assert loose(measured((0, 100)), edges=neighbours) == []
 
 
+def test_a_middle_without_matches_is_loose_unless_a_closure_connects_both_sides():
+    """18 m, of which either side errs by half; 9 m do not matter."""
+    sides = [tuple(scan_edge(k, k + 1) for k in (*range(first), *range(last, 99))) for first, last in ((20, 80), (35, 65))]
+    assert [loose(edges=edges) for edges in sides] == [[20.0], []]
+    assert loose(edges=(*sides[0], scan_edge(10, 90))) == []
+    assert loose(measured((0, 30), (70, 100)), edges=sides[0]) == [], "anchors hold both sides"
+
+
 def test_a_robot_that_stands_goes_not_astray():
     assert loose(measured((0, 50)), poses=0.01 * POSES) == []
 

@@ -48,7 +48,7 @@ _ASTRAY = 0.5
 
 def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
     """Doubt a map whose parts only the odometry connects, where another sensor had no data in between."""
-    ranges, path = estimate.ranges, task.recordings.path
+    ranges = estimate.ranges
     alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
     yield from check_loose_ends(estimate, alive, task)
     for recording in task.recordings.each:
@@ -58,9 +58,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
             first = recording.rows.start + int(np.searchsorted(stamps, before, "right"))
             last = recording.rows.start + int(np.searchsorted(stamps, after))
             sizes = first - recording.rows.start, recording.rows.stop - last
-            wheels = estimate.odometry
-            slips = ((wheels.i >= first - 1) & (wheels.j <= last))[:, None] * _SLIP
-            if min(sizes) < _PART or _tied(estimate, path, slips, np.array([first - 1]), np.array([last]))[0]:
+            if min(sizes) < _PART or not _loose_between(estimate, task, np.array([first - 1, last])):
                 continue
             what = "the lidar is silent" if recording.has_scans else "all anchors are replaced by others"
             yield doubt(
@@ -74,36 +72,50 @@ def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
 
 
 def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> Iterator[Finding]:
-    """Doubt a map with a beginning or an end that no scan, closure or range constrains, where usual wheels drift too far.
+    """Doubt a map with a stretch that no scan, closure or range constrains, where usual wheels drift too far.
 
-    Errors of the wheels there leave no residual, and sigmas assume faultless wheels. The middle of a recording
-    is constrained from both sides.
+    Errors of the wheels there leave no residual, and sigmas assume faultless wheels. A stretch in the middle matters without
+    ranges, where nothing else connects both sides; either of them errs by half.
     """
     ends = [] if ranges is None else [ranges.pose]
     ends += [np.append(e.i, e.j) for e in estimate.graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
     held = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends]))
     for recording in task.recordings.each if len(held) else ():
         frames, places = recording.frames, estimate.graph.poses[recording.rows, :2]
-        own = held[recording.has(held)] - recording.rows.start
+        own, time = held[recording.has(held)] - recording.rows.start, frames.stamps - frames.stamps[0]
         first, last = (int(own[_MEASURED - 1]), int(own[-_MEASURED])) if len(own) >= _MEASURED else (0, 0)
-        for word, edge, rows in (("until", "start", np.arange(first, -1, -1)), ("from", "end", np.arange(last, len(places)))):
-            steps, (begin, end) = np.minimum(rows[1:], rows[:-1]), sorted(frames.stamps[rows[[0, -1]]].tolist())
-            way, at = float(frames.path[steps].sum()), float(frames.stamps[rows[0]])
+        spans = [
+            (f"until t = {time[first]:.0f} s", f"`start={time[first]:.0f}` leaves", 1.0, np.arange(first, -1, -1)),
+            (f"from t = {time[last]:.0f} s", f"`end={time[last]:.0f}` leaves", 1.0, np.arange(last, len(places))),
+        ]
+        for k in np.flatnonzero(np.diff(own) > 1).tolist() if ranges is None else ():
+            begin, end = (f"{time[row]:.0f}" for row in own[k : k + 2])
+            when, cut = f"from t = {begin} to {end} s", f"`end={begin}` and `start={end}` leave"
+            spans.append((when, cut, 0.5, np.arange(own[k], own[k + 1] + 1)))
+        for when, cut, share, rows in spans:
+            way = float(frames.path[np.minimum(rows[1:], rows[:-1])].sum())
             # A heading that drifts evenly moves the end of a straight path aside by half of the last turn.
-            off = 0.5 * _PER_METRE * way * float(np.hypot(*(places[rows] - places[rows[0]]).T).max())
-            if off > _ASTRAY:
-                seconds = at - frames.stamps[0]
+            off = share * 0.5 * _PER_METRE * way * float(np.hypot(*(places[rows] - places[rows[0]]).T).max())
+            between = share < 1.0
+            if off > _ASTRAY and (not between or _loose_between(estimate, task, recording.rows.start + rows[[0, -1]])):
                 loose = doubt(
                     "untied-parts",
-                    f"{word} t = {seconds:.0f} s, over {way:.0f} m, neither scans nor ranges constrain the trajectory: "
-                    f"usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out why no sensor "
-                    "measured there",
-                    at=at,
+                    f"{when}, over {way:.0f} m, neither scans nor ranges constrain the trajectory: usual wheels drift by "
+                    f"{off:.1f} m over that distance; cut that part off, or find out why no sensor measured there",
+                    at=float(frames.stamps[rows[0]]),
                     way=way,
                     error=off,
                 )
-                cure = f"`{edge}={seconds:.0f}` leaves that part out"
-                yield replace(loose, recording=recording.number + 1, stretches=((begin, end),), cure=cure)
+                stretch = np.sort(frames.stamps[rows[[0, -1]]])
+                stretches = ((float(stretch[0]), float(stretch[1])),)
+                yield replace(loose, recording=recording.number + 1, stretches=stretches, cure=f"{cut} that part out")
+
+
+def _loose_between(estimate: Estimate, task: Task, ends: Ints) -> bool:
+    """Return whether only the odometry connects two keyframes (2,)."""
+    wheels = estimate.odometry
+    slips = ((wheels.i >= ends[0]) & (wheels.j <= ends[1]))[:, None] * _SLIP
+    return not _tied(estimate, task.recordings.path, slips, ends[:1], ends[1:])[0]
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
