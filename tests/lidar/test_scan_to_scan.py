@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.laser_walks import HALL, chained, scanned, walked
+from helpers.laser_walks import HALL, ROOM, chained, scanned, walked
 from helpers.planted import box
 
 from uwblite import se2
@@ -189,3 +189,20 @@ def test_a_corridor_is_not_measured_along():
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     assert len(steps) > 20
     assert np.median(information[:, 0, 0]) < 0.02 * np.median(information[:, 1, 1])
+
+
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_a_scan_whose_stamp_is_wrong_leaves_both_of_its_steps_measured(seed):
+    """Wheels give the pose of another moment: what they count too much up to there, they count too little after it."""
+    truth, _, clouds = walked(seed, ROOM, 30.0, half_width=1.8)
+    exact = se2.between(truth[:-1], truth[1:])
+    rng = np.random.default_rng(seed)
+    stated = exact + rng.standard_normal(exact.shape) * NOISE
+    late = np.arange(10, len(exact) - 1, 15)
+    stated[late - 1, 2] += 0.1
+    stated[late, 2] -= 0.1
+    found = tracked(truth, clouds, stated)
+    assert np.isin([late - 1, late], found.steps.i).all()
+    assert not found.rejected[[late - 1, late]].any()
+    turned = found.steps.T_i_j[np.searchsorted(found.steps.i, [late - 1, late]), 2].sum(axis=0)
+    np.testing.assert_allclose(turned, exact[[late - 1, late], 2].sum(axis=0), atol=0.03)

@@ -23,6 +23,7 @@ from uwblite.odometry.wheels import (
     OdometryNoiseConfig,
     _neighbours,
     _scale,
+    displaced,
     drift_time,
     noise_at,
     redundancy,
@@ -186,6 +187,16 @@ def test_jitter_of_stamps_shows_in_the_turns(jitter, outliers):
     measured = wheels.motion + np.column_stack([np.zeros((len(wheels), 2)), np.diff(turned) + noise])
     steps = RelativePoseEdges(wheels.i, wheels.j, measured, 10.0 * wheels.end_sqrt_information)
     assert stamp_jitter(wheels, steps, Graph(np.zeros((len(wheels) + 1, 3)))) == pytest.approx(jitter, rel=0.2, abs=0.01)
+
+
+def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():
+    """A slip is not taken back; what is taken back over two steps, or by half, is not of one scan."""
+    off = 0.01 * np.random.default_rng(2).standard_normal((60, 3))
+    off[10] = [0.3, 0.0, 0.2]
+    off[20], off[22] = [0.0, 0.0, 0.4], [0.0, 0.0, -0.4]
+    off[30], off[31] = [0.3, 0.0, 0.0], [-0.1, 0.0, 0.0]
+    off[40], off[41] = [0.3, 0.0, 0.1], [-0.29, 0.01, -0.11]
+    assert np.flatnonzero(displaced(off)).tolist() == [40]
 
 
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():

@@ -11,7 +11,7 @@ from helpers.told import told
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.screening import clocks
-from uwblite.screening.clocks import displaced, with_late_scans_placed
+from uwblite.screening.clocks import with_late_scans_placed
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 
@@ -203,16 +203,6 @@ def test_scans_with_times_are_left_alone(turning):
     even = replace(log, scans=replace(log.scans, stamps=steady), odometry=replace(log.odometry, stamps=steady))
     assert with_late_scans_placed(even) == (even, [])
     assert with_late_scans_placed(log.without(lidar=True))[1] == []
-
-
-def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():
-    """A slip is not taken back; what is taken back over two steps, or by half, is not of one scan."""
-    off = 0.01 * np.random.default_rng(2).standard_normal((60, 3))
-    off[10] = [0.3, 0.0, 0.2]
-    off[20], off[22] = [0.0, 0.0, 0.4], [0.0, 0.0, -0.4]
-    off[30], off[31] = [0.3, 0.0, 0.0], [-0.1, 0.0, 0.0]
-    off[40], off[41] = [0.3, 0.0, 0.1], [-0.29, 0.01, -0.11]
-    assert np.flatnonzero(displaced(off)).tolist() == [40]
 
 
 @pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (1, 5, False), (4, 4, False), (7, 30, True)])

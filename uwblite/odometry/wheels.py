@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import BEYOND_NOISE, MOST, TINY, Floats, Ints, spread, weighted_median
+from ..arrays import BEYOND_NOISE, MAD_TO_SIGMA, MOST, TINY, Bools, Floats, Ints, spread, weighted_median
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
@@ -147,6 +147,18 @@ def stamp_jitter(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) 
     mean = 0.5 * (rate[first] + rate[first + 1])
     apart, together = (spread((off[first] + sign * off[first + 1]) / mean) for sign in (-1.0, 1.0))
     return float(0.5 * np.sqrt(max(apart**2 - together**2, 0.0)))
+
+
+def displaced(off: Floats) -> Bools:
+    """Return which scans (k - 1,) between two steps, of which each is off by (k, 3), m, m, rad, are alone displaced.
+
+    What is left in the sum of both steps is at most half of either; a turn moves what a scan sees, two metres away.
+    """
+    off = off * np.array([1.0, 1.0, 2.0])
+    limit = BEYOND_NOISE * MAD_TO_SIGMA * float(np.linalg.norm(np.median(np.abs(off), axis=0)))
+    into, out = off[:-1], off[1:]
+    least = np.minimum(np.linalg.norm(into, axis=1), np.linalg.norm(out, axis=1))
+    return np.asarray((least > limit) & (np.linalg.norm(into + out, axis=1) < 0.5 * least))
 
 
 def noise_at(graph: Graph, wheels: OdometryEdges, certainty: Floats) -> OdometryEdges:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import BEYOND_NOISE, ENOUGH, MAD_TO_SIGMA, Bools, Floats, weighted_median
+from ..arrays import ENOUGH, Floats, weighted_median
 from ..errors import DataError
 from ..findings import Fact
 from ..lidar.scan_odometry import scan_steps
 from ..odometry.attached import OUTSIDE
+from ..odometry.wheels import displaced
 from ..sensor_log import LaserScans, Odometry, SensorLog, UwbRanges, odometry_in_bursts, stand_still
 from ..sensor_log import in_bursts as stamps_in_bursts
 from .wheel_motion import PairPolicy
@@ -173,15 +174,3 @@ def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     order = np.argsort(stamps, kind="stable")
     log = replace(log, odometry=Odometry(stamps[order], poses[order]))
     return log, [Fact.of("late-scans", count=len(late), total=len(times))]
-
-
-def displaced(off: Floats) -> Bools:
-    """Return which scans (k - 1,) between two steps, of which each is off by (k, 3), m, m, rad, are alone displaced.
-
-    What is left in the sum of both steps is at most half of either; a turn moves what a scan sees, two metres away.
-    """
-    off = off * np.array([1.0, 1.0, 2.0])
-    limit = BEYOND_NOISE * MAD_TO_SIGMA * float(np.linalg.norm(np.median(np.abs(off), axis=0)))
-    into, out = off[:-1], off[1:]
-    least = np.minimum(np.linalg.norm(into, axis=1), np.linalg.norm(out, axis=1))
-    return np.asarray((least > limit) & (np.linalg.norm(into + out, axis=1) < 0.5 * least))
