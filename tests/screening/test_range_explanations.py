@@ -113,6 +113,15 @@ def test_ranges_that_are_any_numbers_from_half_time_are_no_fault_of_the_wheels()
     assert "wheels-against-ranges" not in {fact.kind for fact in facts}
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_ranges_that_are_any_numbers_make_no_clock(seed):
+    log = late_by(0.0, seed)
+    values = np.random.default_rng(seed).uniform(0.5, 15.0, len(log.ranges.stamps))
+    moved, facts = explained_by_ranges(replace(log, ranges=replace(log.ranges, ranges=values)))
+    np.testing.assert_array_equal(moved.ranges.stamps, log.ranges.stamps)
+    assert "late-ranges" not in {fact.kind for fact in facts}
+
+
 @pytest.mark.parametrize(
     ("seed", "what", "begin", "end", "change"),
     [

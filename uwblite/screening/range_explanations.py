@@ -167,11 +167,11 @@ def _traces(log: SensorLog) -> list[Trace]:
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
     """Return a radio's clock that is off throughout, by a constant or by one that grows evenly; its rivals are wheels with
-    another scale throughout."""
+    another scale throughout, and ranges that are any numbers."""
     offsets, factors, slight = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors, 1.5
     count, length, start, duration = len(factors), PathPolicy.stretch, log.odometry.stamps[0], np.ptp(log.odometry.stamps)
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    each, shares = np.zeros((len(PathPolicy.noise), 0, count + len(offsets))), list[float]()
+    each, shares, counted = np.zeros((len(PathPolicy.noise), 0, count + len(offsets))), list[float](), 0
     for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
         for trace in (trace.between(begin, end) for trace in traces):
             if len(trace.ranges) < PathPolicy.fewest:
@@ -180,11 +180,13 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
             paths = np.concatenate([factors[:, None, None] * trace.places, shifted])
             each = np.concatenate([each, _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))[:, None]], axis=1)
             shares.append(float((trace.stamps.mean() - start) / duration))
+            counted += len(trace.ranges)
     first, last = (offset.ravel() for offset in np.meshgrid(offsets, offsets))
     row = np.rint(PathPolicy.most_late + first[:, None] + (last - first)[:, None] * np.array(shares)).astype(np.intp)
     late = each[:, np.arange(len(shares)), count + row].sum(axis=2)
     steady, sound = first == last, np.maximum(np.abs(first), np.abs(last)) < slight
-    null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max()))
+    nothing = -counted * float(np.log(max(float(trace.ranges.max(initial=1.0)) for trace in traces)))
+    null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max(), nothing))
     # Turns that are wrong throughout look like an offset in each stretch, each another one.
     apart = float((each[:, :, count:].max(axis=2) - np.log(len(offsets))).sum(axis=1).max(initial=-np.inf))
     rows = list[Explanation]()
