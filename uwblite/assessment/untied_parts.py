@@ -43,7 +43,7 @@ _PER_METRE = 0.02
 """rad/m; drift of heading by which wheels and gyros differ between floors, loads and temperatures. A robot that drives straight
 on exceeds the limit below after 7 m."""
 _ASTRAY = 0.5
-"""m; error of a place from which on the map counts as wrong there."""
+"""m; error of a place from which on the map counts as wrong there, if it is more than _KNOWN_SHARE of the map's diameter."""
 
 
 def check_untied_parts(estimate: Estimate, task: Task) -> Iterator[Finding]:
@@ -79,7 +79,7 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
     """
     ends = [] if ranges is None else [ranges.pose]
     ends += [np.append(e.i, e.j) for e in estimate.graph.edges if isinstance(e, ScanEdges | RelativePoseEdges)]
-    held = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends]))
+    held, most = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *ends])), max(_ASTRAY, _KNOWN_SHARE * _extent(estimate))
     for recording in task.recordings.each if len(held) else ():
         frames, places = recording.frames, estimate.graph.poses[recording.rows, :2]
         own, time = held[recording.has(held)] - recording.rows.start, frames.stamps - frames.stamps[0]
@@ -97,7 +97,7 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
             # A heading that drifts evenly moves the end of a straight path aside by half of the last turn.
             off = share * 0.5 * _PER_METRE * way * float(np.hypot(*(places[rows] - places[rows[0]]).T).max())
             between = share < 1.0
-            if off > _ASTRAY and (not between or _loose_between(estimate, task, recording.rows.start + rows[[0, -1]])):
+            if off > most and (not between or _loose_between(estimate, task, recording.rows.start + rows[[0, -1]])):
                 loose = doubt(
                     "untied-parts",
                     f"{when}, over {way:.0f} m, neither scans nor ranges constrain the trajectory: usual wheels drift by "
@@ -181,6 +181,11 @@ def _independent(edges: Edges, path: Floats, slid: Floats) -> Edges:
     return edges.rows(np.flatnonzero(kept))
 
 
+def _extent(estimate: Estimate) -> float:
+    """Return the diameter of the map, m."""
+    return float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
+
+
 def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> Bools:
     """Return whether keyframes i (m,) are known from j (m,) by all measurements, where steps may slip by (e, 3), m, m, rad.
 
@@ -196,8 +201,7 @@ def _tied(estimate: Estimate, path: Floats, slips: Floats, i: Ints, j: Ints) -> 
     others = [_independent(e, path, np.cumsum(slid)) for e in estimate.graph.edges if not isinstance(e, OdometryEdges)]
     graph = replace(estimate.graph, edges=(*others, replace(wheels, sqrt_information=root)))
     relative = JointCovariance(graph, np.unique(np.append(i, j))).relative(i, j)
-    extent = float(np.hypot(*np.ptp(graph.poses[:, :2], axis=0)))
-    known = max(_KNOWN, _KNOWN_SHARE * extent / float(_SLIP[0]))
+    known = max(_KNOWN, _KNOWN_SHARE * _extent(estimate) / float(_SLIP[0]))
     return np.asarray(np.linalg.eigvalsh(relative / np.outer(_SLIP, _SLIP))[:, -1] < known**2)
 
 
