@@ -275,7 +275,7 @@ def wheels_against_ranges(begin: float, at: float, end: float, what: str, value:
     text = {
         "turned": f"at about t = {at:.0f} s the robot turned by {value:+.0f} degrees more than the wheels count",
         "mirrored": f"from about t = {at:.0f} s the wheels turn the other way round, as if left and right were swapped",
-        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere than the wheels say, carried or slipped",
+        "elsewhere": f"at about t = {at:.0f} s the robot is suddenly elsewhere: it slipped, or it or all anchors were carried",
         "turns": f"about t = {at:.0f} s no path that the wheels count fits: one of them, or the heading, is stuck or slips",
     }[what]
     return Finding("wheels-against-ranges", WARNING, f"{text}, by the ranges to the anchors in reach", sensor="odometry")
