@@ -182,8 +182,9 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
             shares.append(float((trace.stamps.mean() - start) / duration))
             counted += len(trace.ranges)
     first, last = (offset.ravel() for offset in np.meshgrid(offsets, offsets))
-    row = np.rint(PathPolicy.most_late + first[:, None] + (last - first)[:, None] * np.array(shares)).astype(np.intp)
-    late = each[:, np.arange(len(shares)), count + row].sum(axis=2)
+    late = np.zeros((len(each), len(first)))
+    for k, share in enumerate(shares):
+        late += each[:, k, count + np.rint(PathPolicy.most_late + first + (last - first) * share).astype(np.intp)]
     steady, sound = first == last, np.maximum(np.abs(first), np.abs(last)) < slight
     nothing = -counted * float(np.log(max(float(trace.ranges.max(initial=1.0)) for trace in traces)))
     null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max(), nothing))
