@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import drifted, scanned, walked
+from helpers.planted import chain
+from helpers.planted_graphs import relative_edges
 from scipy.spatial import cKDTree
 
 from uwblite import se2
@@ -17,7 +19,7 @@ from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.loop_closure.candidates import Candidates, propose
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
 from uwblite.loop_closure.matching import ClosureMatches
-from uwblite.loop_closure.verification import _judge, find, reconcile
+from uwblite.loop_closure.verification import _judge, confirmed, find, reconcile
 from uwblite.map_result import LoopClosure
 
 PERIOD = 1.2
@@ -350,3 +352,19 @@ def test_a_robot_that_never_returns_has_no_candidates():
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
     assert np.all(apart < 7.0)
     assert optimize(graph, SOLVER)[1].converged
+
+
+def test_closures_that_agree_along_the_way_confirm_each_other_and_copies_do_not():
+    """Two laps of 250 m; one closure takes a place for its copy, 8 m and a quarter of a turn away, and one stands alone."""
+    lap = 250
+    truth = chain(np.zeros(3), np.tile([1.0, 0.0, 2.0 * np.pi / lap], (2 * lap, 1)))
+    first = np.array([10, 50, 90, 130])
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        graph = drifted(rng, truth, NOISE)
+        covariance = JointCovariance(graph, np.append(first, first + lap))
+        edges = relative_edges(truth, first, first + lap, [0.05, 0.05, 0.01], rng)
+        assert confirmed(edges, graph, covariance, np.arange(2.0 * lap)).all()
+        copy = replace(edges, T_i_j=edges.T_i_j + np.where(np.arange(4) == 2, 1.0, 0.0)[:, None] * [8.0, 0.0, np.pi / 2.0])
+        assert confirmed(copy, graph, covariance, np.arange(2.0 * lap)).tolist() == [True, True, False, True]
+        assert not confirmed(edges.rows(slice(1)), graph, covariance, np.arange(2.0 * lap)).any()

@@ -13,9 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import TINY, Floats
+from ..arrays import TINY, Bools, Floats
 from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph
+from ..graph.marginals import JointCovariance
+from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
@@ -24,7 +26,7 @@ from ..lidar.submaps import Submaps
 from ..lidar.visibility import FreeSpace
 from ..map_result import LoopClosure
 from . import chain_breaks
-from .candidates import Candidates
+from .candidates import CandidatePolicy, Candidates
 from .closures import Closures, LoopClosureConfig, collected, no_closures
 from .matching import ClosureMatches, fit
 
@@ -103,6 +105,40 @@ def _judge(
             verdict = "accepted", f"{share[k]:.0%} of its points match within {rms[k]:.3f} m"
         verdicts.append(verdict)
     return verdicts
+
+
+def confirmed(edges: RelativePoseEdges, graph: Graph, covariance: JointCovariance, path: Floats) -> Bools:
+    """Return which closures (e,) agree with another one, some way before or after them, along the chain between both.
+
+    A place and its copy elsewhere look alike here and there; closures that are right agree wherever two visits share their way
+    (E. Olson, Recognizing places using spectrally clustered local matches, 2009).
+
+    Parameters
+    ----------
+    graph, covariance : of the chain without them. path : (k,) travelled distance, m.
+    """
+    found = np.zeros(len(edges), dtype=bool)
+    a, b = np.triu_indices(len(edges), 1)
+    i, j, length = edges.i, edges.j, CandidatePolicy.length
+    apart = np.abs([path[k[a]] - path[k[b]] for k in (i, j)])
+    near = ((apart >= length) & (apart <= _ALONG * length)).all(axis=0)
+    a, b = a[near], b[near]
+    if not len(a):
+        return found
+    here, there = (se2.between(graph.poses[k[a]], graph.poses[k[b]]) for k in (i, j))
+    off = se2.between(se2.compose(edges.T_i_j[a], there), se2.compose(here, edges.T_i_j[b]))
+    before, after = (covariance.relative(k[a], k[b]) for k in (i, j))
+    turn = before[:, 2, 2] + after[:, 2, 2]
+    place = np.trace(before[:, :2, :2] + after[:, :2, :2], axis1=1, axis2=2)
+    place += before[:, 2, 2] * np.sum(edges.T_i_j[b, :2] ** 2, axis=1)
+    squared = np.sum(off[:, :2] ** 2, axis=1) / place + se2.wrap_angle(off[:, 2]) ** 2 / turn
+    agree = squared < LoopClosureConfig.agrees**2
+    found[a[agree]] = found[b[agree]] = True
+    return found
+
+
+_ALONG = 4.0
+"""Lengths of a stretch within which closures confirm each other: along more, a chain is too uncertain to contradict them."""
 
 
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

@@ -95,23 +95,28 @@ def _with_long_stretches_tied(base: Graph, estimate: Estimate, task: Task) -> tu
     covariance = JointCovariance(base, reference)
     pieces = submaps.of_pieces(estimate.lidar.clouds, base.poses, first, last, reference, task.config.submaps)
     pieces, free = _static(pieces, base, estimate)
-    tried, accepted, with_ranges = Tried(), 0, estimate.ranges is not None
+    tried, waiting, with_ranges = Tried(), closures.no_closures(), estimate.ranges is not None
     for _ in range(RoundPolicy.wide_rounds):
         pairs = closure_candidates.first_of(
             closure_candidates.uncertain_pairs(
                 base, covariance, pieces, recordings.of_keyframe, tried, with_ranges, rules, rules.direct
             )
         )
-        if not len(pairs.target):
+        if not len(pairs.target) and not len(waiting.edges):
             break
         tried |= pairs.names(rules)
-        new = _verified(pairs, pieces, free, rules, task)
+        new = closures.merged(waiting, _verified(pairs, pieces, free, rules, task))
+        # What looks alike closes loops falsely, here and there; closures that are right confirm each other along the way.
+        sure = verification.confirmed(closures.merged(found, new).edges, base, covariance, recordings.path)[len(found.edges) :]
+        sure |= not sure.any()
+        new, waiting = closures.parted(new, sure)
         base, found = _reconciled(base, found, new, task)
         if len(new.edges):
             covariance = JointCovariance(base.with_edges(found.edges), reference)
-            accepted += len(new.edges)
+    base, found = _reconciled(base, found, waiting, task)
     if not tried:
         return base, found
+    accepted = len(found.edges)
     task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=accepted)
     return base, found
 
