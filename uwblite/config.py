@@ -186,8 +186,11 @@ def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
 
 
 _COMPARED = {
-    "above": (">", operator.gt), "minimum": (">=", operator.ge), "maximum": ("<=", operator.le), "below": ("<", operator.lt),
-}  # fmt: skip
+    "above": (">", operator.gt),
+    "minimum": (">=", operator.ge),
+    "maximum": ("<=", operator.le),
+    "below": ("<", operator.lt),
+}
 
 
 def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]) -> Any:

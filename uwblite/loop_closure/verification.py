@@ -36,6 +36,8 @@ _TIGHTER = 3.0
 """Ratio of each scale of that kernel to the next, and the scale of that of what remains, standard deviations."""
 _SLID = 3
 """Most searches for shifted stretches: without the closures that moved one, another may show."""
+_ALONG = 4.0
+"""Lengths of a stretch within which closures confirm each other: along more, a chain is too uncertain to contradict them."""
 
 
 def find(
@@ -137,10 +139,6 @@ def confirmed(edges: RelativePoseEdges, graph: Graph, covariance: JointCovarianc
     return found
 
 
-_ALONG = 4.0
-"""Lengths of a stretch within which closures confirm each other: along more, a chain is too uncertain to contradict them."""
-
-
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
     """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those that disagree.
 
@@ -156,7 +154,6 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
         reasons = [f"the odometry would have to jump by {jump:.1f} m and back again" for jump in by]
         solved, left = _tightened(graph, left.without(by == 0.0, "contradicts-graph", reasons), config, solver)
     return solved, left
-
 
 
 def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

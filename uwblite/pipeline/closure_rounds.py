@@ -116,8 +116,7 @@ def _with_long_stretches_tied(base: Graph, estimate: Estimate, task: Task) -> tu
     base, found = _reconciled(base, found, waiting, task)
     if not tried:
         return base, found
-    accepted = len(found.edges)
-    task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=accepted)
+    task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=len(found.edges))
     return base, found
 
 
