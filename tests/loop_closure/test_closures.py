@@ -1,8 +1,11 @@
 """Collections of closures: joined, and with some rejected."""
 
+from dataclasses import replace
+
 import numpy as np
 from helpers.planted_graphs import random_poses, relative_edges
 
+from uwblite.graph.robust import Kernel
 from uwblite.loop_closure.closures import Closures, merged, no_closures, parted
 from uwblite.map_result import LoopClosure
 
@@ -27,6 +30,8 @@ def test_nothing_joined_to_a_collection_changes_nothing():
     same(merged(one, no_closures()), one)
     same(merged(no_closures(), one), one)
     assert len(no_closures().edges) == 0
+    robust = replace(one, edges=replace(one.edges, kernel=Kernel("cauchy", 3.0)))
+    assert merged(robust, no_closures()).edges.kernel == robust.edges.kernel
 
 
 def test_one_collection_stands_behind_the_other():

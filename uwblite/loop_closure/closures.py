@@ -111,6 +111,7 @@ def parted(closures: Closures, first: Bools) -> tuple[Closures, Closures]:
 
 
 def merged(one: Closures, other: Closures) -> Closures:
-    """Return both collections as one."""
-    edges = replace(one.edges.followed_by(other.edges), kernel=other.edges.kernel)
+    """Return both collections as one, with the kernel of the other's edges where it has any."""
+    last = other if len(other.edges) else one
+    edges = replace(one.edges.followed_by(other.edges), kernel=last.edges.kernel)
     return Closures(edges, one.candidates + other.candidates)
