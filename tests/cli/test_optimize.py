@@ -42,19 +42,14 @@ def test_incremental_reaches_the_minimum_that_all_at_once_misses(tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["chi2_per_dof"] > 2.0
 
 
-def test_headings_from_anywhere_end_in_the_certified_minimum(tmp_path, capsys):
+def test_headings_from_anywhere_end_in_the_minimum_from_the_truth(tmp_path, capsys):
     graph = loop(3, n=400, anchors=0)[0]
     rng = np.random.default_rng(3)
     poses = graph.poses + rng.normal(scale=[3.0, 3.0, 1.5], size=graph.poses.shape) * (np.arange(400) > 0)[:, None]
     bent = replace(graph, poses=poses, edges=graph.edges[:2])
     best = optimize(replace(graph, edges=graph.edges[:2]))[1].chi2
     assert optimize(bent)[1].chi2 > 2.0 * best
-    found = figures(capsys, written(tmp_path / "bent.g2o", bent))
-    assert found["chi2"] == pytest.approx(best, rel=1e-6)
-    assert found["certificate"] == "global minimum"
-    assert best - 2e-3 < found["chi2_lower_bound"] <= best
-    wrong = figures(capsys, str(tmp_path / "bent.g2o"), "--kernel", "huber")
-    assert wrong["certificate"] == "none: the robust kernel huber has no relaxation"
+    assert figures(capsys, written(tmp_path / "bent.g2o", bent))["chi2"] == pytest.approx(best, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", [4, 12])
@@ -158,7 +153,6 @@ def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):
     assert main(["optimize", path, "--robust"]) == 0
     out = capsys.readouterr().out
     assert "outliers left out: " in out
-    assert "certificate: none: a search decided which edges are outliers\n" in out
 
 
 def test_the_two_ways_exclude_one_another(tmp_path, capsys):

@@ -187,7 +187,6 @@ def test_optimize_is_as_good_as_from_the_truth(tmp_path, capsys):
     best = optimize(replace(graph, poses=truth))[1].chi2
     assert stated["chi2"] <= 1.01 * best
     assert stated["chains"] == ROBOTS
-    assert stated["chi2_lower_bound"] <= stated["chi2"]
     assert read_pyfg(tmp_path / "out.pyfg").pose_ids == tuple(names)
 
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from ..config import override
 from ..errors import ConfigError
-from ..graph.certificate import Certificate, certify
 from ..graph.gnc import misfit, optimize_gnc, outlier_thresholds, with_kernel
 from ..graph.graph import Graph
 from ..graph.robust import Kernel
@@ -35,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
     with closing(console.Progress()) as progress:
         search = _Search(args, config, lambda done, most: progress("optimising", done, most), _allowed(args, file.graph))
-        best, known = _best(search, file, args)
+        best = _best(search, file, args)
     solved_file = dataclasses.replace(file, graph=best.start.placed(best.graph))
     if args.out:
         write_graph(args.out, solved_file)
@@ -43,21 +42,18 @@ def run(args: argparse.Namespace) -> int:
         write_tum(args.trajectory, file.stamps, best.graph.poses)
     figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.start.unplaced])
     figures["closures"] = _closures(best.graph, file.pose_ids)
-    figures["certificate"] = "global minimum" if known.is_global else f"none: {known.reason}"
-    figures["chi2_lower_bound"] = known.lower_bound
     if args.robust:
         figures["outliers"] = best.outliers
     console.report(args.json, figures, _lines(args, figures))
     return 0 if best.summary.converged else 3
 
 
-def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> tuple["_Solution", Certificate]:
-    """Return the lowest minimum that is found, and what is known of the global one."""
+def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> "_Solution":
+    """Return the lowest minimum that is found."""
     solutions = search.solved(starts(file.graph, file.chains))
     best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
-    known = search.certificate(best)
-    if known.is_global or args.robust or args.incremental:
-        return best, known
+    if args.robust or args.incremental:
+        return best
     further = starts_nearby(best.start, best.graph)
     if not args.from_odometry:
         forgotten = file.from_odometry()
@@ -65,8 +61,8 @@ def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> tuple
     for rival in search.solved(further):
         as_many = len(rival.start.unplaced) <= len(best.start.unplaced)
         if as_many and rival.summary.chi2 < (1.0 - search.config.relative_decrease) * best.summary.chi2:
-            best, known = rival, search.certificate(rival)
-    return best, known
+            best = rival
+    return best
 
 
 _WORK = 4e10
@@ -125,14 +121,6 @@ class _Search:
         # The file keeps every edge; which ones were left out is not a property of the measurements.
         return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
 
-    def certificate(self, solution: "_Solution") -> Certificate:
-        """Return what is known of the global minimum."""
-        if self.args.robust:
-            return Certificate(False, 0.0, "a search decided which edges are outliers")
-        if not solution.summary.converged:
-            return Certificate(False, 0.0, "the search did not converge")
-        return certify(solution.graph, max(self.left, 0.0))
-
 
 def _figures(file: GraphFile, summary: SolverSummary, lost: list[str]) -> dict[str, Any]:
     edges = Counter[str]()
@@ -181,9 +169,6 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
             f" that of poses {' and '.join(closures['worst'])} most of all: they contradict each other, or state too much"
             " precision; check their poses, measurements and information"
         )
-    bound = figures["chi2_lower_bound"]
-    below = f"; no minimum lies below chi2 {bound:.6g}" if bound > 0.0 else ""
-    lines.append(f"certificate: {figures['certificate']}{below}")
     if figures["chains"] > 1:
         lines[0] += f"; {figures['chains']} chains that nothing but ranges ties together"
     if "outliers" in figures:

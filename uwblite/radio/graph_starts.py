@@ -1,6 +1,6 @@
 """Starts for the optimisation of an imported graph: every chain and every anchor gets a place.
 
-Without a certificate (graph/certificate.py) further starts may lead to a lower minimum. Trajectories of several robots that
+A descent ends in a local minimum, and further starts may lead to a lower one. Trajectories of several robots that
 only ranges and landmarks connect are placed one after another, the best connected first, each rigid, by the ranges to placed
 points (0 where the chain sees a landmark; trilateration.path_placements). The optimisation of the whole graph decides between
 several hypotheses.
