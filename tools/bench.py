@@ -7,7 +7,6 @@
     python tools/bench.py map --log hall=recordings/hall/run.log  whole runs of `uwblite map`; --log may be repeated
     python tools/bench.py map --log hall=run.log --tree ../before --tree .    the same by two versions, alternately
     python tools/bench.py start                             import and --help above bare python
-    python tools/bench.py hundred                           75,000 poses, incrementally from their odometry: minutes
 
 Processor time on one core and one BLAS thread; runs of a library and of its peers alternate, so that a busy machine
 slows both. Start is wall time, whole runs are both. Recordings are made by tools/simulate.py (hall, 31 min: --minutes 31;
@@ -30,7 +29,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-PARTS = ("graphs", "large", "marginals", "gnc", "icp", "start", "hundred", "map")
+PARTS = ("graphs", "large", "marginals", "gnc", "icp", "start", "map")
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 
 
@@ -152,24 +151,6 @@ def bench_gnc(repeats: int) -> None:
         show(seed, spent, *errors, errors[2] / errors[0])
 
 
-def bench_hundred() -> None:
-    """Optimise a hundred times the paper's graph from its odometry; compare with the minimum next to the truth."""
-    from bench_graphs import ate, paper_graph, trilaterated
-
-    from uwblite.graph.solver import optimize
-    from uwblite.radio.incremental import optimize_incrementally
-
-    head("Hundred times the paper", "from", "s", "iterations at the end", "chi2 / dof", "ATE, m")
-    graph, truth = paper_graph(100)
-    show("(the odometry)", 0, 0, "", ate(graph.poses, truth))
-    near = graph.updated(truth, trilaterated(truth, graph.edges[2], len(graph.anchors)), graph.calibration.values)
-    runs = {"truth, plain": lambda: optimize(near), "odometry, incremental": lambda: optimize_incrementally(graph)}
-    for name, run in runs.items():
-        began = time.process_time()
-        found, summary = run()
-        show(name, time.process_time() - began, summary.iterations, summary.chi2_per_dof, ate(found.poses, truth))
-
-
 def bench_icp(repeats: int) -> None:
     """Align two noisy views of a hall, everything from the bare points included."""
     import numpy as np
@@ -277,7 +258,7 @@ def main() -> int:
     unknown = set(args.parts) - set(PARTS)
     if unknown:
         parser.error(f"unknown part {', '.join(sorted(unknown))}; choose from {', '.join(PARTS)}")
-    parts = args.parts or [p for p in PARTS if p not in ("hundred", "map") or (p == "map" and args.log)]
+    parts = args.parts or [p for p in PARTS if p != "map" or args.log]
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: args.cores])
     runs = {
@@ -287,7 +268,6 @@ def main() -> int:
         "gnc": lambda: bench_gnc(max(1, args.repeats // 3)),
         "icp": lambda: bench_icp(args.repeats),
         "start": lambda: bench_start(args.repeats),
-        "hundred": bench_hundred,
         "map": lambda: bench_map(args.log, max(1, args.repeats // 3), args.map_option, args.tree or [str(ROOT)]),
     }
     for part in parts:

@@ -155,12 +155,6 @@ def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):
     assert "outliers left out: " in out
 
 
-def test_the_two_ways_exclude_one_another(tmp_path, capsys):
-    path = written(tmp_path / "g.pyfg", loop(3, n=50)[0])
-    assert main(["optimize", path, "--robust", "--incremental"]) == 2
-    assert "not allowed with" in capsys.readouterr().err
-
-
 def test_lines_of_kinds_that_are_not_used_are_said(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     path.write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_BEARING_SE2_XY 0 5 0.5 100\n")

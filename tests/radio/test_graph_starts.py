@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import loop, plain_ranges, relative_edges
+from helpers.planted_graphs import lawn, loop, plain_ranges, relative_edges
 from scipy.optimize import brentq
 
 from uwblite import se2
 from uwblite.cli import main
 from uwblite.errors import FormatError
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.point_edges import PointDistanceEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
@@ -27,6 +27,7 @@ from uwblite.radio.graph_starts import (
     search_anchors,
     starts,
     starts_nearby,
+    straightened,
 )
 from uwblite.radio.trilateration import AnchorHypothesis, PathPlacement
 
@@ -175,6 +176,35 @@ def test_chains_find_their_places(seed, ties):
     # Odometry of 80 steps bends by some decimetres over 16 m.
     assert min(errors) < 1.0
     assert len(place_chains(replace(graph, poses=truth), np.zeros(len(truth), dtype=np.intp))) == 1
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_path_bent_by_its_odometry_is_straightened(seed):
+    graph, truth, anchors = lawn(seed)
+    best = optimize(replace(graph, poses=truth, anchors=anchors))
+    # Descent from the odometry, and from anchors where they are, ends elsewhere.
+    assert optimize(replace(graph, anchors=anchors))[1].chi2 > 2.0 * best[1].chi2
+    found, summary = optimize(place_anchors(straightened(graph))[0])
+    assert summary.chi2 == pytest.approx(best[1].chi2, rel=1e-5)
+    np.testing.assert_allclose(found.poses[:, :2], best[0].poses[:, :2], atol=0.02)
+
+
+@pytest.mark.parametrize("prior", [False, True])
+def test_given_anchors_say_where_a_straightened_path_lies(prior):
+    graph, truth, anchors = lawn(3, n=400)
+    graph = replace(graph, anchors=anchors, fixed_anchors=np.full(16, not prior), fixed_poses=np.zeros(400, dtype=bool))
+    if prior:
+        graph = graph.with_edges(PriorEdges("anchors", np.arange(16), anchors, np.tile(np.eye(2) / 0.05, (16, 1, 1))))
+    graph = replace(graph, poses=se2.compose([5.0, 3.0, 1.0], graph.poses))
+    found = straightened(graph)
+    np.testing.assert_array_equal(found.anchors, anchors)
+    # Ranges of 0.1 m to three anchors.
+    assert np.sqrt(np.mean(np.sum((found.poses - truth)[:, :2] ** 2, axis=1))) < 0.2
+
+
+def test_a_path_without_ranges_is_not_straightened():
+    graph = loop(2, anchors=0)[0]
+    assert straightened(graph) is graph
 
 
 def test_optimize_is_as_good_as_from_the_truth(tmp_path, capsys):

@@ -17,8 +17,7 @@ from ..graph.solver import ALL_WORK_DONE, Progress, SolverConfig, SolverSummary,
 from ..io.formats import graph_format, read_graph, refuse_existing, write_graph
 from ..io.graph_file import GraphFile
 from ..io.tum import write_tum
-from ..radio.graph_starts import Start, starts, starts_nearby
-from ..radio.incremental import optimize_incrementally
+from ..radio.graph_starts import Start, starts, starts_nearby, straightened
 from . import console
 
 
@@ -29,9 +28,10 @@ def run(args: argparse.Namespace) -> int:
     config = override(SolverConfig(), args.set)
     file = read_graph(args.graph, from_odometry=args.from_odometry or args.incremental)
     if args.incremental and (count := len(set(file.chains.tolist()))) > 1:
-        raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
+        raise ConfigError(f"--incremental places the poses of one robot; {args.graph} has {count} chains of odometry")
     console.note_of(args.graph, file.warnings)
-    file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
+    graph = straightened(file.graph) if args.incremental else file.graph
+    file = dataclasses.replace(file, graph=with_kernel(graph, Kernel(args.kernel, args.kernel_scale)))
     with closing(console.Progress()) as progress:
         search = _Search(args, config, lambda done, most: progress("optimising", done, most), _allowed(args, file.graph))
         best = _best(search, file, args)
@@ -52,7 +52,7 @@ def _best(search: "_Search", file: GraphFile, args: argparse.Namespace) -> "_Sol
     """Return the lowest minimum that is found."""
     solutions = search.solved(starts(file.graph, file.chains))
     best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
-    if args.robust or args.incremental:
+    if args.robust:
         return best
     further = starts_nearby(best.start, best.graph)
     if not args.from_odometry:
@@ -108,8 +108,6 @@ class _Search:
     def _solution(self, start: Start) -> "_Solution":
         if self.args.robust:
             return self._reject_outliers(start)
-        if self.args.incremental:
-            return _Solution(*optimize_incrementally(start.graph, self.config, self.progress, self.left), {}, start)
         return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
 
     def _reject_outliers(self, start: Start) -> "_Solution":

@@ -509,10 +509,8 @@ exit code 3: the search did not converge
         option("--out FILE", "optimised graph; .g2o or .pyfg by its name, .gz compresses", place),
         option("--trajectory FILE", "poses as a TUM trajectory, as evo reads it", place),
         option("--from-odometry", "forget the file's estimates, start from the odometry"),
-        either(
-            option("--incremental", "from the odometry: add poses in the order of time, anchors when ranges place them"),
-            option("--robust", "leave out closures and ranges that are outliers by graduated non-convexity"),
-        ),
+        option("--incremental", "from the odometry, straightened by ranges outwards from where they place anchors best"),
+        option("--robust", "leave out closures and ranges that are outliers by graduated non-convexity"),
         option("--kernel NAME", "robust kernel on edges that close loops, and ranges", default="none"),
         option("--kernel-scale K", "standard deviations where it bends (2)", ABOVE_ZERO, 2.0),
         option("--set NAME=VALUE", "solver setting, e.g. max_iterations=200; repeatable", **REPEATED),

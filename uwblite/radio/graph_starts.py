@@ -4,6 +4,9 @@ A descent ends in a local minimum, and further starts may lead to a lower one. T
 only ranges and landmarks connect are placed one after another, the best connected first, each rigid, by the ranges to placed
 points (0 where the chain sees a landmark; trilateration.path_placements). The optimisation of the whole graph decides between
 several hypotheses.
+
+No descent from dead reckoning over kilometres finds the minimum: a path may also be straightened first by its ranges, outwards
+from where its anchors are clearest, as that of a recording is (bootstrap_attempt.py).
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,13 +16,17 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, concatenated
+from ..graph.calibration import odometry_indices
 from ..graph.chordal_start import chordal_start
 from ..graph.graph import Graph
 from ..graph.point_edges import LandmarkEdges, PointDistanceEdges, seen_anchors
-from ..graph.problem_checks import tied_chains
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
+from ..graph.problem_checks import given_anchors, tied_chains
 from ..graph.range_edges import RangeEdges
+from ..graph.unknowns import free_unknowns
 from ..problem.alternatives import EvidencePolicy
+from .bootstrap_attempt import Attempt, Measured
 from .trilateration import TrilaterationConfig, path_placements, trilaterate
 
 _CLEARLY = 0.02
@@ -64,6 +71,56 @@ def starts_nearby(start: Start, optimised: Graph) -> Iterator[Start]:
     for graph in (chordal_start(optimised), search_anchors(start.graph)):
         if graph is not None:
             yield Start(graph, start.unplaced)
+
+
+def straightened(graph: Graph) -> Graph:
+    """Return the graph with the poses of its one chain as odometry and ranges place them, unchanged without ranges.
+
+    Anchors get the places found on the way (nan: none), but for those that are given. The path lies where given anchors, two
+    at least, put it, else its first fixed pose.
+
+    Parameters
+    ----------
+    graph : its poses follow the odometry; all are poses of one robot in the order of time.
+    """
+    ranges = [e for e in graph.edges if isinstance(e, RangeEdges) and len(e)]
+    if not ranges:
+        return graph
+    motion = se2.between(graph.poses[:-1], graph.poses[1:])
+    attempt = Attempt(
+        Graph(graph.poses, np.zeros_like(graph.anchors)),
+        Measured(
+            _odometry(graph, motion),
+            concatenated(ranges),
+            np.append(0.0, np.cumsum(np.hypot(*motion[:, :2].T))),
+            float(np.median(np.concatenate([e.sigma for e in ranges]))),
+        ),
+        TrilaterationConfig(),
+    )
+    attempt.run()
+    known = given_anchors(graph) & attempt.placed
+    first = int(np.argmin(free_unknowns(graph)["poses"]))
+    moved = se2.compose(graph.poses[first], se2.inverse(attempt.poses[first]))
+    if known.sum() > 1:
+        moved = se2.align(attempt.anchors[known], graph.anchors[known])
+    places = np.where(attempt.placed[:, None], se2.transform(moved, attempt.anchors), np.nan)
+    return replace(
+        graph,
+        poses=se2.compose(moved, attempt.poses),
+        anchors=np.where(given_anchors(graph)[:, None], graph.anchors, places),
+    )
+
+
+def _odometry(graph: Graph, motion: Floats) -> OdometryEdges:
+    """Return the steps (n - 1, 3) between successive poses with the information of the edges that measured them; others are
+    uncertain by 1 m and 1 rad."""
+    each, root = np.arange(len(motion)), np.tile(np.eye(motion.shape[1]), (len(motion), 1, 1))
+    for e in graph.edges:
+        if isinstance(e, RelativePoseEdges):
+            steps = e.rows(e.j == e.i + 1)
+            root[steps.i] = steps.sqrt_information
+    unknowns = odometry_indices(graph.calibration, len(motion))
+    return OdometryEdges(each, each + 1, motion, motion[:, 0], np.ones(len(motion)), root, unknowns)
 
 
 def ranges_to(edges: Iterable[RangeEdges], poses: Floats) -> tuple[Floats, Floats]:
