@@ -19,7 +19,6 @@ from uwblite.radio.prior_selection import (
     _common,
     _mean_under,
     _units,
-    is_uncalibrated,
     select_priors,
     with_calibrated_radio,
 )
@@ -260,16 +259,3 @@ def test_a_calibrated_radio_has_the_narrowest_priors_tried():
     # A prior that is narrower stays.
     narrow = replace(CONFIG, range_bias_sound=0.5, range_bias=0.5)
     assert widths(with_calibrated_radio(done, narrow)) == pytest.approx(after)
-
-
-@pytest.mark.parametrize(("bias", "scale", "asked"), [
-    ((0.0, 0.0, 0.0, 0.0), 1.0, False), ((0.1, -0.05, 0.08, 0.0), 1.0, False), ((0.9, 0.4, 1.3, 0.7), 1.0, True),
-    ((0.0, 0.0, 0.0, 0.0), 1.07, True),
-])  # fmt: skip
-def test_wide_priors_are_asked_for_where_a_calibrated_radio_contradicts_its_ranges(bias, scale, asked):
-    graph, edges = solved(2, bias=bias, scale=scale)
-    calibrated = with_calibrated_radio(graph, CONFIG)
-    done = optimize(calibrated.with_edges(edges))[0]
-    chosen = select_priors(calibrated.updated(done.poses, done.anchors, done.calibration.values), (edges,), CONFIG)
-    assert is_uncalibrated(chosen, CONFIG) == asked
-    assert not is_uncalibrated(calibrated, CONFIG)

@@ -20,8 +20,7 @@ from ..graph.work import Work
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.slips import slipped, with_slips
-from ..odometry.wheels import redundancy, sideways_priors, variance_factors, wheel_edges
-from ..problem.alternatives import EvidencePolicy
+from ..odometry.wheels import sideways_priors, variance_factors, wheel_edges
 from ..problem.evidence import laplace_marginal_likelihood
 from ..problem.solution import comparable, rough
 from ..radio import bootstrap, prior_selection
@@ -54,7 +53,7 @@ def first_optimisation(task: Task) -> Estimate:
     estimates = [dead_reckoning(recording, task.config, task.stages.work) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
-    estimates = [_of_likelier_radio(estimate, n, task) for n, estimate in enumerate(estimates)]
+    estimates = [_optimised(bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
         return range_alternatives.choose_heights(estimates[0], task.config)
     joined = _optimised(replace(joining.join(estimates, recordings), alone=tuple(estimates)), task)
@@ -91,28 +90,15 @@ def heights_given(recording: Recording) -> Bools:
     return np.array([height is not None for height in heights], dtype=bool)
 
 
-def _of_likelier_radio(estimate: Estimate, number: int, task: Task) -> Estimate:
-    """Bootstrap and optimise one recording with a calibrated radio; also with one that is not, where the result asks for it.
-
-    Wide priors lead to other places from the beginning, and noise that is learnt there justifies them. So they are an
-    alternative that is solved from the beginning as well, and that the likelihood of all ranges has to pay for.
-    """
-    priors = task.config.calibration
-    calibrated = replace(estimate, graph=prior_selection.with_calibrated_radio(estimate.graph, priors))
-    sound = _optimised(bootstrapped(calibrated, number, task), task)
-    if sound.ranges is None or not prior_selection.is_uncalibrated(sound.graph, priors):
-        return sound
-    wide = _optimised(bootstrapped(estimate, number, task), task)
-    if (missing := int(sound.placed.sum() - wide.placed.sum())) != 0:
-        return sound if missing > 0 else wide
-    return wide if evidence_against(wide, sound, task.config) > EvidencePolicy.positive else sound
-
-
 def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
-    """Find trajectory and anchors of one recording without any guess of the anchors."""
+    """Find trajectory and anchors of one recording without any guess of the anchors.
+
+    The radio is taken for calibrated until the last lap: noise that is learnt under wide priors justifies them.
+    """
     ranges, recordings, config = estimate.ranges, task.recordings, task.config
     if ranges is None:
         return estimate
+    estimate = replace(estimate, graph=prior_selection.with_calibrated_radio(estimate.graph, config.calibration))
     path = recordings.path[recordings.each[number].rows]
     used = ranges.alive
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
@@ -203,16 +189,7 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     (rest, density, share), (rest_of_other, density_of_other, share_of_other) = (_evidence(e, config) for e in (one, other))
     common = 0.5 * (share + share_of_other) * ((share > 0.0) & (share_of_other > 0.0))
     ranges = float(common @ density) - float(common @ density_of_other)
-    return rest - rest_of_other + ranges + _for_tighter_wheels(one, other)
-
-
-def _for_tighter_wheels(one: Estimate, other: Estimate) -> float:
-    """Return by how much the logarithm of the density of wheels of less noise is greater, of steps that others measure."""
-    tighter = np.einsum("eii->ei", one.odometry.sqrt_information) / np.einsum("eii->ei", other.odometry.sqrt_information)
-    if np.all(tighter == 1.0):
-        return 0.0
-    shown = [redundancy(each.problem, each.odometry, np.ones(len(each.odometry))) for each in (one, other)]
-    return float(np.mean(shown, axis=0) @ np.log(tighter).mean(axis=0))
+    return rest - rest_of_other + ranges
 
 
 def _evidence(estimate: Estimate, config: MappingConfig) -> tuple[float, Floats, Floats]:

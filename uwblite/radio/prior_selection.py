@@ -49,23 +49,11 @@ class UnitPolicy:
 
 def with_calibrated_radio(graph: Graph, config: CalibrationConfig) -> Graph:
     """Return the graph with the priors of a radio whose antenna delays and unit are right, or narrower ones that it has."""
-    sigma = prior_sigma(graph)
-    for kind, widths in _widths(config):
+    sigma, biases = prior_sigma(graph), _between(config.range_bias_sound, config.range_bias)
+    for kind, widths in ((BIAS, biases), (RANGE_SCALE, _between(config.range_scale_sound, config.range_scale))):
         own = graph.calibration.of_kinds(kind)
         sigma[own] = np.minimum(sigma[own], widths[0])
     return with_prior_sigma(graph, sigma)
-
-
-def is_uncalibrated(graph: Graph, config: CalibrationConfig) -> bool:
-    """Return whether priors of biases or of the scale are wider than the next that is tried after a calibrated radio's."""
-    sigma = prior_sigma(graph)
-    return any(np.any(sigma[graph.calibration.of_kinds(kind)] > max(widths[:2])) for kind, widths in _widths(config))
-
-
-def _widths(config: CalibrationConfig) -> tuple[tuple[str, list[float]], ...]:
-    """Return the widths tried of each kind of error of a radio, from those of a calibrated one on."""
-    biases = _between(config.range_bias_sound, config.range_bias)
-    return (BIAS, biases), (RANGE_SCALE, _between(config.range_scale_sound, config.range_scale))
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
