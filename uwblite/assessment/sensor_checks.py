@@ -258,13 +258,13 @@ def lidar_figures(log: SensorLog) -> Figures:
     """Return rhythm, field of view, and shares of beams of the scans."""
     scans = log.scans
     assert scans is not None
-    beams = scans.ranges.shape[1]
+    readings, beams = scans.ranges.size, scans.ranges.shape[1]
     figures = {
         "field of view deg": np.degrees(abs(scans.angle_increment) * (beams - 1)),
         "range max m": scans.range_max,
-        "share of beams that hit": scans.hits(scans.ranges).mean(),
-        "share that saw nothing": np.isposinf(scans.ranges).mean(),
-        "share that is invalid": np.isnan(scans.ranges).mean(),
+        "share of beams that hit": np.count_nonzero(scans.hits(scans.ranges)) / readings,
+        "share that saw nothing": np.count_nonzero(scans.ranges == np.inf) / readings,
+        "share that is invalid": np.count_nonzero(np.isnan(scans.ranges)) / readings,
     }
     return rhythm(scans.stamps, expected_gap=1.0) | {"beams": beams} | _rounded(figures)
 

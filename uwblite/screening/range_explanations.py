@@ -339,19 +339,19 @@ def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
     its distance from the middle of the path.
     """
     many = counted.sum(axis=-1)
-    middle = np.sum(paths * counted[..., None], axis=-2) / many[..., None]
+    middle = (counted[..., None, :] @ paths)[..., 0, :] / many[..., None]
     x, y = (-2.0 * (paths[..., k] - middle[..., k, None]) for k in (0, 1))
     squares, twice = ranges**2 - 0.25 * (x**2 + y**2), 2.0 * ranges
     rows = np.stack([x, y, np.broadcast_to(1.0, x.shape), squares], axis=-2)
-    sure = counted / twice**2
+    unknown, sure = rows[..., :-1, :], counted / twice**2
     weights = np.broadcast_to(sure, squares.shape)
     for _ in range(PathPolicy.rounds):
-        normal = (rows[..., :-1, :] * weights[..., None, :]) @ np.swapaxes(rows, -1, -2)
+        normal = (unknown * weights[..., None, :]) @ np.swapaxes(rows, -1, -2)
         found = np.linalg.solve(normal[..., :-1] + PathPolicy.ridge * np.eye(normal.shape[-2]), normal[..., -1:])
-        errors = (found[..., 0, :] * x + found[..., 1, :] * y + found[..., 2, :] - squares) / twice
+        errors = ((np.swapaxes(found, -1, -2) @ unknown)[..., 0, :] - squares) / twice
         weights = sure / (1.0 + (errors / PathPolicy.noise[1]) ** 2)
     scales = PathPolicy.noise.reshape(-1, *(1,) * (errors.ndim - 1))
-    off = np.sum(counted * np.log(1.0 + (errors / scales[..., None]) ** 2), axis=-1)
+    off = np.einsum("...n,...n", np.log(1.0 + (errors / scales[..., None]) ** 2), counted)
     return np.asarray(-off - many * np.log(np.pi * scales) - 1.5 * np.log(many))
 
 
