@@ -246,21 +246,21 @@ class PoseEstimator:
         if not len(found.bank):
             self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
             return
-        self._bank = found.hypotheses
-        best = int(np.argmax(self._bank.log_weight))
-        ranges, pose = found.ranges, self._bank.poses[best].copy()
-        alone = found.complete and verdict.odds_of_place(self._bank, best) > verdict.LIKELY
+        best = int(np.argmax(found.weight))
+        # Several poses that were tried may have moved to one place, which counts once.
+        self._bank = hypotheses.pruned(found.hypotheses, _MOST, _FORGET)
+        ranges, pose = found.ranges, self._bank.poses[0].copy()
+        alone = found.complete and verdict.odds_of_place(self._bank, 0) > verdict.LIKELY
         agreed = self._agreed(pose if alone else None)
         odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed, self._tracked)
         self._reason = (
-            verdict.undecided(self._bank, best, found.complete)
-            or verdict.imprecise(self._bank.pose_covariances[best])
+            verdict.undecided(self._bank, 0, found.complete)
+            or verdict.imprecise(self._bank.pose_covariances[0])
             or odds.nowhere
             or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)
         )
         if not self._reason and odds.total < verdict.CERTAIN:
             self._reason = "found; a little more driving will confirm it"
-        self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         if not self._reason:
             self.tracks = self._tracked = True
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
