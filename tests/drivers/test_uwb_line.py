@@ -11,7 +11,7 @@ from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Lost, Note, RangeEpoch
 from uwblite.drivers.text_lines import LineProtocol
 from uwblite.drivers.uwb_line import BOARDS as FORMS
-from uwblite.drivers.uwb_line import by_columns, parse_columns
+from uwblite.drivers.uwb_line import by_columns, parse_columns, sound_lines
 from uwblite.errors import ConfigError
 
 SPECS = {name: f"{name}:port" for name in BOARDS} | {
@@ -82,6 +82,12 @@ def test_older_at_firmware_reports_rssi_and_no_ids():
 )
 def test_lines_that_are_not_whole_are_damage(name, line):
     assert isinstance(FORMS[name](line), str)
+
+
+def test_a_line_that_names_an_anchor_twice_is_the_beginning_of_one_and_the_end_of_another():
+    row = '{"Addr":"0x000%d","Status":"Ok","D_cm":%d}'
+    line = '{"Block":3948, "results":[' + ",".join(row % pair for pair in ((1, 382), (2, 372), (1, 383))) + "]}"
+    assert isinstance(sound_lines(FORMS["dwm3001"])(line), str)
 
 
 @pytest.mark.parametrize("name", FORMS)

@@ -26,7 +26,7 @@ from .scip_commands import ScanRequest
 from .scip_driver import ScipDriver
 from .session import Driver, Session
 from .text_lines import LineProtocol
-from .uwb_line import BOARDS, Parse, UwbDriver, by_columns, parse_columns, within_reach
+from .uwb_line import BOARDS, Parse, UwbDriver, by_columns, parse_columns, sound_lines
 from .ydlidar import YdLidarX2Driver, YdLidarX4Driver
 
 CP2102 = ("10c4:ea60",)
@@ -153,7 +153,7 @@ def _gyro_line(options: Values, _setup: Setup) -> Driver:
 
 def _board(parse: Parse, title: str, options: Values) -> Driver:
     clock = DeviceClock(options.get("time_unit", 1.0), proven=False)
-    return UwbDriver(LineProtocol(within_reach(parse)), title, options["baud"], clock, options["tag"])
+    return UwbDriver(LineProtocol(sound_lines(parse)), title, options["baud"], clock, options["tag"])
 
 
 def _uwb_line(options: Values, _setup: Setup) -> Driver:

@@ -68,6 +68,18 @@ class Lds01Driver(SpinningDriver):
 
     def __init__(self) -> None:
         super().__init__(Lds01Protocol(), FAN)
+        self._latest: Samples | None = None
+
+    def take(self, event: Samples) -> list[Action]:
+        """Turn packets into scans. One counts when the next one's angles follow.
+
+        Where bytes were lost, the beginning of one and the end of another have a right sum once in 128 times.
+        """
+        before, self._latest = self._latest, event
+        if before is None:
+            return []
+        step = (event.turned[0] - before.turned[-1]) % 1.0
+        return super().take(before) if step < 1.5 * DEGREE else [Corrupt(b"", "packet before a gap")]
 
     def start_up(self) -> Script[bool]:
         yield Send(START)

@@ -148,13 +148,16 @@ def reading(anchor: str, metres: float, quality: float = 100.0) -> RangeReading:
     return RangeReading(anchor.upper(), metres, round(min(max(quality, 0.0), 100.0)))
 
 
-def within_reach(parse: Parse) -> Parse:
-    """Return what reads lines as `parse` does and calls those damaged whose ranges no radio has."""
+def sound_lines(parse: Parse) -> Parse:
+    """Return what reads lines as `parse` does and calls those damaged whose ranges no radio has, or that name an anchor twice:
+    the beginning of one and the end of another."""
 
     def checked(line: str) -> Ranges | Refused | str | None:
         content = parse(line)
-        far = isinstance(content, Ranges) and any(abs(r.range) > MOST_RANGE for r in content.readings)
-        return f"a range beyond {MOST_RANGE:.0f} m" if far else content
+        readings = content.readings if isinstance(content, Ranges) else ()
+        if any(abs(r.range) > MOST_RANGE for r in readings):
+            return f"a range beyond {MOST_RANGE:.0f} m"
+        return content if len({r.anchor_id for r in readings}) == len(readings) else DAMAGED
 
     return checked
 
