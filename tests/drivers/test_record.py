@@ -20,6 +20,7 @@ from helpers.driver_harness import ROOT
 
 from uwblite.cli import main
 from uwblite.drivers.devices import open_device
+from uwblite.io.folders import sole_writer
 
 WITHOUT_NUMPY = "import sys; sys.modules['numpy'] = sys.modules['scipy'] = None; from uwblite.cli import main; sys.exit(main())"
 
@@ -128,6 +129,15 @@ def wait_for(path, word, count=5):
 
 
 @pytest.mark.slow
+def test_a_log_that_is_being_written_is_not_appended_to(tmp_path, capsys):
+    path = tmp_path / "run.log"
+    path.write_bytes(b"# CARMEN Logfile\n")
+    with sole_writer(path):
+        assert main(["record", "--odometry", f"kobuki:{tmp_path}/base", "--wait", "--out", str(path), "--append"]) == 1
+    assert "another run is writing" in capsys.readouterr().err
+    assert path.read_bytes() == b"# CARMEN Logfile\n"
+
+
 def test_kill_and_append(bench, tmp_path):
     """kill -9 in mid-run: every line but perhaps the last is whole, and --append goes on from the last pose."""
     start, arguments, _ = bench

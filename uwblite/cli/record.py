@@ -17,6 +17,7 @@ from ..drivers.log_file import LogFile, last_state
 from ..drivers.recorder import Recorder
 from ..drivers.transport import absent_port, check_pyserial, check_url, stable_name
 from ..errors import ConfigError, DeviceError
+from ..io.folders import sole_writer
 from .child import Child
 from .console import Progress, note, report
 from .interruption import stopped_by
@@ -34,6 +35,11 @@ def run(args: argparse.Namespace) -> int:
     if path.suffix in (".gz", ".bz2", ".xz", ".zip"):
         note(f"uwblite: error: --out {path}: a log is plain text, so that a crash loses one line; compress it afterwards")
         return 2
+    with sole_writer(path):
+        return _record(args, path)
+
+
+def _record(args: argparse.Namespace, path: Path) -> int:
     offset = time.time() - time.monotonic()
     pose, remark = (0.0, 0.0, 0.0), ""
     if args.append and path.exists():
