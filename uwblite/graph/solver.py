@@ -164,6 +164,9 @@ class DescentPolicy:
     """Share of the predicted decrease from which on the other way of moving has little to gain."""
     quadratic: ClassVar[float] = 0.5
     """Share of the predicted decrease below which the cost is not quadratic along a step, and predicts no later ones."""
+    many: ClassVar[float] = 1e3
+    """Unknowns from which on the first lambda falls with their squared number: the damping of all poses of a chain, which move
+    together, is to be softer than one of its steps."""
     first: ClassVar[float] = 1e-5
     most: ClassVar[float] = 1e12
     """lambda at least after a step that failed, and at most."""
@@ -187,7 +190,8 @@ class _Descent:
         """H is of the estimate, and not of one before it."""
         self.factor: Factor | None = None
         """To be used again; None = factorise."""
-        self.damping, self.raised_by, self.last_decrease = config.initial_damping, 2.0, np.inf
+        self.damping = config.initial_damping / max(normal.unknowns.size / DescentPolicy.many, 1.0) ** 2
+        self.raised_by, self.last_decrease = 2.0, np.inf
         self.decreases: list[float] = []
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
