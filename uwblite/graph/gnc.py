@@ -48,7 +48,9 @@ def _threshold(dimensions: int) -> float:
     return float(np.sqrt(chdtri(dimensions, OutlierPolicy.probability)))
 
 
-def optimize_tightening(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
+def optimize_tightening(
+    graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig, together: bool = False
+) -> Graph:
     """Optimise with a Geman-McClure kernel on chosen kinds of edges that is tightened, scale by scale, standard deviations.
 
     A scale that no residual exceeds would reject nothing: it is left out, but for the last.
@@ -56,13 +58,16 @@ def optimize_tightening(graph: Graph, chosen: Collection[int], scales: Sequence[
     Parameters
     ----------
     chosen : their positions in ``graph.edges``.
+    together : the kernels of all other edges are wider by the same ratio, until the last scale. Of two steps of the odometry,
+        the one that gave way before would else stay torn, although the other explains the closures better.
     """
-    optimizer = Optimizer()
+    optimizer, given = Optimizer(), graph.edges
     for scale in scales:
         if scale != scales[-1] and _worst(graph, dict.fromkeys(chosen, scale)) <= 1.0:
             continue
-        kernel = Kernel("geman-mcclure", scale)
-        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))
+        kernel, wider = Kernel("geman-mcclure", scale), scale / scales[-1] if together else 1.0
+        others = [replace(e.kernel, scale=wider * e.kernel.scale) for e in given]
+        edges = tuple(replace(e, kernel=kernel if k in chosen else others[k]) for k, e in enumerate(given))
         graph = optimizer.optimize(replace(graph, edges=edges), solver)[0]
     return graph
 

@@ -18,6 +18,7 @@ from ..graph.gnc import optimize_tightening
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..graph.pose_edges import RelativePoseEdges
+from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
@@ -164,7 +165,9 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     # The first scale contains every closure: one that ends a long drift would else be rejected before it has any weight.
     steps = int(np.ceil(np.log(max(worst / config.agrees, 1.0)) / np.log(_TIGHTER)))
     scales = [config.agrees * _TIGHTER**k for k in range(steps, -1, -1)]
-    solved = optimize_tightening(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick)
+    # Ranges tell by themselves which step of the odometry is torn.
+    alone = not any(isinstance(edges, RangeEdges) for edges in graph.edges)
+    solved = optimize_tightening(graph.with_edges(closures.edges), [len(graph.edges)], scales, quick, together=alone)
     solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
