@@ -71,6 +71,20 @@ def test_wheels_that_stand_still_make_no_clock(seed, still):
     assert {fact.kind for fact in facts} <= {"wheels-against-ranges"}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_wheels_that_slip_twice_along_a_straight_way_make_no_clock(seed):
+    """Ranges that are late by time that grows fit the two stretches on which wheels count twice the way."""
+    rng, stamps = np.random.default_rng(seed), np.arange(0.0, 200.0, 0.05)
+    y = 0.2 * np.sin(stamps / 9.0)
+    truth = np.column_stack([0.4 * stamps, y, np.arctan2(np.gradient(y), 0.4 * 0.05)])
+    anchors = np.array([[2.0, 2.5], [20.0, -2.0], [38.0, 3.0], [58.0, -2.5], [78.0, 2.0]])
+    wheels = planted.odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
+    log = SensorLog(wheels, planted.ranges(rng, stamps, truth, anchors, rate=1.0, sigma=0.05, outliers=0.05), None)
+    for begin, end in ((8.0, 12.5), (150.0, 154.0)):
+        log = redriven(log, begin, end, lambda steps: steps * [2.3, 1.0, 1.0] - [0.0, 0.0, 0.013])
+    assert {kind for kind, _ in kinds_of(log)} == {"wheels-against-ranges"}
+
+
 def test_wheels_that_turn_at_random_make_no_clock():
     """Each stretch fits at some other offset; all are no clock."""
     rng = np.random.default_rng(0)

@@ -167,36 +167,49 @@ def _traces(log: SensorLog) -> list[Trace]:
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
     """Return a radio's clock that is off throughout, by a constant or by one that grows evenly; its rivals are wheels with
-    another scale throughout, and ranges that are any numbers."""
+    another scale throughout or that slip on some stretches, and ranges that are any numbers."""
     offsets, factors, slight = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors, 1.5
     count, length, start, duration = len(factors), PathPolicy.stretch, log.odometry.stamps[0], np.ptp(log.odometry.stamps)
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    each, shares, counted = np.zeros((len(PathPolicy.noise), 0, count + len(offsets))), list[float](), 0
+    longest = max(float(trace.ranges.max(initial=1.0)) for trace in traces)
+    stretches, shares, counted = list[Floats](), list[float](), 0
     for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
+        likely, stamps = np.zeros((len(PathPolicy.noise), count + len(offsets))), list[Floats]()
+        lost = np.zeros(len(likely))
         for trace in (trace.between(begin, end) for trace in traces):
             if len(trace.ranges) < PathPolicy.fewest:
                 continue
             shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
             paths = np.concatenate([factors[:, None, None] * trace.places, shifted])
-            each = np.concatenate([each, _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))[:, None]], axis=1)
-            shares.append(float((trace.stamps.mean() - start) / duration))
-            counted += len(trace.ranges)
+            likely += _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
+            lost += _by_way(trace, longest)
+            stamps.append(trace.stamps)
+        if stamps:
+            # Whatever the clock, on a stretch where the wheels slip only the way is known, or its path is any of these.
+            of_any = np.logaddexp.reduce(likely, axis=1, keepdims=True) - np.log(likely.shape[1])
+            stretches.append(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost[:, None], of_any)))
+            shares.append(float((np.concatenate(stamps).mean() - start) / duration))
+            counted += sum(len(each) for each in stamps)
+    if not stretches:
+        return Explanation(-np.inf, "late-ranges", {})
+    each = np.stack(stretches, axis=1)
     first, last = (offset.ravel() for offset in np.meshgrid(offsets, offsets))
     late = np.zeros((len(each), len(first)))
     for k, share in enumerate(shares):
         late += each[:, k, count + np.rint(PathPolicy.most_late + first + (last - first) * share).astype(np.intp)]
+    nothing = -counted * float(np.log(longest))
     steady, sound = first == last, np.maximum(np.abs(first), np.abs(last)) < slight
-    nothing = -counted * float(np.log(max(float(trace.ranges.max(initial=1.0)) for trace in traces)))
     null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max(), nothing))
-    # Turns that are wrong throughout look like an offset in each stretch, each another one.
-    apart = float((each[:, :, count:].max(axis=2) - np.log(len(offsets))).sum(axis=1).max(initial=-np.inf))
     rows = list[Explanation]()
     for some in (np.flatnonzero(steady & ~sound), np.flatnonzero(np.abs(last - first) > slight)):
-        likely = late[np.argmax(late[:, some].max(axis=1)), some]
-        odds = float(np.logaddexp.reduce(likely)) - np.log(len(some)) + np.log(PathPolicy.fault)
+        # Clocks that part were mostly set together, as when a recording begins.
+        together = np.abs(first[some]) < slight
+        prior = 1.0 + together * len(some) / max(together.sum(), 1)
+        likely = late[np.argmax(late[:, some].max(axis=1)), some] + np.log(prior / prior.sum())
+        odds = float(np.logaddexp.reduce(likely)) + np.log(PathPolicy.fault)
         weights = np.exp(likely - likely.max())
         by, grows = (float(np.average(values[some], weights=weights)) for values in (first, last - first))
-        rows.append(Explanation(odds - max(null, apart), "late-ranges", {"late": -by, "grows": -grows}))
+        rows.append(Explanation(odds - null, "late-ranges", {"late": -by, "grows": -grows}))
     return max(rows, key=lambda row: row.log_odds)
 
 
