@@ -15,6 +15,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.slips import LASTS
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
+from uwblite.problem.alternatives import EvidencePolicy
 from uwblite.radio.bootstrap import bootstrap_graph, of_likeliest_slips
 from uwblite.radio.bootstrap_attempt import Attempt, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
@@ -232,6 +233,27 @@ def test_a_slip_near_an_end_shows_in_the_few_ranges_beyond_it(part):
     times = at[np.flatnonzero(bootstrapped.slips)]
     assert error < WELL / 3
     assert np.abs(times - stamps[part].mean()).max(initial=0.0) < 3.0 * LASTS
+
+
+def test_the_mirror_image_of_an_attempt_is_a_rival_that_turns_the_other_way():
+    """Wheels tell a path with slips from its image, and the image of an attempt that is mirrored is the sound one."""
+    truth = se2.chain(np.zeros(3), np.tile([0.5, 0.0, 0.15], (39, 1)))
+    motion = se2.between(truth[:-1], truth[1:])
+    motion[22:26] += [0.5, 0.0, 0.2]
+    anchors = np.array([[4.0, 3.0], [6.0, -3.0], [-4.0, 1.0]])
+    pose, anchor = np.repeat(np.arange(40), 3), np.tile([0, 1, 2], 40)
+    distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
+    wheels = chained(se2.chain(np.zeros(3), motion), (0.02, 0.02, 0.02))
+    measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0), 0.05)
+    starts = Graph(truth, anchors), Graph(truth, anchors * [1.0, -1.0])
+    sound, turned = (Attempt(each, measured, TrilaterationConfig(), ()) for each in starts)
+    for attempt, poses in ((sound, truth), (turned, truth * [1.0, -1.0, -1.0])):
+        attempt.placed[:], attempt.low, attempt.high, attempt.poses = True, 0, 40, poses.copy()
+        attempt.slips[22:26] = 1.0
+    solved, image = sound.with_slips(sound.slips), turned.mirrored()
+    assert image.evidence() == pytest.approx(solved.evidence(), abs=0.1)
+    assert aligned_error(image.poses[:, :2], truth[:, :2]) < 0.01
+    assert sound.mirrored().evidence() < solved.evidence() - EvidencePolicy.very_strong
 
 
 @pytest.mark.parametrize("marked", [[(22, 26)], [(22, 26), (5, 9)], [(5, 9), (22, 26), (32, 36)], [(24, 28)], []])

@@ -38,7 +38,10 @@ def bootstrap_graph(graph: Graph, measured: Measured, search: TrilaterationConfi
         slipping.append(Attempt(graph, measured, search, [each.first for each in slipping]))
         slipping[-1].run()
     agreeing = [attempt for attempt in slipping if attempt.misfit() < BootstrapPolicy.agreement]
-    return of_likeliest_slips(max([heading, *agreeing], key=Attempt.evidence)).estimate()
+    best = of_likeliest_slips(max([heading, *agreeing], key=Attempt.evidence))
+    # Slips make up for turns of the wrong sign: the path may be the mirror image of the true one.
+    image = _likeliest(best, [best.mirrored()])
+    return (best if image is best else of_likeliest_slips(image)).estimate()
 
 
 def of_likeliest_slips(attempt: Attempt) -> Attempt:

@@ -95,6 +95,10 @@ class Measured:
     """Assumed standard deviation of ranges until it is learnt, m."""
 
 
+_IMAGE = np.array([1.0, -1.0, -1.0])
+"""Signs of the mirror image of a pose."""
+
+
 class Attempt:
     """The poses in [low, high) are known, the anchors in `placed` have a position.
 
@@ -352,6 +356,16 @@ class Attempt:
         other.slips, other.wheels = slips, with_slips(self.odometry, slips)
         other._solve(BootstrapPolicy.scales[-1:])
         return other
+
+    def mirrored(self) -> Self:
+        """Return the attempt solved from the mirror image of its path and anchors, with the same slips."""
+        other = self._copy()
+        other.poses, other.anchors = other.poses * _IMAGE, other.anchors * _IMAGE[:2]
+        other.hypotheses = {
+            anchor: [replace(each, position=each.position * _IMAGE[:2]) for each in found]
+            for anchor, found in self.hypotheses.items()
+        }
+        return other.with_slips(other.slips)
 
     def _copy(self) -> Self:
         other = copy(self)
