@@ -62,9 +62,9 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     if cut is not None:
         estimate, task = cut, task.following(cut)
         steps = _steps(estimate, task)
-    track, by_ranges = _followed(estimate, steps), estimate.odometry.slips
+    track = _followed(estimate, steps)
     slipped = (track.slips > NeighbourPolicy.likely) & (estimate.ranges is not None)
-    cut = _with_keyframes_where(replace(estimate, odometry=replace(track.wheels, slips=by_ranges)), slipped, task)
+    cut = _with_keyframes_where(replace(estimate, odometry=replace(track.wheels, slips=track.slips)), slipped, task)
     if cut is not None:
         estimate, task = cut, task.following(cut)
         track = _followed(estimate, _steps(estimate, task))
@@ -80,7 +80,8 @@ def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
         late = calibration_checks.late(shown, task)
         settled = late == 0.0
         if settled and estimate.lidar.delay == 0.0:
-            return estimate, steps
+            # Clouds tell the errors of the wheels that last better than ranges.
+            return estimate.with_estimates_of(shown.graph), steps
         if abs(late) > corrected:
             # With a clock that is off by a constant, each correction leaves a part of the error before it.
             task.stages.note("clock-offset", offset=estimate.lidar.delay)
