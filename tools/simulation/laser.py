@@ -126,6 +126,8 @@ def disturb(
     range_ = np.where(seen, true, model.max_range)
     jump = np.zeros_like(seen)
     jump[:, :-1] = np.abs(range_[:, 1:] - range_[:, :-1]) > 0.12
+    # Neighbours on one oblique wall are no edge, however far apart they are.
+    jump[:, :-1] &= surface[:, 1:] != surface[:, :-1]
     jump &= seen
     mix = jump & (rng.random(true.shape) < model.mixed)
     neighbour = np.concatenate([range_[:, 1:], range_[:, -1:]], axis=1)
