@@ -142,7 +142,8 @@ def _anchor(
             "a time, or another anchor has its name?"
         )
     if doubtful:
-        status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
+        # The mirror image of a place that its ranges contradict is contradicted as well.
+        status, reason, alternative = "distrusted", "; ".join(filter(None, (doubtful, reason))), None
     return AnchorEstimate(
         name,
         graph.anchors[k],
