@@ -112,7 +112,8 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
 
     Parameters
     ----------
-    wheels : edges between neighbouring keyframes; what is no scan and shows slips weighs as much as one pair of clouds.
+    wheels : edges between neighbouring keyframes; slips that ranges show, or longer steps that were cut into these, weigh as
+        much as what one pair of clouds shows.
     graph : holds their calibration. steps : the same steps after descent, see match_plainly.
     """
     i, good = wheels.i, steps.enough & (steps.share >= PairPolicy.good_share)
@@ -127,21 +128,21 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     prior = Prior.about(mean, covariance, slip_sigma(noise), lost_sigma(noise))
     found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
-    by_ranges = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
+    by_others = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)
     alone, motions = found.log_odds(), found.false_motions()
     # A long slip of a little per step is likelier than none only as a whole.
     chain = posterior(np.zeros(len(wheels)), wheels.duration)
     for _ in range(TrackingConfig.laps):
         expected = motions.by_neighbours(chain, wheels.duration)
         log_odds = found.log_odds(motions.log_marginal(expected))
-        chain = posterior(log_odds + by_ranges, wheels.duration)
+        chain = posterior(log_odds + by_others, wheels.duration)
     found = with_neighbours(objects, pairs, found, expected)
     # Where neighbours share few points, or a slip is possible, clouds some steps before say where they lie.
     doubtful = steps.enough & (~good | (chain.probability > RegistrationConfig.doubtful))
     rest = np.clip(logit(np.clip(chain.probability, SINGULAR, 1.0 - SINGULAR)) - log_odds, -np.inf, 0.0)
     found, choice = _decided(objects, pairs, found, steps.pose, np.flatnonzero(doubtful), rest)
     alone[doubtful] = log_odds[doubtful] = choice.log_odds
-    slips = posterior(log_odds + by_ranges, wheels.duration).probability
+    slips = posterior(log_odds + by_others, wheels.duration).probability
     slipped = with_slips(noise, slips)
     variance, sound, mode = sigma**2 * PairPolicy.correlation, found.sound, choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.

@@ -72,7 +72,8 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
-    """Return the estimate with keyframes and clouds at the lidar's clock, which the steps that the clouds measure show."""
+    """Return the estimate with keyframes and clouds at the lidar's clock, which the steps that the clouds measure show, and
+    these steps; where that is the log's clock, the estimate is their optimum."""
     estimate, steps = _descended(estimate, task)
     corrected = np.inf
     for _ in range(NeighbourPolicy.retimings):

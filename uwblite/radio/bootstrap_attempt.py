@@ -95,10 +95,6 @@ class Measured:
     """Assumed standard deviation of ranges until it is learnt, m."""
 
 
-_IMAGE = np.array([1.0, -1.0, -1.0])
-"""Signs of the mirror image of a pose."""
-
-
 class Attempt:
     """The poses in [low, high) are known, the anchors in `placed` have a position.
 
@@ -359,10 +355,10 @@ class Attempt:
 
     def mirrored(self) -> Self:
         """Return the attempt solved from the mirror image of its path and anchors, with the same slips."""
-        other = self._copy()
-        other.poses, other.anchors = other.poses * _IMAGE, other.anchors * _IMAGE[:2]
+        other, place = self._copy(), np.array([1.0, -1.0])
+        other.poses, other.anchors = other.poses * np.append(place, -1.0), other.anchors * place
         other.hypotheses = {
-            anchor: [replace(each, position=each.position * _IMAGE[:2]) for each in found]
+            anchor: [replace(each, position=each.position * place) for each in found]
             for anchor, found in self.hypotheses.items()
         }
         return other.with_slips(other.slips)

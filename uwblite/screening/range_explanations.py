@@ -169,27 +169,13 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
     """Return a radio's clock that is off throughout, by a constant or by one that grows evenly; its rivals are wheels with
     another scale throughout or that slip on some stretches, and ranges that are any numbers."""
     offsets, factors, slight = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors, 1.5
-    count, length, start, duration = len(factors), PathPolicy.stretch, log.odometry.stamps[0], np.ptp(log.odometry.stamps)
-    edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    longest = max(float(trace.ranges.max(initial=1.0)) for trace in traces)
-    stretches, shares, counted = list[Floats](), list[float](), 0
-    for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
-        likely, stamps = np.zeros((len(PathPolicy.noise), count + len(offsets))), list[Floats]()
-        lost = np.zeros(len(likely))
-        for trace in (trace.between(begin, end) for trace in traces):
-            if len(trace.ranges) < PathPolicy.fewest:
-                continue
-            shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
-            paths = np.concatenate([factors[:, None, None] * trace.places, shifted])
-            likely += _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
-            lost += _by_way(trace, longest)
-            stamps.append(trace.stamps)
-        if stamps:
-            # Whatever the clock, on a stretch where the wheels slip only the way is known, or its path is any of these.
-            of_any = np.logaddexp.reduce(likely, axis=1, keepdims=True) - np.log(likely.shape[1])
-            stretches.append(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost[:, None], of_any)))
-            shares.append(float((np.concatenate(stamps).mean() - start) / duration))
-            counted += sum(len(each) for each in stamps)
+    count, stretches, shares, counted = len(factors), list[Floats](), list[float](), 0
+    longest, start = max(float(trace.ranges.max(initial=1.0)) for trace in traces), log.odometry.stamps[0]
+    for own in _stretches(log, traces):
+        stretches.append(_on_stretch(log, own, offsets, longest))
+        stamps = np.concatenate([trace.stamps for trace in own])
+        shares.append(float((stamps.mean() - start) / np.ptp(log.odometry.stamps)))
+        counted += len(stamps)
     if not stretches:
         return Explanation(-np.inf, "late-ranges", {})
     each = np.stack(stretches, axis=1)
@@ -211,6 +197,33 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
         by, grows = (float(np.average(values[some], weights=weights)) for values in (first, last - first))
         rows.append(Explanation(odds - null, "late-ranges", {"late": -by, "grows": -grows}))
     return max(rows, key=lambda row: row.log_odds)
+
+
+def _stretches(log: SensorLog, traces: Sequence[Trace]) -> Iterator[list[Trace]]:
+    """Yield the traces that have enough readings on each stretch of the way; none where no trace has."""
+    length = PathPolicy.stretch
+    edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
+    for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
+        parts = (trace.between(begin, end) for trace in traces)
+        if own := [part for part in parts if len(part.ranges) >= PathPolicy.fewest]:
+            yield own
+
+
+def _on_stretch(log: SensorLog, traces: Sequence[Trace], offsets: Floats, longest: float) -> Floats:
+    """Return log likelihoods (g, h) of traces on a stretch, for g scales of errors, if the way by the wheels has a factor, or
+    the radio's clock one of some offsets, s; longest: of all ranges, m.
+
+    Whatever the clock, on a stretch where the wheels slip only the way is known, or its path is any of these.
+    """
+    likely = np.zeros((len(PathPolicy.noise), len(PathPolicy.factors) + len(offsets)))
+    lost = np.zeros((len(likely), 1))
+    for trace in traces:
+        shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
+        paths = np.concatenate([PathPolicy.factors[:, None, None] * trace.places, shifted])
+        likely += _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
+        lost += _by_way(trace, longest)[:, None]
+    of_any = np.logaddexp.reduce(likely, axis=1, keepdims=True) - np.log(likely.shape[1])
+    return np.asarray(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost, of_any)))
 
 
 def _at_moments(log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None) -> list[Explanation]:
