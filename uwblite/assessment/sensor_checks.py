@@ -1,7 +1,7 @@
 """Figures of wheels, radio and lidar as a log has them, before a map is made, and the rules over these figures."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,20 +18,20 @@ Figures = dict[str, Any]
 class CheckPolicy:
     """From where on something is worth a finding."""
 
-    some: ClassVar[float] = 0.02
+    some: float = 0.02
     """Share of readings, or of the time, with a fault from which on it costs accuracy; and width of a path by its length below
     which its two sides cannot be distinguished."""
-    many: ClassVar[float] = 0.1
+    many: float = 0.1
     """Share from which on it is a warning."""
-    few: ClassVar[int] = 10
+    few: int = 10
     """Least number of ranges by which an anchor can be placed."""
-    finest: ClassVar[float] = 1.5e-6
+    finest: float = 1.5e-6
     """s; stamps are written no finer than 1e-6, which `record` puts between rows that came in one piece."""
-    periods: ClassVar[float] = 5.0
+    periods: float = 5.0
     """Usual periods of a sensor, and seconds, that are a long silence."""
-    slowest: ClassVar[float] = 5.0
+    slowest: float = 5.0
     """Hz; ranges and rays between odometry readings that are farther apart are placed badly at usual speeds."""
-    window: ClassVar[float] = 2.0
+    window: float = 2.0
     """s; anchors within it are in reach at one time."""
 
 

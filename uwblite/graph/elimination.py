@@ -11,7 +11,6 @@ to compute row and column counts for sparse Cholesky factorization, SIAM J. Matr
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,25 +22,24 @@ from ..arrays import WIDE, Ints
 from .graph import WIDTHS
 
 
-@dataclass(frozen=True, slots=True)
 class EliminationPolicy:
     """Which factorisation suits which pattern (docs/lab/performance.md)."""
 
-    widest_band: ClassVar[int] = 16
+    widest_band: int = 16
     """Distance in the band, poses, up to which the banded factorisation wins."""
-    widest_border: ClassVar[int] = 48
+    widest_border: int = 48
     """Scalars in a border; more of them stay in the sparse matrix."""
-    little_work: ClassVar[float] = 4e8
+    little_work: float = 4e8
     """Multiplications of a factorisation that always pay, a tenth of a second; so many in a band's envelope are not counted."""
-    per_pose: ClassVar[float] = 1e5
+    per_pose: float = 1e5
     """Multiplications for each pose beyond which iteration takes less time. In one hall all poses are connected; a hundred
     times the paper's graph takes a third of that."""
-    per_complex: ClassVar[int] = 4
+    per_complex: int = 4
     """Multiplications in one of complex numbers."""
-    alone: ClassVar[float] = 6.0
+    alone: float = 6.0
     """Time of a multiplication in a single column relative to one in many columns together: measured with SuperLU."""
-    small: ClassVar[int] = 3000
-    wide: ClassVar[float] = 0.1
+    small: int = 3000
+    wide: float = 0.1
     """Rows up to which any pattern is counted, and the mean share of the rows that each reaches back in the band of a matrix
     that fills up in any order; for the streets of a town it is a fiftieth."""
 

@@ -14,7 +14,6 @@ for each mu, which changes little.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.special import chdtri
@@ -29,17 +28,16 @@ from .robust import SQUARED, Kernel
 from .solver import Optimizer, Progress, SolverConfig, SolverSummary, minimise
 
 
-@dataclass(frozen=True, slots=True)
 class OutlierPolicy:
     """What an outlier is, and the way to it."""
 
-    probability: ClassVar[float] = 1e-3
+    probability: float = 1e-3
     """Of a sound edge to be taken for an outlier."""
-    factor: ClassVar[float] = 2.0
+    factor: float = 2.0
     """On mu from step to step; one linear system is solved for each."""
-    reach: ClassVar[float] = 100.0
+    reach: float = 100.0
     """Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
-    strict: ClassVar[float] = 100.0
+    strict: float = 100.0
     """mu at which the surrogate is the truncated square to within a per cent of the threshold."""
 
 

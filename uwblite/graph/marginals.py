@@ -6,7 +6,7 @@ With the same factor a further unknown that the model does not have is estimated
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,17 +24,16 @@ from .selected_inverse import selected_inverse
 from .unknowns import Unknowns
 
 
-@dataclass(frozen=True, slots=True)
 class MarginalsPolicy:
     """Numerical tolerances, and bounds on the memory."""
 
-    dependent: ClassVar[float] = 1e-13
+    dependent: float = 1e-13
     """Pivot, as a share of its diagonal entry, below which a direction counts as unmeasured."""
-    open: ClassVar[float] = 1.0 / TRACE
+    open: float = 1.0 / TRACE
     """m^2; variance of an anchor that no edge touches, that of a direction with a trace of damping."""
-    variances: ClassVar[Floats] = np.geomspace(1e-4, 4.0, 12)[:, None]
+    variances: Floats = np.geomspace(1e-4, 4.0, 12)[:, None]
     """Of common errors, from a hundredth to twice the size that is expected."""
-    columns_at_once: ClassVar[int] = 16
+    columns_at_once: int = 16
     """Columns of an inverse, each of which has the length of all unknowns."""
 
 

@@ -7,7 +7,6 @@ coarse level; where they are thousands, which would make it as large as the matr
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from scipy import sparse
@@ -17,21 +16,20 @@ from ..arrays import Bools, Floats, Ints, chunks
 from ..errors import SINGULAR, SolverError
 
 
-@dataclass(frozen=True, slots=True)
 class SchwarzPolicy:
     """Sizes of the two levels, and when the iteration ends."""
 
-    piece: ClassVar[int] = 24
+    piece: int = 24
     """Poses of a piece."""
-    enough: ClassVar[float] = 1e-3
+    enough: float = 1e-3
     """Relative error of a solution: the next step of the descent corrects it."""
-    most: ClassVar[int] = 300
+    most: int = 300
     """Iterations; the result by then is still a descent step."""
-    most_coarse: ClassVar[int] = 1000
+    most_coarse: int = 1000
     """Number of unknowns other than poses up to which each is in the coarse level."""
-    per_product: ClassVar[int] = 4
+    per_product: int = 4
     """Multiplications of a factorisation in the time of one of a matrix-vector product, which memory access limits."""
-    columns_at_once: ClassVar[int] = 256
+    columns_at_once: int = 256
     """Of the coarse matrix; a bound on the memory."""
 
 

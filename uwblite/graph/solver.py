@@ -145,30 +145,29 @@ def minimise(
     return graph, SolverSummary(converged, reason, len(history), chi2_initial, chi2, size, graph, history, descent.work)
 
 
-@dataclass(frozen=True, slots=True)
 class DescentPolicy:
     """When the damping changes, a factor is used again, and a step is the last."""
 
-    negligible: ClassVar[float] = 1e-12
+    negligible: float = 1e-12
     """chi2 that never matters, and its share that the rounding of thousands of residuals hides."""
-    little: ClassVar[float] = 1e-4
+    little: float = 1e-4
     """Share of chi2 above which a predicted decrease that was not reached is no sign of a minimum, even in a coarse search."""
-    free: ClassVar[float] = 1e-2
+    free: float = 1e-2
     """lambda up to which small steps indicate a minimum and not only strong damping."""
-    patience: ClassVar[int] = 8
+    patience: int = 8
     """Accepted steps that together indicate a minimum if their decrease was negligible, for any damping."""
-    near: ClassVar[float] = 5e-2
-    nearly_free: ClassVar[float] = 1e-6
+    near: float = 5e-2
+    nearly_free: float = 1e-6
     """A step that decreased chi2 by less than this share, with less damping, hardly changed H: the next uses its factor."""
-    as_predicted: ClassVar[float] = 0.9
+    as_predicted: float = 0.9
     """Share of the predicted decrease from which on the other way of moving has little to gain."""
-    quadratic: ClassVar[float] = 0.5
+    quadratic: float = 0.5
     """Share of the predicted decrease below which the cost is not quadratic along a step, and predicts no later ones."""
-    many: ClassVar[float] = 1e3
+    many: float = 1e3
     """Unknowns from which on the first lambda falls with their squared number: the damping of all poses of a chain, which move
     together, is to be softer than one of its steps."""
-    first: ClassVar[float] = 1e-5
-    most: ClassVar[float] = 1e12
+    first: float = 1e-5
+    most: float = 1e12
     """lambda at least after a step that failed, and at most."""
 
 

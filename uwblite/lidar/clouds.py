@@ -156,7 +156,6 @@ def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clo
     return whole
 
 
-@dataclass(frozen=True, slots=True)
 class GapPolicy:
     """Surfaces between the beams of a coarse lidar: points on the chord of two beams that hit one straight surface.
 
@@ -164,20 +163,20 @@ class GapPolicy:
     hit one line, it is taken as the surface between them; elsewhere the space between two beams is unknown.
     """
 
-    spacing: ClassVar[float] = 0.1
+    spacing: float = 0.1
     """Distance between points, m, that makes lines: a neighbourhood of 0.2 m holds four others."""
-    coarse: ClassVar[float] = 0.0075
+    coarse: float = 0.0075
     """Angle between two beams, rad (0.43 degrees), from which on they are coarse. Finer beams that hit far apart graze a
     surface, whose shape between them is not measured; where they do not graze it they are dense enough."""
-    widest: ClassVar[float] = 0.6
+    widest: float = 0.6
     """Wider gaps are not filled, m: they may contain niches and doors."""
-    reach: ClassVar[float] = 15.0
+    reach: float = 15.0
     """Gaps farther away are not filled, m: the memory of rasters grows with the square of a cloud's extent."""
-    noise: ClassVar[float] = 0.04
+    noise: float = 0.04
     """Largest distance of the next hit from the line through two others, m."""
-    bend: ClassVar[float] = 0.08
+    bend: float = 0.08
     """The same as a share of its distance along this line."""
-    least_beside: ClassVar[float] = 0.4
+    least_beside: float = 0.4
     """Least ratio of neighbouring gaps on one line, at any grazing angle."""
 
 

@@ -1,7 +1,6 @@
 """Round columns among the rays of many scans: where they stand, and how large they are."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,31 +11,30 @@ from ..odometry.attached import ScanPoints
 from .surface_rays import ShapePolicy, SurfaceRays, begins_run, range_sigma, to_circle
 
 
-@dataclass(frozen=True, slots=True)
 class ColumnPolicy:
     """What a round column is."""
 
-    radii: ClassVar[tuple[float, float]] = (0.04, 0.8)
+    radii: tuple[float, float] = (0.04, 0.8)
     """m, smallest and largest."""
-    widest: ClassVar[float] = 2.0
+    widest: float = 2.0
     """Largest distance between the ends of a run of rays, m."""
-    jump: ClassVar[float] = 0.2
+    jump: float = 0.2
     """m, difference of neighbouring ranges that ends a run of rays, beside two standard deviations of them."""
-    fewest: ClassVar[int] = 10
+    fewest: int = 10
     """Least number of rays of a run that shows a curvature."""
-    views: ClassVar[int] = 3
+    views: int = 3
     """Least number of keyframes that see a column."""
-    steps: ClassVar[int] = 8
+    steps: int = 8
     """Steps towards a circle."""
-    begin: ClassVar[float] = 0.15
+    begin: float = 0.15
     """Gate of the first half of the steps, m."""
-    gate: ClassVar[float] = 4.0
+    gate: float = 4.0
     """Gate of the other steps, standard deviations of the rays, beside what surfaces are uneven."""
-    incidence: ClassVar[float] = 0.4
+    incidence: float = 0.4
     """Least cosine between a ray and the normal; others hit the edge of a column, where readings are unreliable."""
-    share: ClassVar[float] = 0.6
+    share: float = 0.6
     """Share of the rays around it that must end on it."""
-    probable: ClassVar[float] = 1.22
+    probable: float = 1.22
     """Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
 
 

@@ -13,7 +13,6 @@ the place.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.special import expit
@@ -26,25 +25,24 @@ from .scan_matching import CloudPairs, Correspondences, PairFactors, PairPolicy,
 from .visibility import free_space, in_free_space, nearest_by_bearing
 
 
-@dataclass(frozen=True, slots=True)
 class ObjectPolicy:
     """Likelihood of surfaces."""
 
-    outlier: ClassVar[float] = OUTLIER**2
+    outlier: float = OUTLIER**2
     """Squared residual, in variances, that no point exceeds: the Geman-McClure kernel's limit."""
-    gap: ClassVar[float] = 0.4
+    gap: float = 0.4
     """Distance between neighbouring points that ends an object, m, and along both axes to where none belongs."""
-    moves: ClassVar[float] = 0.03
+    moves: float = 0.03
     """Probability that an object moves by itself, before any was seen: one in a room of thirty things."""
-    unlikely: ClassVar[float] = 0.5
+    unlikely: float = 0.5
     """Probability of standing still below which an object moves."""
-    sure: ClassVar[float] = 0.99
+    sure: float = 0.99
     """Probability of standing still from which on an object counts as one that does."""
-    long: ClassVar[float] = 2.0
+    long: float = 2.0
     """Length of the longest thing that moves by itself, m; a longer one would be several that move together."""
-    fits: ClassVar[float] = 5.0 / 6.0
+    fits: float = 5.0 / 6.0
     """Share of the points in view that match in the true place."""
-    chance: ClassVar[tuple[float, float]] = (1.0, 3.0)
+    chance: tuple[float, float] = (1.0, 3.0)
     """Matches by chance and points beforehand (Laplace's rule of succession)."""
 
 

@@ -12,7 +12,6 @@ design effect (L. Kish, Survey sampling, 1965), and n rays have the information 
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -21,21 +20,20 @@ from ..arrays import OUTLIER, Bools, Floats, Ints, run_starts, spread
 from .surface_rays import MeasuredSurfaces, RayNoise, ShapePolicy, SurfaceRays, Surfaces, to_circle
 
 
-@dataclass(frozen=True, slots=True)
 class RayPolicy:
     """Linearisation and noise of rays."""
 
-    incidence: ClassVar[float] = 0.05
+    incidence: float = 0.05
     """Least cosine of incidence; smaller ones are replaced by it."""
-    piece: ClassVar[float] = 1.0
+    piece: float = 1.0
     """Length of a place on a wall, m, within which residuals may be correlated."""
-    sector: ClassVar[float] = np.pi / 4.0
+    sector: float = np.pi / 4.0
     """The same of one on a column, rad."""
-    fewest: ClassVar[int] = 200
+    fewest: int = 200
     """Least number of rays from which their noise is learnt."""
-    clip: ClassVar[float] = OUTLIER
+    clip: float = OUTLIER
     """Standard deviations at which residuals are clipped: outliers give no information about the noise of inliers."""
-    places: ClassVar[int] = 5
+    places: int = 5
     """Least number of places of a surface from which the correlation of its residuals is learnt."""
 
 

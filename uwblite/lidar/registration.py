@@ -10,7 +10,6 @@ where the sum is that of object_likelihood. Two clouds may also show nothing of 
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.special import chdtri, expit, logit
@@ -24,25 +23,24 @@ from .object_likelihood import ObjectLikelihood
 from .scan_matching import SINGULAR, Aligned, CloudPairs, PairPolicy, limited, measured_part, nondegenerate_step
 
 
-@dataclass(frozen=True, slots=True)
 class RegistrationConfig:
     """Descent and search."""
 
-    fewest: ClassVar[int] = 6
+    fewest: int = 6
     """Matches from which on a pose is measured: twice its unknowns."""
-    useless: ClassVar[float] = 0.05
+    useless: float = 0.05
     """Probability that two clouds show nothing of each other's place: 'none of these'."""
-    contradicts: ClassVar[float] = float(chdtri(*se2.POSE, 1e-3))
+    contradicts: float = float(chdtri(*se2.POSE, 1e-3))
     """Squared Mahalanobis distance beyond which two poses are not the same; one in a thousand exceeds it by chance."""
-    doubtful: ClassVar[float] = 0.02
+    doubtful: float = 0.02
     """Probability of a slip from which on it is searched for."""
-    least_share: ClassVar[float] = 0.5
+    least_share: float = 0.5
     """Share of matching points below which the search is exhaustive."""
-    cooling: ClassVar[float] = 0.6
+    cooling: float = 0.6
     """Covariance of the prior that residuals may still have in an iteration, as a share of the one before."""
-    cold: ClassVar[float] = 0.05
+    cold: float = 0.05
     """Share of the prior's covariance from which on descent may end."""
-    linear: ClassVar[float] = 0.1
+    linear: float = 0.1
     """Distance from the matched pose, m or rad, up to which the matches there are those of the optimum."""
 
 

@@ -11,7 +11,6 @@ N = B B^T, a direction was measured where its l exceeds a multiple of 1. That de
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,35 +21,34 @@ from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 
 
-@dataclass(frozen=True, slots=True)
 class PairPolicy:
     """Matches and descent."""
 
-    points: ClassVar[int] = 150
+    points: int = 150
     """Points looked up per pair."""
-    fewest: ClassVar[int] = 30
+    fewest: int = 30
     """Clouds with fewer points with a normal measure nothing."""
-    reach: ClassVar[float] = 0.5
+    reach: float = 0.5
     """Farthest match at the beginning of a descent, m; the reach of the rasters."""
-    gate: ClassVar[float] = 0.15
+    gate: float = 0.15
     """The same at its end, m."""
-    good_share: ClassVar[float] = 0.75
+    good_share: float = 0.75
     """Share of matching points from which on a pair needs no further search."""
-    correlation: ClassVar[float] = 8.0
+    correlation: float = 8.0
     """Matches that together weigh as one: errors of neighbouring rays are correlated."""
-    same_facing: ClassVar[float] = float(np.sqrt(0.5))
+    same_facing: float = float(np.sqrt(0.5))
     """Least cosine between the normals of two matched points."""
-    measured: ClassVar[float] = 2.0
+    measured: float = 2.0
     """Multiple of the spurious information that a direction must exceed to have been measured."""
-    farthest: ClassVar[tuple[float, float]] = (2.0 * gate, gate)
+    farthest: tuple[float, float] = (2.0 * gate, gate)
     """Longest step of one iteration, m and rad."""
-    shrink: ClassVar[float] = 0.8
+    shrink: float = 0.8
     """Gate of an iteration as a share of the one before, at most."""
-    gate_per_step: ClassVar[float] = 10.0
+    gate_per_step: float = 10.0
     """Largest ratio of the next gate to a step, the larger of m and rad: points 10 m away move by ten times the angle."""
-    converged: ClassVar[float] = 1e-3
+    converged: float = 1e-3
     """Steps below this end the descent, m or rad."""
-    iterations: ClassVar[int] = 20
+    iterations: int = 20
 
 
 _LEAST = float(np.finfo(np.float32).tiny)

@@ -4,8 +4,7 @@ Scans a moment apart are aligned point to line from a guess; where few points th
 finds the place.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,19 +20,18 @@ from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
 from .visibility import directional_overlap, free_around, violates_free_space
 
 
-@dataclass(frozen=True, slots=True)
 class ScanStepPolicy:
     """Matching of single scans a moment apart."""
 
-    reach: ClassVar[float] = 0.4
+    reach: float = 0.4
     """Farthest match at the beginning of a descent, m; a point without one counts as one there."""
-    gate: ClassVar[float] = 0.12
+    gate: float = 0.12
     """The same at its end: single scans are thinner than clouds of keyframes, and more often match what they do not show."""
-    search: ClassVar[float] = 0.6
+    search: float = 0.6
     """Half-width of the search, m and rad."""
-    well_seen: ClassVar[float] = 0.9
+    well_seen: float = 0.9
     """Quantile of a scan's readings up to which it sees whatever is there."""
-    least_in_sight: ClassVar[float] = 0.5
+    least_in_sight: float = 0.5
     """Share of the points that must be nearer."""
 
 

@@ -9,7 +9,6 @@ on colour and material.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,32 +19,31 @@ from ..odometry.attached import ScanPoints
 from .joint_refinement import RefinementConfig
 
 
-@dataclass(frozen=True, slots=True)
 class ShapePolicy:
     """Rays, and what a surface is."""
 
-    noise: ClassVar[tuple[float, float]] = (0.01, 0.01)
+    noise: tuple[float, float] = (0.01, 0.01)
     """Standard deviation of a range by data sheets, m and as a share of it: 10 mm up to 1 m, and 1 % beyond (URG-04LX; other
     scanners are better)."""
-    roughness: ClassVar[float] = 0.004
+    roughness: float = 0.004
     """Roughness of surfaces, m: a grazing ray does not measure better."""
-    bundle: ClassVar[int] = 4
+    bundle: int = 4
     """Neighbouring rays that count as one."""
-    missing: ClassVar[int] = 2
+    missing: int = 2
     """Rays without a reading that do not end a run of neighbours."""
-    bend: ClassVar[float] = 20.0
+    bend: float = 20.0
     """Chi2 by which the richer of two shapes fits rays better."""
-    scatter: ClassVar[float] = 1.35
+    scatter: float = 1.35
     """Largest rms distance of rays from their surface, relative to their noise."""
-    on: ClassVar[float] = 0.06
+    on: float = 0.06
     """Distance from a surface up to which a place is on it, m."""
-    uneven: ClassVar[float] = 0.02
+    uneven: float = 0.02
     """Standard deviation of surfaces beside the noise of rays, m and rad: by the poses, and because walls are not straight."""
-    quietest: ClassVar[float] = 0.1
+    quietest: float = 0.1
     """Least noise of rays, as a share of that by data sheets."""
-    around: ClassVar[float] = 0.3
+    around: float = 0.3
     """Distance from a column's rim up to which rays are its surroundings, m."""
-    alike: ClassVar[float] = RefinementConfig().correlation
+    alike: float = RefinementConfig().correlation
     """Design effect of rays until one is learnt: that of matches of clouds."""
 
 

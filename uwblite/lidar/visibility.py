@@ -11,7 +11,6 @@ cent of such points, within one visit to a place as between two; if it is wrong,
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,45 +25,43 @@ from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_o
 from .submaps import Submaps
 
 
-@dataclass(frozen=True, slots=True)
 class OverlapPolicy:
     """Surface that two clouds have in common."""
 
-    noise: ClassVar[float] = 0.005
+    noise: float = 0.005
     """Share of the points added in every direction: fewer points that face it, as along a bare wall, are noise of normals."""
-    against: ClassVar[float] = 2.0
+    against: float = 2.0
     """Weight of a point in view without a match relative to one with a match, by the ratio of likelihoods: in the true
     place five of six points match, in a wrong one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) /
     (1/2)) = 2.2."""
-    points: ClassVar[int] = 1000
+    points: int = 1000
     """Most points of either cloud that are looked up."""
-    surface_cell: ClassVar[float] = 0.5
+    surface_cell: float = 0.5
     """Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
-    facings: ClassVar[int] = 8
+    facings: int = 8
     """Directions in which such a cell may face."""
 
 
-@dataclass(frozen=True, slots=True)
 class VisibilityPolicy:
     """Free space around clouds, and visits whose views are compared."""
 
-    bearings: ClassVar[int] = 120
+    bearings: int = 120
     """Bins of the free space around a keyframe: so wide that the points of a wall 5 m away leave none empty."""
-    margin: ClassVar[float] = 0.3
+    margin: float = 0.3
     """How far inside the free space a point must stand to count, m."""
-    views: ClassVar[int] = 8
+    views: int = 8
     """Keyframes of a sub-map whose free space is used."""
-    revisit: ClassVar[float] = 2.0
+    revisit: float = 2.0
     """Keyframes nearer to each other than this are at one place, m."""
-    apart: ClassVar[float] = 10.0
+    apart: float = 10.0
     """Travelled distance between two visits, m."""
-    revisits: ClassVar[int] = 400
+    revisits: int = 400
     """Most revisits that are compared."""
-    common: ClassVar[int] = 10
+    common: int = 10
     """Points of the other that a visit must be able to see to be compared."""
-    neighbours: ClassVar[int] = 64
+    neighbours: int = 64
     """Keyframes around one among which another visit is sought."""
-    usual: ClassVar[float] = 0.9
+    usual: float = 0.9
     """Share of the pairs of sub-maps of which no more stands in the next one's free space than is said of all."""
 
 

@@ -7,7 +7,6 @@ doors, of a few rays each, are found by one rule, which asks nothing but what th
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,28 +20,27 @@ from .columns import surroundings
 from .surface_rays import MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, begins_run
 
 
-@dataclass(frozen=True, slots=True)
 class WallPolicy:
     """What a straight piece is, and which pieces are of one wall, by what maps err by and objects stand off walls."""
 
-    fewest: ClassVar[int] = 6
+    fewest: int = 6
     """Least number of rays."""
-    splits: ClassVar[int] = 7
+    splits: int = 7
     """Most rounds in which bent pieces are split, and most times that a bent wall is halved."""
-    incidence: ClassVar[float] = 0.15
+    incidence: float = 0.15
     """Least cosine of incidence: readings at a grazing angle are unreliable."""
-    vague: ClassVar[float] = 0.2
+    vague: float = 0.2
     """Largest standard deviation of the direction, rad."""
-    every: ClassVar[float] = 0.5
+    every: float = 0.5
     """m between the places at which pieces are compared."""
-    reach: ClassVar[float] = 0.4
+    reach: float = 0.4
     """m, largest distance of places, and of the ends of neighbouring rays."""
-    lean: ClassVar[float] = 0.1
+    lean: float = 0.1
     """rad, largest difference of directions, beside two standard deviations of it."""
-    turned: ClassVar[float] = 2.0
+    turned: float = 2.0
     """Largest rms difference of directions from the wall's, in their standard deviations: what looks flat from every side, as a
     stem or a corner does, turns with the view."""
-    views: ClassVar[int] = 4
+    views: int = 4
     """Least number of keyframes that see a wall."""
 
 

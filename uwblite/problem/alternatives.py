@@ -7,7 +7,6 @@ for which there is positive evidence is taken; one that very strong evidence doe
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,20 +17,19 @@ from ..graph.graph import Graph
 from .evidence import laplace_marginal_likelihood
 
 
-@dataclass(frozen=True, slots=True)
 class EvidencePolicy:
     """Degrees of evidence (R. Kass, A. Raftery, Bayes factors, 1995), as logarithms of odds, and the effort of a search."""
 
-    positive: ClassVar[float] = float(np.log(3.0))
+    positive: float = float(np.log(3.0))
     """From here on an explanation is taken in place of the present one."""
-    very_strong: ClassVar[float] = float(np.log(150.0))
+    very_strong: float = float(np.log(150.0))
     """From here on an explanation is refuted."""
-    hopeless: ClassVar[float] = 20.0
+    hopeless: float = 20.0
     """From here on, against the likeliest, an explanation leads to no others: a further change would have to undo as much."""
-    searched: ClassVar[int] = 4
+    searched: int = 4
     """Explanations from which the search for others is continued, the likeliest first."""
-    same_path: ClassVar[float] = 0.1
-    same_anchor: ClassVar[float] = 0.5
+    same_path: float = 0.1
+    same_anchor: float = 0.5
     """m rms between the paths of two optima of one problem that are one, and between the places of an anchor."""
 
 

@@ -8,8 +8,7 @@ to that extent: the scatter is an error that all explanations have alike, so tha
 pass for precision.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -86,13 +85,12 @@ def with_prior_sigma(graph: Graph, sigma: Floats, mean: Floats | None = None) ->
     return replace(graph, edges=tuple(edges))
 
 
-@dataclass(frozen=True, slots=True)
 class ScatterPolicy:
     """Scatters tried, evenly in their logarithm, as shares of the least standard deviation and of the prior's."""
 
-    tried: ClassVar[int] = 60
-    least: ClassVar[float] = 0.01
-    most: ClassVar[float] = 10.0
+    tried: int = 60
+    least: float = 0.01
+    most: float = 10.0
 
 
 _TINY = np.finfo(np.float64).tiny

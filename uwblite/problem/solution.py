@@ -1,7 +1,6 @@
 """Solution of a problem and of its parts: the optimum, of which no anchor's squared height is below 0."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,13 +11,12 @@ from ..graph.solver import Optimizer, SolverConfig, SolverSummary
 from ..graph.unknowns import free_unknowns
 
 
-@dataclass(frozen=True, slots=True)
 class SolutionPolicy:
     """When optimisations end after which others follow: relative decreases of chi2, and most iterations."""
 
-    rough: ClassVar[float] = 1e-4
-    rough_iterations: ClassVar[int] = 12
-    comparable: ClassVar[float] = 1e-5
+    rough: float = 1e-4
+    rough_iterations: int = 12
+    comparable: float = 1e-5
 
 
 def solve(graph: Graph, config: SolverConfig, optimizer: Optimizer | None = None) -> tuple[Graph, SolverSummary]:

@@ -10,7 +10,7 @@ again and anchors not yet placed are searched from the poses so far.
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -30,38 +30,37 @@ from .slip_search import TagRanges, bursts, likeliest_slip, log_prior
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
 
 
-@dataclass(frozen=True, slots=True)
 class BootstrapPolicy:
     """How an attempt begins, grows, and is judged."""
 
-    seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
-    starts: ClassVar[int] = 5
+    seed_distances: tuple[float, ...] = (25.0, 10.0, 4.0, 60.0, 150.0)
+    starts: int = 5
     """Travelled distances of the first stretch, m, tried at so many places in this order until the anchors in it are clear;
     then all of the path."""
-    clear_enough: ClassVar[float] = 0.35
-    seen: ClassVar[int] = 3
+    clear_enough: float = 0.35
+    seen: int = 3
     """Mean score of the anchors in a good first stretch, up to as many as constrain a pose; 1 = without error, 0 = unclear."""
-    piece: ClassVar[float] = 0.3
-    growth: ClassVar[tuple[float, float]] = (1.5, 0.8)
+    piece: float = 0.3
+    growth: tuple[float, float] = (1.5, 0.8)
     """Distance appended at once, as a share of the first stretch, and factors on it where the prediction held and where not."""
-    resolve_factor: ClassVar[float] = 1.35
+    resolve_factor: float = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
-    scales: ClassVar[tuple[float, ...]] = (20.0, 6.0, OUTLIER)
+    scales: tuple[float, ...] = (20.0, 6.0, OUTLIER)
     """Scales of the ranges' kernel, one after the other, standard deviations."""
-    solver: ClassVar[SolverConfig] = SolverConfig(max_iterations=15, relative_decrease=1e-3)
-    drift: ClassVar[float] = 0.015
+    solver: SolverConfig = SolverConfig(max_iterations=15, relative_decrease=1e-3)
+    drift: float = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
-    heading_scales: ClassVar[tuple[float, ...]] = tuple(2.0**k - 1.0 for k in (0, -1, 1, -0.5, 0.5, -0.25, 0.25))
+    heading_scales: tuple[float, ...] = tuple(2.0**k - 1.0 for k in (0, -1, 1, -0.5, 0.5, -0.25, 0.25))
     """Relative heading errors of the odometry, tried until the ranges agree: a wrong track width in the base's settings is the
     most frequent gross fault, and a factor of two its most frequent value; then its roots."""
-    enough: ClassVar[float] = 50.0
+    enough: float = 50.0
     """Travelled distance over which a heading error is tried before the whole path is, m."""
-    agreement: ClassVar[float] = 2.0
+    agreement: float = 2.0
     """Ranges agree when their median error is below so many standard deviations."""
-    tear: ClassVar[float] = 1.0
+    tear: float = 1.0
     """Largest error of a step between keyframes by slip, m or rad; with a larger one a piece was appended mirrored or in the
     wrong place, even if its ranges agree well."""
-    slipping_starts: ClassVar[int] = 4
+    slipping_starts: int = 4
     """First stretches that are tried where the wheels slip."""
 
 

@@ -12,7 +12,6 @@ covariance S_k of place k, and the area A in reach, over which a place is unifor
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,30 +21,29 @@ from .range_noise import RangeNoiseConfig, independent_shares
 from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
 
 
-@dataclass(frozen=True, slots=True)
 class MovePolicy:
     """Prior probabilities of what happens to an anchor, and the effort of the search."""
 
-    moved: ClassVar[float] = 0.01
+    moved: float = 0.01
     """That an anchor is moved while a recording is made."""
-    moved_between: ClassVar[float] = 0.05
+    moved_between: float = 0.05
     """That it is moved between two recordings."""
-    usual: ClassVar[float] = 0.3
+    usual: float = 0.3
     """That its line of sight changes lastingly while a recording is made; that one whose height nobody gave is high."""
-    heights: ClassVar[tuple[float, ...]] = tuple(np.arange(1.0, 7.0).tolist())
+    heights: tuple[float, ...] = tuple(np.arange(1.0, 7.0).tolist())
     """m; heights above the tag that are tried."""
-    splits: ClassVar[int] = 3
-    likely: ClassVar[int] = 2
+    splits: int = 3
+    likely: int = 2
     """Times tried first, spread evenly over an interval's ranges, and divisions from which the search for times goes on."""
-    laps: ClassVar[int] = 4
+    laps: int = 4
     """Rounds between places and times, and between places and errors; two or three are usual."""
-    compared: ClassVar[int] = 3
+    compared: int = 3
     """Places by a part of the ranges that are compared."""
-    grid: ClassVar[int] = 4001
+    grid: int = 4001
     """Errors at which a density is summed."""
-    farthest: ClassVar[float] = 1.0
+    farthest: float = 1.0
     """m; the longest step of a descent."""
-    nearest: ClassVar[float] = 0.1
+    nearest: float = 0.1
     """m; a range shorter than the height keeps so much of a distance."""
 
 

@@ -10,8 +10,6 @@ weighted by marginal likelihood, is taken, and the widest where a scale is clear
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -24,26 +22,25 @@ from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
 
 
-@dataclass(frozen=True, slots=True)
 class UnitPolicy:
     """What is known beforehand of units of length and of the calibration of radios."""
 
-    widths: ClassVar[int] = 4
+    widths: int = 4
     """Widths tried from calibrated to uncalibrated radios, and of heights, evenly spaced in their logarithm."""
-    wrong_unit: ClassVar[float] = 0.1
+    wrong_unit: float = 0.1
     """Prior odds that the wheels' unit of length is wrong, against all units being right."""
-    off: ClassVar[float] = 1.0
+    off: float = 1.0
     """Prior odds that the radio's scale is off, by any order of magnitude, against being right; and the same of biases."""
-    farthest: ClassVar[float] = 0.08
+    farthest: float = 0.08
     """Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
-    short: ClassVar[float] = -0.01
-    too_short: ClassVar[float] = 0.01
+    short: float = -0.01
+    too_short: float = 0.01
     """Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a
     radio: ranges too long may come from late first paths, too short ones do not."""
-    fewest: ClassVar[int] = 3
-    least_heights: ClassVar[float] = 0.3
+    fewest: int = 3
+    least_heights: float = 0.3
     """Least number of anchors for a common mean, and spread of squared heights, m^2: 1.5 m above the tag, within 10 cm."""
-    together: ClassVar[float] = 4.0
+    together: float = 4.0
     """Ratio of the prior width of the mean to that of a single square: all anchors of a hall may be twice as high as usual."""
 
 

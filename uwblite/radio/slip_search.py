@@ -5,7 +5,6 @@ moments of a slip, and motions over it, those are sought along which the ranges 
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,21 +15,20 @@ from ..odometry.slips import EVERY, LASTS, SPEED
 from ..problem.alternatives import EvidencePolicy
 
 
-@dataclass(frozen=True, slots=True)
 class SlipSearchPolicy:
     """What is tried, and how ranges count."""
 
-    headings: ClassVar[int] = 72
+    headings: int = 72
     """Turns over a slip, evenly from none to a whole one."""
-    shares: ClassVar[tuple[float, ...]] = (0.0, 0.5, 1.0)
+    shares: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Shares of the distance counted over it that were driven."""
-    longest: ClassVar[float] = 2.0
+    longest: float = 2.0
     """Time over which the motion is sought, in mean durations of a slip: six in seven are shorter."""
-    stride: ClassVar[float] = 0.5
+    stride: float = 0.5
     """Time between moments that are tried, in mean durations of a slip."""
-    kernel: ClassVar[Kernel] = Kernel("geman-mcclure", OUTLIER)
+    kernel: Kernel = Kernel("geman-mcclure", OUTLIER)
     """Of ranges, in standard deviations."""
-    bursts: ClassVar[int] = 3
+    bursts: int = 3
     """Runs of ranges at a time at which a slip is tried."""
 
 

@@ -7,8 +7,7 @@ matches every other one. After a fast turn two scans may overlap little: the sur
 those of the other. For scans from different places, many points stand in the free space of the other.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,35 +19,34 @@ from . import range_motion
 from .wheel_motion import show_motion, usual_period
 
 
-@dataclass(frozen=True, slots=True)
 class CutPolicy:
     """Silences of the odometry, and changes from scan to scan."""
 
-    gap: ClassVar[float] = 2.0
-    periods: ClassVar[float] = 20.0
+    gap: float = 2.0
+    periods: float = 20.0
     """Silence of the odometry that is a gap, s; or so many periods, where that is longer."""
-    margin: ClassVar[float] = 0.2
+    margin: float = 0.2
     """Time at either end of a silence in which other sensors still have a place, s."""
-    stands: ClassVar[float] = 0.05
+    stands: float = 0.05
     """Distance, m, and turn, rad, by the wheels, below which the robot stood meanwhile."""
-    usual: ClassVar[float] = 0.99
+    usual: float = 0.99
     """Share of steps up to whose largest a step is usual."""
-    anywhere: ClassVar[tuple[float, float, float]] = (20.0, 20.0, 3.0)
+    anywhere: tuple[float, float, float] = (20.0, 20.0, 3.0)
     """Standard deviation of a step that no sensor measured, m, m, rad."""
-    one_cut: ClassVar[float] = 3.0
+    one_cut: float = 3.0
     """Cuts and breaks nearer than this in time are the same, s."""
-    neighbours: ClassVar[int] = 8
+    neighbours: int = 8
     """Scans on either side from which the usual difference of scans is computed: the 90 % quantile, or twice that."""
-    silence: ClassVar[float] = 6.0
+    silence: float = 6.0
     """Usual periods of the lidar after which two scans do not count as neighbours."""
-    least_change: ClassVar[float] = 0.25
-    most_change: ClassVar[float] = 1.0
+    least_change: float = 0.25
+    most_change: float = 1.0
     """Mean difference of readings, m, below which nothing happened, and the most of a single one that counts."""
-    tested: ClassVar[int] = 40
+    tested: int = 40
     """Most candidates that are tested, the largest first."""
-    same_place: ClassVar[float] = 0.55
+    same_place: float = 0.55
     """Scans that match by a larger share are of one place."""
-    through: ClassVar[float] = 0.12
+    through: float = 0.12
     """Share in free space that is too large for a true place; people and doors cause less."""
 
 

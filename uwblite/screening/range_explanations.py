@@ -12,7 +12,7 @@ any numbers, where they are no distances. An anchor may be moved by itself at an
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -25,35 +25,34 @@ from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SensorLog, plausible
 
 
-@dataclass(frozen=True, slots=True)
 class PathPolicy:
     """Priors of the explanations, and what is compared."""
 
-    fault: ClassVar[float] = 1e-3
+    fault: float = 1e-3
     """Probability of a clock that is off by seconds, of names exchanged and of one anchor moved at a given moment."""
-    wheels: ClassVar[float] = 1e-2
+    wheels: float = 1e-2
     """Of wheels that are wrong from a given moment on."""
-    most_late: ClassVar[float] = 20.0
+    most_late: float = 20.0
     """Largest offset of the clock, s; all up to it are equally probable, and compared in steps of a second.
 
     One of a second is no fault but calibrated with the map."""
-    noise: ClassVar[Floats] = np.array([0.1, 0.2, 0.4])
+    noise: Floats = np.array([0.1, 0.2, 0.4])
     """Scales of the errors of ranges, m, that of a path by wheels over a stretch included; each row has its best."""
-    apart: ClassVar[float] = 0.5
+    apart: float = 0.5
     """Way between two readings of an anchor that count, m: the errors of ranges last for so long."""
-    stretch: ClassVar[float] = 8.0
+    stretch: float = 8.0
     """Way for which wheels alone give the shape of the path, m."""
-    fewest: ClassVar[int] = 6
+    fewest: int = 6
     """Readings of an anchor in a stretch: three give its place and its error."""
-    factors: ClassVar[Floats] = np.geomspace(0.5, 2.0, 15)
+    factors: Floats = np.geomspace(0.5, 2.0, 15)
     """Ways of the robot / ways by the wheels that are compared."""
-    usual_motion: ClassVar[float] = 0.3
+    usual_motion: float = 0.3
     """Motion that sound wheels miss over twice such a way, m and rad: the map takes it up."""
-    turn: ClassVar[float] = 0.05
+    turn: float = 0.05
     """Between the turns that are compared, rad."""
-    rounds: ClassVar[int] = 5
+    rounds: int = 5
     """Of reweighting of the readings of a place, by errors of the middle scale."""
-    ridge: ClassVar[float] = 1e-6
+    ridge: float = 1e-6
     """Added to normal equations: a robot that stands shows a distance only."""
 
 

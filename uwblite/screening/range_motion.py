@@ -4,8 +4,6 @@ Medians of a few readings of one anchor are compared over a time. Where several 
 missed a motion.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,25 +12,24 @@ from ..sensor_log import SensorLog, plausible
 from .repeats import RepeatPolicy
 
 
-@dataclass(frozen=True, slots=True)
 class MotionPolicy:
     """Changes of ranges against the distance driven."""
 
-    window: ClassVar[int] = 3
+    window: int = 3
     """Readings whose median is taken."""
-    lasting: ClassVar[int] = 8
+    lasting: int = 8
     """Number of readings for which a jump must last."""
-    silence: ClassVar[float] = 6.0
+    silence: float = 6.0
     """Usual periods of an anchor after which a jump does not show the time of the motion."""
-    stretch: ClassVar[float] = 1.5
+    stretch: float = 1.5
     """Factor by which wheels may count too little."""
-    margin: ClassVar[float] = 0.5
+    margin: float = 0.5
     """Change, m, that a blocked line of sight explains."""
-    votes: ClassVar[int] = 2
+    votes: int = 2
     """Anchors that must agree, where so many are in reach."""
-    apart: ClassVar[float] = 10.0
+    apart: float = 10.0
     """Cuts nearer than this in time are one, s."""
-    way: ClassVar[float] = 2.0
+    way: float = 2.0
     """Length of the stretches, m, in which the change of ranges is compared with the distance."""
 
 

@@ -1,7 +1,6 @@
 """Sensors that repeat themselves while the robot moves, beams that see it, values that stand for no distance."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,43 +10,42 @@ from ..findings import Fact
 from ..sensor_log import LaserScans, SensorLog
 
 
-@dataclass(frozen=True, slots=True)
 class RepeatPolicy:
     """From where on equal readings are no chance."""
 
-    in_row: ClassVar[int] = 12
+    in_row: int = 12
     """Least number of constant ranges in a row."""
-    moved: ClassVar[float] = 0.5
+    moved: float = 0.5
     """Travelled distance, m, from which on a robot is elsewhere."""
-    new_place: ClassVar[float] = 0.01
+    new_place: float = 0.01
     """Travelled distance, m, after which a range is a new measurement, for a robot that hardly moves."""
-    unlikely: ClassVar[float] = 25.0
+    unlikely: float = 25.0
     """Negative logarithm of a probability so small that chance does not reach it in any recording."""
-    inner: ClassVar[tuple[float, float]] = (0.05, 0.95)
+    inner: tuple[float, float] = (0.05, 0.95)
     """Quantiles between which ranges count as standing; about the ends of a stretch some do not."""
-    finest_share: ClassVar[float] = 0.02
-    finest: ClassVar[float] = 0.001
+    finest_share: float = 0.02
+    finest: float = 0.001
     """Quantile of the steps between values that occur, and the finest resolution that counts, m."""
-    changes: ClassVar[float] = 0.2
+    changes: float = 0.2
     """Change of a range, m, or four steps of its resolution, with which it is measured and not repeated."""
-    usual_noise: ClassVar[float] = 0.03
-    least_noise: ClassVar[float] = 0.005
+    usual_noise: float = 0.03
+    least_noise: float = 0.005
     """Noise of radios, m, where the recording does not show it, and the least that is assumed."""
-    often: ClassVar[float] = 0.1
+    often: float = 0.1
     """Share of repeated scans from which on even single ones are no chance: of seven real recordings one has any, 0.5 %."""
-    mark_share: ClassVar[float] = 0.03
-    times_others: ClassVar[float] = 8.0
+    mark_share: float = 0.03
+    times_others: float = 8.0
     """Share of all readings at different places, and how much more frequent than others a value is that stands for no distance;
     no value of seven lidars, in steps of 1 to 10 mm, is more than 0.7 %."""
-    sector: ClassVar[float] = float(np.deg2rad(30.0))
+    sector: float = float(np.deg2rad(30.0))
     """Turn after which walls are elsewhere in a scan, rad."""
-    sectors: ClassVar[int] = 8
-    way: ClassVar[float] = 3.0
+    sectors: int = 8
+    way: float = 3.0
     """Such turns, and way, m, that show what moves with the robot: along a wall there is one at the same side all the time."""
-    near: ClassVar[float] = 0.8
+    near: float = 0.8
     """m; parts of a robot are nearer to its lidar than this."""
-    steady: ClassVar[float] = 0.04
-    steady_share: ClassVar[float] = 0.8
+    steady: float = 0.04
+    steady_share: float = 0.8
     """Deviation from a beam's median that noise of lidars makes nearby, m, and share of the readings within it."""
 
 

@@ -7,7 +7,6 @@ too much for a while slip, and are named; any other lasting difference is a doub
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,53 +17,52 @@ from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
 
 
-@dataclass(frozen=True, slots=True)
 class PairPolicy:
     """Comparison of wheels and lidar over pairs of scans."""
 
-    beams: ClassVar[int] = 30
+    beams: int = 30
     """Least number of beams that show motion."""
-    pairs: ClassVar[int] = 250
+    pairs: int = 250
     """Compared over the whole recording."""
-    per_stand: ClassVar[int] = 8
+    per_stand: int = 8
     """Further pairs in each stretch in which the wheels stand."""
-    stands: ClassVar[int] = 30
+    stands: int = 30
     """Such stretches, the longest first."""
-    apart: ClassVar[float] = 0.1
+    apart: float = 0.1
     """Usual distance between the scans of a pair, m."""
-    spans: ClassVar[tuple[float, float]] = (0.1, 1.0)
+    spans: tuple[float, float] = (0.1, 1.0)
     """Least and longest time between them, s."""
-    still: ClassVar[tuple[float, float]] = (0.005, 0.01)
+    still: tuple[float, float] = (0.005, 0.01)
     """Distance, m, and turn, rad, within a second below which wheels stand."""
-    least_stand: ClassVar[float] = 1.5
+    least_stand: float = 1.5
     """Shorter stands do not matter, s."""
-    matching: ClassVar[float] = 0.6
+    matching: float = 0.6
     """Pairs that share less of their points measure nothing."""
-    gain: ClassVar[float] = 0.03
+    gain: float = 0.03
     """Share by which rest must explain a pair better than the wheels do."""
-    noise_share: ClassVar[float] = 0.4
+    noise_share: float = 0.4
     """Share of matching points that one pair of scans in ten exceeds in any place; noise gives 0.1 to 0.2."""
-    noise: ClassVar[float] = 0.02
+    noise: float = 0.02
     """Rms distance of matches of two scans from one place, m: lidars of robots have 1 to 2 cm."""
-    worse: ClassVar[float] = 1.2
+    worse: float = 1.2
     """Factor between mean square distances of matches from which the better motion is shown; twice is clear."""
-    moving: ClassVar[float] = 0.03
+    moving: float = 0.03
     """Motion between the scans of a pair that is larger than noise, m and rad."""
-    clear: ClassVar[tuple[float, float]] = (0.05, 0.1)
+    clear: tuple[float, float] = (0.05, 0.1)
     """Distance, m, and turn, rad, that are large enough for a ratio."""
-    enough: ClassVar[int] = 12
+    enough: int = 12
     """Pairs whose median is a figure."""
-    lasting: ClassVar[int] = 6
+    lasting: int = 6
     """Pairs in a row, and seconds, of a lasting difference; half as many show whether the robot moves."""
-    allowed: ClassVar[tuple[float, float]] = (0.05, 0.06)
-    relative: ClassVar[float] = 0.35
+    allowed: tuple[float, float] = (0.05, 0.06)
+    relative: float = 0.35
     """Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
-    replaced: ClassVar[float] = 0.25
+    replaced: float = 0.25
     """Time between the scans whose motion replaces the wheels, s."""
-    step_sigma: ClassVar[tuple[float, float, float]] = (0.02, 0.02, 0.01)
-    unknown_sigma: ClassVar[float] = 0.3
+    step_sigma: tuple[float, float, float] = (0.02, 0.02, 0.01)
+    unknown_sigma: float = 0.3
     """Standard deviations of such a step, m, m, rad, and of one where scans do not match either, m and rad."""
-    searches: ClassVar[int] = 100
+    searches: int = 100
     """Steps of a stretch that are searched for, where they match badly."""
 
 
