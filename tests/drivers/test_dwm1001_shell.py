@@ -14,8 +14,9 @@ from uwblite.drivers.dwm1001_shell import (
     RangeLine,
     ShellProtocol,
     TextLine,
-    parse_node_info,
+    node_facts,
 )
+from uwblite.drivers.dwm1001_tlv import NodeConfig, Status, UpdateRate, Value
 from uwblite.drivers.events import Corrupt, RangeReading
 
 RNG = random.Random(5)
@@ -96,10 +97,13 @@ def test_captured_static_ranges_have_the_stated_spread(shared_data):
 
 
 def test_captured_node_info(shared_data):
-    info = parse_node_info((shared_data / "captures" / "dwm_shell_misc.txt").read_text().splitlines())
-    assert (info.short_id, info.pan_id, info.firmware, info.mode, info.activity) == ("1512", 0xBACA, "1.3.0.1", "tn", "off")
-    assert info.connected is False
-    assert dict(info.settings)["upd_rate_norm"] == "1"
+    """What the shell says of a node is what the binary interface would have answered."""
+    facts = node_facts((shared_data / "captures" / "dwm_shell_misc.txt").read_text().splitlines(), 1.0)
+    assert [event for event in facts if isinstance(event, Value)][1:] == [
+        Value(1.0, "pan_id", 0xBACA), Value(1.0, "firmware", 0x01030001)
+    ]  # fmt: skip
+    assert facts[0].value & 0xFFFF == 0x1512
+    assert facts[3:] == [Status(1.0, 0), NodeConfig(1.0, False, False, False, 0), UpdateRate(1.0, 0.1, 0.1)]
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ from typing import Any
 
 from .continuity import LinkHealth, RangeGuard
 from .dwm1001_poll import NOT_JOINED, FixPoller
-from .dwm1001_shell import ENTER, NodeInfo, PositionLine, Prompt, RangeLine, ShellProtocol, TextLine, parse_node_info
+from .dwm1001_shell import ENTER, PositionLine, Prompt, RangeLine, ShellProtocol, TextLine, node_facts
 from .dwm1001_tlv import (
+    ACTIVE,
     BAUD,
     CFG_GET,
     NODEID_GET,
@@ -54,29 +55,21 @@ UNREADABLE = Note("error", "uwb-unreadable", f"{_FOREIGN}: {_PORT}, and that it 
 _SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
 
 
-def advise(*, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float) -> list[Note]:
+def advise(node: NodeConfig, *, joined: bool | None, period: float) -> list[Note]:
     """Name every setting that makes ranges rare or absent, the worst first, and how to mend each.
 
-    The node is a `tag`, `active` = its radio is on, `joined` None = not known yet, `period` s between fixes.
+    `joined` : the node is part of a network, None = not known yet. `period` : s between fixes.
     """
     resting = f"stationary detection is on: the rate falls to once in 10 s at rest: {_SHELL}, `acts` shows its arguments;"
+    resting += " set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)"
+    off, rare = not node.anchor and node.uwb_mode != ACTIVE, period > SHORTEST_PERIOD
     rows = (
-        (not tag, "error", "not-a-tag", f"this node is an anchor: {_SHELL}, type `nmt` (it restarts)"),
-        (tag and not active, "error", "uwb-off", f"the tag's radio is off or passive: {_SHELL}, type `nmt`"),
+        (node.anchor, "error", "not-a-tag", f"this node is an anchor: {_SHELL}, type `nmt` (it restarts)"),
+        (off, "error", "uwb-off", f"the tag's radio is off or passive: {_SHELL}, type `nmt`"),
         (joined is False, NOT_JOINED.level, NOT_JOINED.name, NOT_JOINED.text.removeprefix("uwb: ")),
-        (
-            stationary,
-            "warning",
-            "stationary-detection",
-            f"{resting} set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)",
-        ),
-        (low_power, "warning", "low-power", f"low-power mode makes ranges come in bursts: {_SHELL}, type `nmt`"),
-        (
-            period > SHORTEST_PERIOD,
-            "warning",
-            "slow-update-rate",
-            f"a fix only every {period:.1f} s: {_SHELL}, type `aurs 1 1` for ten a second",
-        ),
+        (node.stationary_detection, "warning", "stationary-detection", resting),
+        (node.low_power, "warning", "low-power", f"low-power mode makes ranges come in bursts: {_SHELL}, type `nmt`"),
+        (rare, "warning", "slow-update-rate", f"a fix only every {period:.1f} s: {_SHELL}, type `aurs 1 1` for ten a second"),
     )
     return [Note(level, name, f"uwb: {text}") for hurts, level, name, text in rows if hurts]
 
@@ -91,7 +84,6 @@ class Dwm1001Driver(Driver):
         self.config: NodeConfig | None = None
         self.rate: UpdateRate | None = None
         self.values: dict[str, int] = {}
-        self.info = NodeInfo()
         self.joined: bool | None = None
         self._shell, self._stream = shell, stream
         self._poller: FixPoller | None = None
@@ -122,6 +114,14 @@ class Dwm1001Driver(Driver):
         self._heard = self._heard or bool(data)
         noise: list[Any] = self._tlv.feed(data, now) if self._binary else []
         events: list[Any] = [*(self._lines.feed(data, now) if self._text else []), *noise]
+        self._learn(events)
+        if not (self._text and self._binary):
+            return events
+        self._noise += [event for event in noise if isinstance(event, Corrupt)]
+        return [event for event in events if not isinstance(event, Corrupt)]
+
+    def _learn(self, events: Iterable[Any]) -> None:
+        """Remember what the module answers of itself."""
         for event in events:
             if isinstance(event, NodeConfig):
                 self.config = event
@@ -131,10 +131,6 @@ class Dwm1001Driver(Driver):
                 self.values[event.name] = event.value
             elif isinstance(event, Status):
                 self.joined = event.joined
-        if not (self._text and self._binary):
-            return events
-        self._noise += [event for event in noise if isinstance(event, Corrupt)]
-        return [event for event in events if not isinstance(event, Corrupt)]
 
     def spacing(self, event: Any) -> float | None:
         return self.period if self._begun and isinstance(event, RangeLine) else None
@@ -160,6 +156,7 @@ class Dwm1001Driver(Driver):
                 yield Reopen("no answer")
                 continue
             yield from (self._ask_shell() if self._shell else self._query())
+            yield from self._describe()
             self.ready = True
             if not self._stream:
                 return
@@ -226,25 +223,7 @@ class Dwm1001Driver(Driver):
         while (event := (yield Wait(until))) is not None and not (texts and isinstance(event, Prompt)):
             if isinstance(event, TextLine):
                 texts.append(event.text)
-        self.info = parse_node_info(texts)
-        self.joined = self.info.connected
-        settings = dict(self.info.settings)
-        normal = settings.get("upd_rate_norm", "1")
-        if normal.isdecimal():
-            self.rate = UpdateRate(self.now, int(normal) / 10, int(normal) / 10)
-        if self.info.short_id:
-            yield Param("uwb_tag_id", self.info.short_id)
-        if self.info.firmware:
-            yield Param("uwb_tag_firmware", self.info.firmware)
-        findings = advise(
-            tag=self.info.mode in ("tn", ""),
-            active=self.info.activity in ("act", ""),
-            stationary=settings.get("stat_det") == "1",
-            joined=self.joined,
-            low_power=settings.get("lp") == "1",
-            period=self.period,
-        )
-        yield from self.say_once(*findings)
+        self._learn(node_facts(texts, self.now))
 
     def _read_lines(self) -> Script[None]:
         """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
@@ -275,31 +254,27 @@ class Dwm1001Driver(Driver):
     def _query(self) -> Script[None]:
         for request, answers in QUERIES:
             yield from self.ask(request, answers, PATIENCE)
+
+    # ---- who it is
+
+    def _describe(self) -> Script[None]:
+        """Name the module in the log, and what of its settings hurts."""
         for name, key in (("uwb_tag_id", "node_id"), ("uwb_pan_id", "pan_id")):
             if key in self.values:
                 yield Param(name, short_id(self.values[key]))
         if "firmware" in self.values:
             yield Param("uwb_tag_firmware", self._firmware())
-        config = self.config
-        if config is not None:
-            findings = advise(
-                tag=not config.anchor,
-                active=config.uwb_mode == 2,
-                stationary=config.stationary_detection,
-                joined=None,
-                low_power=config.low_power,
-                period=self.period,
-            )
-            yield from self.say_once(*findings)
+        if self.config is not None:
+            # By TLV the polls tell whether it has joined: at first it may not have yet.
+            joined = self.joined if self._shell else None
+            yield from self.say_once(*advise(self.config, joined=joined, period=self.period))
 
     def _firmware(self) -> str:
         return ".".join(str(byte) for byte in self.values["firmware"].to_bytes(4, "big"))
 
-    # ---- for people
-
     def identity(self) -> Identity:
         details = {}
-        node, network = self.values.get("node_id"), self.values.get("pan_id", self.info.pan_id)
+        node, network = self.values.get("node_id"), self.values.get("pan_id")
         if node is not None:
             details["id"] = short_id(node)
         if network is not None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from .dwm1001_tlv import ACTIVE, JOINED, Fact, NodeConfig, Status, UpdateRate, Value
 from .events import Corrupt, RangeReading, corrupt
 from .framing import LineReader, RawLine
 
@@ -174,39 +175,21 @@ def _find_text(text: str, stamp_at: StampAt) -> Found:
     return 0, TextLine(stamp_at(0), stripped) if known and stripped.isprintable() else None
 
 
-@dataclass(frozen=True, slots=True)
-class NodeInfo:
-    """The answer of a node to `si`."""
-
-    short_id: str = ""
-    """Four hexadecimal digits."""
-    pan_id: int | None = None
-    firmware: str = ""
-    """For example "1.3.0.1"."""
-    mode: str = ""
-    """"tn" tag, "an" anchor, "ani" initiator."""
-    activity: str = ""
-    """"act", "pasv" or "off"."""
-    connected: bool | None = None
-    settings: tuple[tuple[str, str], ...] = ()
-    """key, value of the cfg line."""
+ACTIVITY = {"off": 0, "pasv": 1, "act": ACTIVE}
+"""Of the radio: ``uwb_mode`` of a configuration."""
 
 
-def parse_node_info(lines: Sequence[str]) -> NodeInfo:
-    """Read the text lines of `si` (or the one of `nmg`); fields that did not occur keep their defaults."""
+def node_facts(lines: Sequence[str], stamp: float) -> list[Fact]:
+    """Return what the text lines of `si` (or the one of `nmg`) say of a node, as its binary interface answers it."""
     text = "\n".join(lines)
-    address, pan = re.search(r"addr=x([0-9A-F]{16})", text), re.search(r"panid=x([0-9A-F]{1,4})", text)
-    firmware = re.search(r"fw_ver=x([0-9a-fA-F]{8})", text)
-    mode = re.search(r"mode: (\w+) \((\w+)", text)
-    joined = re.search(r"uwbmac: (connected|disconnected)", text)
-    row = re.search(r"cfg: (.*)", text)
-    settings = tuple(re.findall(r"(\w+)=(\S+)", row[1])) if row else ()
-    return NodeInfo(
-        address[1][-4:] if address else "",
-        int(pan[1], 16) if pan else None,
-        ".".join(str(b) for b in bytes.fromhex(firmware[1])) if firmware else "",
-        mode[1] if mode else "",
-        mode[2] if mode else "",
-        joined[1] == "connected" if joined else None,
-        settings,
-    )
+    numbers = {"node_id": r"addr=x([0-9A-F]{16})", "pan_id": r"panid=x([0-9A-F]{1,4})", "firmware": r"fw_ver=x([0-9a-fA-F]{8})"}
+    matches = {name: re.search(form, text) for name, form in numbers.items()}
+    facts: list[Fact] = [Value(stamp, name, int(match[1], 16)) for name, match in matches.items() if match]
+    if joined := re.search(r"uwbmac: (connected|disconnected)", text):
+        facts.append(Status(stamp, JOINED if joined[1] == "connected" else 0))
+    row, mode = re.search(r"cfg: (.*)", text), re.search(r"mode: (\w+) \((\w+)", text)
+    settings: dict[str, str] = dict(re.findall(r"(\w+)=(\S+)", row[1])) if row else {}
+    anchor, activity = (mode[1] != "tn", ACTIVITY.get(mode[2], 0)) if mode else (False, ACTIVE)
+    facts.append(NodeConfig(stamp, anchor, settings.get("stat_det") == "1", settings.get("lp") == "1", activity))
+    normal = settings.get("upd_rate_norm", "1")
+    return [*facts, UpdateRate(stamp, int(normal) / 10, int(normal) / 10)] if normal.isdecimal() else facts

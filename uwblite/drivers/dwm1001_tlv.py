@@ -73,7 +73,11 @@ class Status:
     @property
     def joined(self) -> bool:
         """The module is part of a network."""
-        return bool(self.bits & 2)
+        return bool(self.bits & JOINED)
+
+
+JOINED = 2
+"""Bit of a status."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +100,10 @@ class NodeConfig:
     stationary_detection: bool
     low_power: bool
     uwb_mode: int
-    """0 off, 1 passive, 2 active."""
+    """0 off, 1 passive, 2 ACTIVE."""
+
+
+ACTIVE = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +116,9 @@ class Value:
     value: int
 
 
-Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Corrupt
+Fact = Status | UpdateRate | NodeConfig | Value
+"""What a module answers of itself."""
+Event = Answer | Position | Distances | Fact | Corrupt
 
 _VALUES = {0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware")}
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
